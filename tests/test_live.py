@@ -281,7 +281,7 @@ def test_cameras_without_a_lens_are_said_before_anything_is_recorded(
 ) -> None:
     attached, settings = attached_to(lab_log, 60.0)
     request = Request(model_from=calibration)
-    with attached, pytest.raises(IpsysError, match="camera black has no lens"):
+    with attached, pytest.raises(IpsysError, match="camera black has no calibration"):
         pipeline.live(attached, settings[:1], tmp_path / "x.mcap", request)
     assert not (tmp_path / "x.mcap").exists()
 

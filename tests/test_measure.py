@@ -108,7 +108,7 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
     assert "d_B_cm: 8.15 cm is very short; if it is in metres, type 815" in doubt
     done = ipsys("measure", log, "--csv", path, "--force")
     assert done.code == 0, done.err
-    assert f"{len(tape)} places measured into {log}" in done.out
+    assert f"{len(tape)} points measured into {log}" in done.out
     assert done.err.splitlines()[-1] == f"next: ipsys replay {log}"
     assert data_section(log).startswith(before)
     assert ipsys("replay", log).code == 0
@@ -140,7 +140,7 @@ def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasure
         assert ipsys("replay", log, "--model", "rigid").code == 0
         gone = min(fitted_ids(log, "rigid"))
         scene.add([withdrawal_of(scene.history(), gone)])
-        with pytest.raises(IpsysError, match=f"no measurement {gone} to withdraw"):
+        with pytest.raises(IpsysError, match=f"measurement {gone} cannot be withdrawn"):
             withdrawal_of(scene.history(), gone)
     assert ipsys("replay", log, "--model", "rigid").code == 0
     assert fitted_ids(log, "rigid") - fitted_ids(log, "rigid_2") == {gone}
@@ -191,7 +191,7 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
         ),
         (
             "marker;d_A_cm;d_B_cm;side;height_cm;place\n0;170,5;190;left;0;999\n",
-            ["line 2: place 999 is none"],
+            ["line 2: place 999 is not between 1 and"],
         ),
         ("marker,d_A_cm,d_B_cm,side,height_cm,time\n0,170,190,left,0,noon\n", ["line 2: time 'noon'"]),
         (
@@ -258,7 +258,7 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
         # What the first one did is known now: the other goes on after it, and they take turns.
         assert [m.id for m in other.history()] == ["p001"]
         other.add([Measurement(tape[0].timestamp, "p002", marker_id=0)])
-        with pytest.raises(LogError, match=r"meanwhile \(p002\), so this is not written yet"):
+        with pytest.raises(LogError, match=r"into this log \(p002\); check them, and save again"):
             one.add([withdrawal_of(one.history(), "p001")])
         one.add([withdrawal_of(one.history(), "p001")])
         with pytest.raises(LogError, match="p001_withdrawn"):
@@ -313,7 +313,7 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "distance to B: 1.234 cm looks like metres" in done.out
     assert "p001 is in the log" in done.out
     assert "p001 is withdrawn" in done.out
-    assert "1 place measured" in done.out
+    assert "1 point measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
     # Undone while place 2 was asked for, and back at place 1.
     places = re.findall(r"Place (\d+) of", done.out)
@@ -399,7 +399,7 @@ def test_the_page_is_served_until_it_is_interrupted(unmeasured: Unmeasured) -> N
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=240)
     assert served.returncode == 0
-    assert out == f"0 places measured into {unmeasured.log}\n"
+    assert out == f"0 points measured into {unmeasured.log}\n"
     assert "Traceback" not in err
 
 

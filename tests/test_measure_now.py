@@ -155,7 +155,7 @@ def test_places_are_measured_on_the_page_until_it_is_told_to_end(
         out, err = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == 0, err
     assert "Traceback" not in err
-    assert f"6 places measured into {log}, 1 withdrawn" in out
+    assert f"6 points measured into {log}, 1 withdrawn" in out
     assert [row.withdraws for row in foreign_read(log)] == [""] * 6 + ["p002"]
     for name, count in counted(log).items():
         # One second before the first place, and until the last one.
@@ -276,7 +276,7 @@ def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     code, told = typed([*command, "--calibration", str(still_lab.lenses)], answers)
     assert code == 0, told
     assert "Traceback" not in told
-    assert "1 place measured into" in told
+    assert "1 point measured into" in told
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
     assert all(5 < count < 40 for count in counted(log).values())
 

@@ -245,7 +245,7 @@ def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[s
     labels = sorted({label for m in measurements for label in m.splits} - {"test"})
     if train == "test":
         raise IpsysError(
-            "--train test: the evaluation holds these points out; fit to points with another label"
+            "--train test: these points are held out for the evaluation; fit to points with another label"
         )
     if not any(m.splits for m in measurements):
         ids = np.array(sorted(m.id for m in measurements))

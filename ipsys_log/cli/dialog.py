@@ -213,7 +213,7 @@ def _measure(
             console.print(str(error), style="red", markup=False)
             continue
         saved.append(now.id)
-        console.print(f"{now.id} is saved", style="green", markup=False)
+        console.print(f"{now.id} is in the log", style="green", markup=False)
         return None
 
 

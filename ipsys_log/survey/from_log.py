@@ -138,9 +138,7 @@ class FinishedLog:
                 self._history += others
                 names = ", ".join(message.payload.id for message in others)
                 raise LogError(
-                    f"another program wrote measurements into this log ({names}), so this is not "
-                    "written yet: "
-                    "look again, and repeat it"
+                    f"another program wrote measurements into this log ({names}); check them, and save again"
                 )
             added: list[Message] = []
             for measurement in measurements:

@@ -226,7 +226,7 @@ def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
     markers = "".join(f"[[markers]]\nid = {n}\n" for n in known)
     rig_file = write_rig(tmp_path, markers + played(lab))
     done = ipsys("record", "--rig", rig_file, "--seconds", "2.5", "-o", tmp_path / "a.mcap")
-    assert "camera red: marker 0 is seen, but not in the rig; to track it add" in done.out
+    assert "camera red: marker 0 is seen, but not in the rig; to track it, add" in done.out
     assert "add [[markers]] with id = 0 to lab.toml" in done.out
     assert f"marker {known[0]} is seen" not in done.out
 
@@ -238,7 +238,7 @@ def test_a_camera_without_a_lens_is_recorded_and_named(ipsys: Ipsys, tmp_path: P
     assert "camera red has no calibration, but a replay needs one" in done.err
     lensed = write_rig(tmp_path, played(lab))
     done = ipsys("record", "--rig", lensed, "--seconds", "0.5", "-o", tmp_path / "b.mcap")
-    assert "no lens" not in done.err
+    assert "has no calibration" not in done.err
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_the_plan_is_a_table_and_a_headline(
     rows = [line for line in lines if line[:1].isdigit()]
     assert [row.split()[0] for row in rows] == ["1", "2", "3", "4", "5"]
     assert lines[-1].startswith("predicted mean error over the floor: 0.")
-    assert "with these 5 places 0." in lines[-1]
+    assert "cm with these 5 points" in lines[-1]
     # The model that was lacking was fitted and appended; what was recorded is as it was.
     assert "fit           run best  1 message\n" in done.err
     assert data_section(paper).startswith(section)
@@ -223,7 +223,7 @@ def test_too_few_places_are_said(ipsys: Ipsys, paper: Path) -> None:
         payload = message.payload
         return None if isinstance(payload, Measurement) and payload.id > "s003" else message
 
-    assert "best needs at least 5 measured places" in refused(ipsys, rewrite(paper, few))
+    assert "best needs at least 5 calibration points" in refused(ipsys, rewrite(paper, few))
 
 
 def test_what_the_log_lacks_is_noted(ipsys: Ipsys, authors: Path) -> None:
@@ -258,7 +258,7 @@ def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, fitted: Path)
     assert place["side"] is None
     assert place["distances_m"]["corner"] == pytest.approx(np.hypot(place["x_m"], place["y_m"]))
     done = ipsys("plan", fitted, "--rig", rig, "--places", 1)
-    assert "with this place" in done.out
+    assert "with this point" in done.out
     assert "corner" in done.out
 
 

@@ -106,7 +106,7 @@ def test_simulated_lab_is_measured_and_fitted(
     write_log(tmp_path / "day.mcap", seen_by_all(load_rig(tmp_path / "lab.toml")))
     done = ipsys("measure", "day.mcap", "--csv", "lab_tape.csv")
     assert done.code == 0, done.err
-    assert f"{len(sheet_rows(tmp_path / 'lab_tape.csv'))} places measured" in done.out
+    assert f"{len(sheet_rows(tmp_path / 'lab_tape.csv'))} points measured" in done.out
     assert ipsys("replay", "day.mcap").code == 0
     errors = errors_m(tmp_path / "day.mcap")
     assert len(errors) > 150

@@ -115,7 +115,7 @@ def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
         assert scene.model is not None
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still")
+        says(hand, "#sight", "is stationary")
         other = "right" if side == "left" else "left"
         for selector, text in (("#d-A", a), ("#d-B", b), ("#height", height)):
             hand.type(selector, text)
@@ -135,7 +135,7 @@ def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured:
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still")
+        says(hand, "#sight", "is stationary")
         fill(hand, a, b, side, height)
         with log.open("r+b") as other:
             fcntl.flock(other, fcntl.LOCK_EX)
@@ -159,7 +159,7 @@ def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasu
     ):
         texts = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still")
+        says(hand, "#sight", "is stationary")
         fill(hand, *texts)
         other.add([Measurement(tape[-1].timestamp, "p001", marker_id=1)])
         save(hand, "p001")
@@ -317,7 +317,7 @@ def test_place_after_place_in_through_the_token(hand: Phone, unmeasured: Unmeasu
         assert hand.run("location.pathname + location.search") == "/"
         for number in range(5):
             says(hand, "#stop", f"place {number + 1} of")
-            says(hand, "#sight", "lies still")
+            says(hand, "#sight", "is stationary")
             fill(hand, *texts_at(scene, tape, number))
             save(hand, f"p00{number + 1}")
             says(hand, "#places", f"p00{number + 1}")

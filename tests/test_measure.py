@@ -316,7 +316,7 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "1 point measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
     # Undone while place 2 was asked for, and back at place 1.
-    places = re.findall(r"Place (\d+) of", done.out)
+    places = re.findall(r"Stationary interval (\d+) of", done.out)
     assert places == ["1", "2", "1"]
 
 

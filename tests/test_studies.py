@@ -59,7 +59,7 @@ def test_places_on_a_line_too_few_and_none_at_all(ipsys: Ipsys, tmp_path: Path) 
         tape[:, 2] = 0.0
 
     log = made(tmp_path / "line.mcap", spoil=on_a_line)
-    assert "lie on one line" in refused(ipsys, log, "fit", "--model", "best")
+    assert "are on one line" in refused(ipsys, log, "fit", "--model", "best")
     few = made(tmp_path / "few.mcap", count=4)
     assert "best needs at least 5" in refused(ipsys, few, "evaluate", "--model", "best")
 

@@ -237,7 +237,7 @@ def _explain(error: Exception) -> str:
     explanations = {
         av.error.ConnectionRefusedError: "refuses the connection; check that the camera is on, and the port",
         av.error.HTTPNotFoundError: "the camera has no such path; find the path in the camera's manual",
-        av.error.HTTPUnauthorizedError: "the password is missing or wrong; put user:password@ before "
+        av.error.HTTPUnauthorizedError: "the password is missing or not accepted; put user:password@ before "
         "the host",
         av.error.HTTPForbiddenError: "the user may not see the stream; give the user this right in the "
         "camera",

@@ -109,7 +109,7 @@ def test_a_password(videos: dict[str, Path], authentication: str) -> None:
     for user in ("", "admin:wrong@"):
         with (
             served(videos["h264"], "tcp", authentication, user) as address,
-            pytest.raises(SourceError, match="the password is missing or wrong;") as error,
+            pytest.raises(SourceError, match="the password is missing or not accepted;") as error,
         ):
             take(address, 1, [])
         assert "wrong" not in str(error.value)

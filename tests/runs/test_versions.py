@@ -235,7 +235,7 @@ def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
     assert made(ipsys, log)["fuse"] == ("poly", True)
     assert states(ipsys, log)["poly", "fuse"]["state"] == "current"
     done = ipsys("verify", log)
-    assert (done.code, "detect is not verified: /cameras/" in done.err) == (0, True)
+    assert (done.code, "detect is not verified: its input /cameras/" in done.err) == (0, True)
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
 
 

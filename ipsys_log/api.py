@@ -125,7 +125,7 @@ class Log:
 
     def __init__(self, *paths: StrPath) -> None:
         if not paths:
-            raise IpsysError("name at least one log")
+            raise IpsysError("no log is given; name at least one")
         self._session = Session([Path(path) for path in paths])
 
     def __enter__(self) -> Log:
@@ -225,7 +225,7 @@ class Log:
         from ipsys_log.exchange.data_frames import TABLES, read_table
 
         if name not in TABLES:
-            raise IpsysError(f"there is no table {name!r}; use one of {', '.join(TABLES)}")
+            raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
         channel = _channel_named(name)
         wanted = [run] if run is None or isinstance(run, str) else list(run)
         runs = [self._run_of(channel, name) for name in wanted]
@@ -234,7 +234,7 @@ class Log:
     def _run_of(self, channel: Channel, run: str | None) -> str | None:
         if not channel.is_derived:
             if run is not None:
-                raise IpsysError(f"channel {channel.name} was recorded: it belongs to no run")
+                raise IpsysError(f"channel {channel.name} is recorded and belongs to no run; leave run out")
             return None
         name = run or newest_run(self._session, channel)
         if name is None or not self._session.topics(channel, name):
@@ -249,7 +249,7 @@ class Log:
 def _channel_named(name: str) -> Channel:
     channel = next((channel for channel in CHANNELS if channel.name == name), None)
     if channel is None:
-        raise IpsysError(f"there is no channel {name!r}; use one of {', '.join(c.name for c in CHANNELS)}")
+        raise IpsysError(f"channel {name!r} is not known; use one of {', '.join(c.name for c in CHANNELS)}")
     return channel
 
 
@@ -257,7 +257,7 @@ def _ns(time: Time | None) -> int | None:
     if time is None or isinstance(time, int):
         return time
     if time.tzinfo is None:
-        raise IpsysError(f"{time}: a time needs a time zone, for example datetime.now(timezone.utc)")
+        raise IpsysError(f"{time}: has no time zone; give one, for example datetime.now(timezone.utc)")
     whole = int(time.replace(microsecond=0).timestamp())
     return whole * 1_000_000_000 + time.microsecond * 1_000
 
@@ -488,7 +488,7 @@ def calibrate(
     board : inner corners of a chessboard as ``6x4``, or squares of a ChArUco board as ``charuco:4x5``.
     square_m : side of a square in m.
     lens : ``fisheye`` or another lens model of ``ipsys calibrate``.
-    cameras : only these cameras of a log; or the name of the only camera of the other sources.
+    cameras : the cameras of a log to use; for other sources, the name of the one camera.
     force : accept the stated board size, and poor results.
 
     Yields

@@ -23,7 +23,7 @@ class IpsysError(Exception):
 
 
 class LogError(IpsysError):
-    """A log file cannot be read or written as it is."""
+    """A log file that cannot be read or written."""
 
 
 class WriteError(LogError):
@@ -52,13 +52,13 @@ def is_full(error: OSError) -> bool:
 
 
 def disk_advice(error: OSError) -> str:
-    """Return what to do about a disk that cannot be written to, by the error of the operating system."""
+    """Return advice on a disk that cannot be written to, by the error of the operating system."""
     if is_full(error):
         return "free some space and try again"
     if error.errno == errno.EROFS:
         return "the disk is read-only (perhaps after a fault): mount it for writing, or use another disk"
     if error.errno == errno.EFBIG:
-        return "files of this size are not possible there: use a disk with another file system"
+        return "the file system does not allow files of this size: use a disk with another file system"
     if error.errno in (errno.EACCES, errno.EPERM):
         return "ask for write permission there, or use another folder"
-    return "the disk or its connection is at fault: copy the log to another disk, and try again there"
+    return "the disk or its connection has failed: copy the log to another disk, and try again there"

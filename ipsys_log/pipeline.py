@@ -263,20 +263,22 @@ def live(
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show)
         if fault is not None:
-            cameras.add_event("stages_stopped", f"{fault}; frames are recorded all the same")
+            cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in frames:
                 if message is not TICK:
                     show(message)
     if fault is not None:
-        raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
+        raise IpsysError(
+            f"{fault}; {target} has all frames; to process them: ipsys replay {target}"
+        ) from fault
     try:
         outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:
         log.check_disk()
     if frames.skipped:
         cameras.say(
-            f"{frames.skipped.total()} frames are recorded but were not looked at: the stages were too slow. "
-            f"ipsys replay {target} looks at all, with --as-live at those that were looked at"
+            f"{frames.skipped.total()} frames skipped: processing could not keep up. All are recorded. To "
+            f"process all: ipsys replay {target}; --as-live excludes the skipped frames"
         )
     show.check()
     return outcomes

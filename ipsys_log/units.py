@@ -1,4 +1,4 @@
-"""Units of what people read. Everything inside is metres, radians and nanoseconds."""
+"""Units of texts and reports. All other values are in metres, radians and nanoseconds."""
 
 from __future__ import annotations
 

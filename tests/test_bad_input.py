@@ -198,7 +198,7 @@ def test_too_few_points_for_a_model_are_refused(
 
     log = rewrite(imsel, few)
     line = refused(ipsys, log, "fit", log, "--model", model)
-    assert f"{model} needs at least {needed} measured places, found {places}" in line
+    assert f"{model} needs at least {needed} calibration points, found {places}" in line
 
 
 def test_places_on_a_line(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_an_impossible_triangle(ipsys: Ipsys, lab: Path) -> None:
     log = rewrite(lab, once)
     line = refused(ipsys, log, "replay", log)
     assert "measurement s_first" in line
-    assert "AB = 2.4384 m, d1 = 0.4000 m and d2 = 0.5000 m" in line
+    assert "d1 = 0.4000 m and d2 = 0.5000 m do not meet, because AB is 2.4384 m" in line
 
 
 def test_two_cameras_of_one_name(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
@@ -246,7 +246,7 @@ def test_two_cameras_of_one_name(ipsys: Ipsys, lab: Path, tmp_path: Path) -> Non
     assert "two cameras have the name 'red'" in refused(ipsys, lab, "replay", lab, "--rig", rig)
     other = rewrite(lab, lambda message: message)
     line = refused(ipsys, lab, "replay", lab, other, "-o", tmp_path / "out.mcap")
-    assert "two cameras of one name" in line
+    assert "two cameras have the same name" in line
 
 
 @pytest.mark.parametrize("damage", ["cut", "zeros", "empty", "noise"])
@@ -291,9 +291,13 @@ def test_impossible_names_and_options_are_refused(ipsys: Ipsys, lab: Path, tmp_p
     )
     assert "small letters" in refused(ipsys, lab, "replay", lab, "--run", "Monday/1")
     assert "camera=file.yaml" in refused(ipsys, lab, "replay", lab, "--calibration", "red")
-    assert "no such camera" in refused(ipsys, lab, "replay", lab, "--calibration", f"blue={yaml(tmp_path)}")
-    assert "there is no such" in refused(ipsys, lab, "replay", lab, "--calibration", "red=nowhere.yaml")
-    assert "no measurement is labelled 'half'" in refused(ipsys, lab, "fit", lab, "--train", "half")
+    assert "does not have this camera" in refused(
+        ipsys, lab, "replay", lab, "--calibration", f"blue={yaml(tmp_path)}"
+    )
+    assert "nowhere.yaml: does not exist" in refused(
+        ipsys, lab, "replay", lab, "--calibration", "red=nowhere.yaml"
+    )
+    assert "no measurement has the label 'half'" in refused(ipsys, lab, "fit", lab, "--train", "half")
     (tmp_path / "out.mcap").write_bytes(b"kept")
     assert "exists already" in refused(ipsys, lab, "replay", lab, "-o", tmp_path / "out.mcap")
     assert "no fitted model" in refused(ipsys, lab, "replay", lab, "--model-from", lab)
@@ -314,13 +318,13 @@ def yaml(folder: Path) -> Path:
     ("text", "said"),
     [
         ("name = ", "not valid TOML"),
-        ('name = "a"\nmarker_length_m = 0,20', "a decimal comma? Write 0.20"),
-        ("name = lab one # mine", 'text stands in quotes; write "lab one"'),
+        ('name = "a"\nmarker_length_m = 0,20', "write the decimal point as 0.20"),
+        ("name = lab one # mine", 'text needs quotes; write "lab one"'),
         ('name = "a"', "dictionary is missing"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = "20 cm"', "must be a number"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = -1', "not a length"),
-        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_lenght_m = 1', "was marker_length_m meant?"),
-        ('name = "a"\ndictionary = "DICT_9X9"\nmarker_length_m = 0.2', "none of OpenCV's"),
+        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_lenght_m = 1', "use marker_length_m"),
+        ('name = "a"\ndictionary = "DICT_9X9"\nmarker_length_m = 0.2', "is unknown to OpenCV"),
     ],
 )
 def test_a_bad_rig_file(ipsys: Ipsys, lab: Path, tmp_path: Path, text: str, said: str) -> None:
@@ -331,7 +335,9 @@ def test_a_bad_rig_file(ipsys: Ipsys, lab: Path, tmp_path: Path, text: str, said
 
 def test_a_folder_that_is_not_the_authors(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    assert "no such folder" in refused(ipsys, lab, "import", "imsel", tmp_path / "nowhere", "-o", out)
+    assert "nowhere: does not exist" in refused(
+        ipsys, lab, "import", "imsel", tmp_path / "nowhere", "-o", out
+    )
     assert "has no testing.mat" in refused(ipsys, lab, "import", "imsel", tmp_path, "-o", out)
     (tmp_path / "data").mkdir()
     assert "no sub-folders with pictures" in refused(

@@ -135,7 +135,7 @@ def test_a_second_detect_finds_the_first(ipsys: Ipsys, tmp_path: Path, rig: Path
     done = ipsys("detect", log, "--rig", rig)
     assert done.code == 0
     # Edge fits need intrinsics: without them, corners are OpenCV's, and a message says so.
-    assert "camera cam has no calibration: corners are found as with --corners stock" in done.err
+    assert "camera cam has no calibration, so its corners are from --corners stock" in done.err
     before = log.read_bytes()
     assert "up to date" in ipsys("detect", log, "--rig", rig).err
     assert log.read_bytes() == before
@@ -201,7 +201,7 @@ def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
 @pytest.mark.parametrize(
     ("encoding", "data", "said"),
     [
-        ("flatbuffer", b"...", "messages encoded as 'flatbuffer' are not read, only protobuf and json"),
+        ("flatbuffer", b"...", "messages encoded as 'flatbuffer' cannot be read, only protobuf and json"),
         ("json", b"{]", "not a valid foxglove.CompressedImage"),
         ("protobuf", b"\xff\xff", "not a valid foxglove.CompressedImage"),
     ],

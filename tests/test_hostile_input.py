@@ -75,7 +75,7 @@ def one_line(error: pytest.ExceptionInfo[IpsysError]) -> str:
         (NEEDED + "0.2\ntape_sigma_m = -inf", "at most"),
         (NEEDED + f"0.2\n[[markers]]\nid = {1 << 70}", "at most"),
         (NEEDED + f"0.2\n[[markers]]\nid = {'[' * 90}{']' * 90}", "whole number"),
-        (f"name = {'x' * 100_000}", "text stands in quotes"),
+        (f"name = {'x' * 100_000}", "text needs quotes"),
         ("#" * (1 << 20), "too large"),
     ],
 )

@@ -229,7 +229,7 @@ def test_point_measured_later_is_reported_and_no_difference(
     append_messages(log, [Message("/measurements", time_ns, time_ns, withdrawal_of([last], last.id))])
     done = ipsys("verify", log)
     assert done.code == 0, done.out
-    assert "its fit is not verified: ipsys replay makes it again" in done.err
+    assert "its fit is not verified: ipsys replay computes it again" in done.err
 
 
 def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
@@ -241,7 +241,7 @@ def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
     write_log(unsigned, iter(fuse))
     apart = {one.topic: one.first for one in again(unsigned) if not one.equal}
     assert apart.keys() == {"/runs/poly/tracks", "/runs/poly/poses"}
-    assert set(apart.values()) == {"no record says how it was made"}
+    assert set(apart.values()) == {"no record of the run"}
 
 
 def test_models_and_evaluations_are_computed_again(lab_log: Path, calibration: Path, tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_cameras_without_intrinsics_are_reported_first(
 ) -> None:
     attached, settings = attached_to(lab_log, 60.0)
     request = Request(model_from=calibration)
-    with attached, pytest.raises(IpsysError, match="camera black has no lens"):
+    with attached, pytest.raises(IpsysError, match="camera black has no calibration"):
         pipeline.live(attached, settings[:1], tmp_path / "x.mcap", request)
     assert not (tmp_path / "x.mcap").exists()
 
@@ -291,7 +291,7 @@ def test_failed_stage_does_not_stop_the_recording(
     target = tmp_path / "x.mcap"
     with monkeypatch.context() as patch:
         patch.setattr(Detect, "_frame", broken)
-        with pytest.raises(IpsysError, match="has all frames: replay it"):
+        with pytest.raises(IpsysError, match="has all frames; to process them: ipsys replay"):
             go_live(lab_log, calibration, target, 30.0)
     with Session([target]) as session:
         assert {name: session.count(topic) for name, topic in session.images.items()} == {
@@ -333,7 +333,7 @@ def test_consumer_that_fails_ends_no_recording(
         frames = {name: session.count(topic) for name, topic in session.images.items()}
         assert frames == {name: len(found) for name, found in sent(lab_log).items()}
         assert [e.text for e in session.payloads(["/events"]) if e.kind == "sink_stopped"] == [
-            "the display stopped (a fault in the display); the recording goes on"
+            "the display stopped (a fault in the display); the recording continues"
         ]
         signed = {run.stage for run in session.runs()}
         assert signed == ({"detect", "camera-frame", "fit", "locate", "fuse"} if stages else set())
@@ -351,7 +351,7 @@ def test_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> No
         CompressedImage,
         lambda image: replace(image, data=image.data + b"\0"),
     )
-    with pytest.raises(IpsysError, match=r"run edges was made from .* is out of date"):
+    with pytest.raises(IpsysError, match=r"run edges is out of date: it has read"):
         again(log)
 
 
@@ -524,13 +524,13 @@ def test_missing_model_is_refused(ipsys: Ipsys, lab: Path, tmp_path: Path) -> No
 def test_verify_and_diff_on_the_command_line(ipsys: Ipsys, recorded: Path, lab: Path) -> None:
     done = ipsys("verify", recorded)
     assert (done.code, done.err) == (0, "")
-    assert done.out.endswith("a replay equals the log\n")
+    assert done.out.endswith("the replay is identical to the log\n")
     done = ipsys("verify", lab)
     assert done.code == 1
     assert "has no run to verify" in done.err
     assert ipsys("diff", recorded, recorded, "--run", "poly").code == 0
     assert "has no run spline" in ipsys("diff", recorded, recorded, "--run", "spline").err
-    assert "holds no latencies" in ipsys("latency", lab).err
+    assert "has no latencies" in ipsys("latency", lab).err
 
 
 def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, tmp_path: Path) -> None:

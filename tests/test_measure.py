@@ -105,11 +105,11 @@ def test_points_measured_later_give_the_pairs_of_a_live_session(
     path = sheet(tmp_path / "a.csv", tape, time=times(tape, log))
     # One point is so near to B that its distance may be in metres; no other is doubtful.
     (doubt,) = refused(ipsys, log, "measure", log, "--csv", path).splitlines()[1:]
-    assert "d_B_cm: 8.15 cm is very near to B: in metres? Then type 815" in doubt
+    assert "d_B_cm: 8.15 cm is very short; if it is in metres, type 815" in doubt
     done = ipsys("measure", log, "--csv", path, "--force")
     assert done.code == 0, done.err
-    assert f"{len(tape)} places measured into {log}" in done.out
-    assert done.err.splitlines()[-1] == f"then: ipsys replay {log}"
+    assert f"{len(tape)} points measured into {log}" in done.out
+    assert done.err.splitlines()[-1] == f"next: ipsys replay {log}"
     assert data_section(log).startswith(before)
     assert ipsys("replay", log).code == 0
     mine = pairs_of(log)
@@ -140,7 +140,7 @@ def test_fit_uses_a_measured_point_and_ignores_a_withdrawn_one(ipsys: Ipsys, unm
         assert ipsys("replay", log, "--model", "rigid").code == 0
         gone = min(fitted_ids(log, "rigid"))
         scene.add([withdrawal_of(scene.history(), gone)])
-        with pytest.raises(IpsysError, match=f"no measurement {gone} to withdraw"):
+        with pytest.raises(IpsysError, match=f"measurement {gone} cannot be withdrawn"):
             withdrawal_of(scene.history(), gone)
     assert ipsys("replay", log, "--model", "rigid").code == 0
     assert fitted_ids(log, "rigid") - fitted_ids(log, "rigid_2") == {gone}
@@ -159,9 +159,9 @@ def test_sheet_rows_match_intervals_by_order_or_by_number(
     assert done.code == 0
     listed = ipsys("measure", log, "--places")
     assert f"p{len(mine):03d}" in listed.out
-    needed = "a model needs 10 or more that each camera sees, and gets good with some 40"
-    assert f"places in it: {len(mine)}; {needed}" in done.err
-    assert f"then: ipsys replay {log}" in done.err
+    needed = "each camera must see 10 or more for a model, and about 40 for a good one"
+    assert f"calibration points in the log: {len(mine)}; {needed}" in done.err
+    assert f"next: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with open_finished_log(log, Request()) as scene:
         numbers = [str(next(n for n, s in enumerate(scene.intervals, 1) if s.covers(one))) for one in other]
@@ -179,39 +179,43 @@ def test_sheet_rows_match_intervals_by_order_or_by_number(
     [
         (
             "marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n",
-            ["line 2: no triangle has the sides A to B = 243.8 cm, d_A_cm = 100 cm and d_B_cm = 40 cm"],
+            ["line 2: d_A_cm = 100 cm and d_B_cm = 40 cm do not meet, because A to B is 243.8 cm"],
         ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm,place\n0,1.7,190,left,0,1\n\n99,170,190,left,0,1\n0,170,x,up,,1\n",
             [
-                "line 2: no triangle has the sides",
+                "cm do not meet, because A to B is",
                 "line 4: marker 99 is not in the rig",
-                "line 5: d_B_cm: 'x' is no number",
+                "line 5: d_B_cm: 'x' is not a number",
                 "line 5: side 'up'",
-                "line 5: height_cm? 0 where",
+                "line 5: height_cm? 0 if",
             ],
         ),
         (
             "marker;d_A_cm;d_B_cm;side;height_cm;place\n0;170,5;190;left;0;999\n",
-            ["line 2: place 999 is none"],
+            ["line 2: place 999 is not between 1 and"],
         ),
         ("marker,d_A_cm,d_B_cm,side,height_cm,time\n0,170,190,left,0,noon\n", ["line 2: time 'noon'"]),
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n", ["line 2: 6 cells, but 5 columns"]),
+        (
+            "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n",
+            ["line 2: the row has 6 cells, but the header has 5"],
+        ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,20\n0,170,190,up,10\n",
             [
-                "line 2: 6 cells, but 5 columns; a decimal comma? Write a point: 212.7",
+                "line 2: the row has 6 cells, but the header has 5; if it has a decimal comma, write a "
+                "point: 212.7",
                 "line 3: side 'up': write left or right",
             ],
         ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm,place,note\n0,170,5,190,left,20\n",
-            ["line 2: side '190': write left or right; a decimal comma? Write a point: 212.7"],
+            ["line 2: side '190': write left or right; if it has a decimal comma, write a point: 212.7"],
         ),
         ("marker,d_A_cm,side,height_cm\n0,170,left,0\n", ["line 1: the column d_A_cm is missing"]),
         ("marker,d_A_m,d_B_cm,side,height_cm\n0,1.7,190,left,0\n", ["line 1: unknown column 'd_A_m'"]),
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0\n", ["rows name no place or time"]),
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n", ["holds no measurements"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0\n", ["rows without place and time"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n", ["has no measurements"]),
         ("", ["line 1: the column marker is missing"]),
     ],
 )
@@ -251,12 +255,12 @@ def test_two_processes_measure_in_one_log(unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as one, open_finished_log(log, Request()) as other:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
-        with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
+        with pytest.raises(LogError, match="another program wrote measurements into this log"):
             other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
         # The second process now sees the first one's entry: it continues after it, and they alternate.
         assert [m.id for m in other.history()] == ["p001"]
         other.add([Measurement(tape[0].timestamp, "p002", marker_id=0)])
-        with pytest.raises(LogError, match=r"meanwhile \(p002\), so this is not written yet"):
+        with pytest.raises(LogError, match=r"into this log \(p002\); check them, and save again"):
             one.add([withdrawal_of(one.history(), "p001")])
         one.add([withdrawal_of(one.history(), "p001")])
         with pytest.raises(LogError, match="p001_withdrawn"):
@@ -277,7 +281,7 @@ def test_a_rig_without_reference_points(ipsys: Ipsys, unmeasured: Unmeasured) ->
     rig = unmeasured.log.with_name("lab.toml")
     rig.write_text('name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n')
     line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--rig", rig)
-    assert "the rig has no reference points to lay the tape from" in line
+    assert "the rig has no reference points, but a tape needs two" in line
     assert "[[reference_points]]" in line
 
 
@@ -287,12 +291,12 @@ def test_log_without_stationary_intervals_is_refused(ipsys: Ipsys, lab: Path) ->
     log = rewrite(lab, lambda m: m if m.log_time_ns <= start_ns + 1_050_000_000 else None)
     done = ipsys("measure", log)
     assert done.code == 1
-    assert "no marker of the rig lies still in it" in done.err
+    assert "no marker of the rig is stationary" in done.err
 
 
 def test_exclusive_options_are_refused(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log = unmeasured.log
-    assert "exclude one another" in refused(ipsys, log, "measure", log, "--terminal", "--places")
+    assert "cannot be used together" in refused(ipsys, log, "measure", log, "--terminal", "--places")
 
 
 def test_the_terminal_asks_checks_and_undoes(
@@ -309,10 +313,10 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "distance to B: 1.234 cm looks like metres" in done.out
     assert "p001 is in the log" in done.out
     assert "p001 is withdrawn" in done.out
-    assert "1 place measured" in done.out
+    assert "1 point measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
     # withdrawn at the question for point 2, and back at point 1
-    places = re.findall(r"Place (\d+) of", done.out)
+    places = re.findall(r"Stationary interval (\d+) of", done.out)
     assert places == ["1", "2", "1"]
 
 
@@ -346,16 +350,16 @@ def test_bad_answer_in_the_terminal_is_asked_again(
         assert next(left, None) is None
     said = " ".join(capsys.readouterr().out.split())
     for text in (
-        "distance to A: 'hallo' is no number",
-        "3 cm is very near to B: in metres? Then type 300",
-        "no triangle has the sides",
-        "'up' is no side; type l or r",
+        "distance to A: 'hallo' is not a number",
+        "3 cm is very short; if it is in metres, type 300",
+        "cm do not meet, because",
+        "'up' is not a side; type l or r",
         "0,15 cm looks like metres; type 15",
-        "'perhaps' is neither yes nor no; type y or n",
+        "'perhaps' is not yes or no; type y or n",
         "p001 is in the log",
     ):
         assert text in said
-    assert said.count("a begins the place anew") == 1
+    assert said.count("a: start the point again") == 1
     with Session([log]) as session:
         (saved,) = session.payloads(session.topics(MEASUREMENTS))
     assert as_typed(saved).distances == first.distances
@@ -379,7 +383,7 @@ def test_terminal_entry_allows_a_second_process_to_measure(
         monkeypatch.setattr("typer.prompt", prompt)
         ask_places(scene)
     said = capsys.readouterr().out
-    assert "somebody else measured in this log meanwhile (p001)" in said
+    assert "another program wrote measurements into this log (p001)" in said
     assert "p002 is in the log" in said
     assert sorted(row.id for row in foreign_read(log)) == ["p001", "p002"]
 
@@ -395,7 +399,7 @@ def test_the_page_is_served_until_it_is_interrupted(unmeasured: Unmeasured) -> N
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=240)
     assert served.returncode == 0
-    assert out == f"0 places measured into {unmeasured.log}\n"
+    assert out == f"0 points measured into {unmeasured.log}\n"
     assert "Traceback" not in err
 
 

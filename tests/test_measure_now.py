@@ -155,7 +155,7 @@ def test_page_measures_points_until_it_is_stopped(
         out, err = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == 0, err
     assert "Traceback" not in err
-    assert f"6 places measured into {log}, 1 withdrawn" in out
+    assert f"6 points measured into {log}, 1 withdrawn" in out
     assert [row.withdraws for row in foreign_read(log)] == [""] * 6 + ["p002"]
     for name, count in counted(log).items():
         # from one second before the first point, and until the last one
@@ -210,10 +210,10 @@ def test_existing_log_is_kept_without_force(ipsys: Ipsys, still_lab: Lab, tmp_pa
     [
         (["measure"], "name a finished log, or give --rig lab.toml -o places.mcap"),
         (["measure", "-o", "a.mcap"], "name a finished log, or give --rig lab.toml"),
-        (["measure", "--rig", "RIG", "-o", "a.mcap", "--places"], "--places is for a finished log"),
-        (["measure", "--rig", "RIG", "-o", "a.mcap", "--csv", "s.csv"], "--csv is for a finished log"),
+        (["measure", "--rig", "RIG", "-o", "a.mcap", "--places"], "--places is only for a finished log"),
+        (["measure", "--rig", "RIG", "-o", "a.mcap", "--csv", "s.csv"], "--csv is only for a finished log"),
         (["measure", "LOG", "-o", "a.mcap"], "--output is for cameras"),
-        (["measure", "LOG", "--force"], "--force is for --csv, or cameras; leave it out"),
+        (["measure", "LOG", "--force"], "--force is only for --csv or live cameras; leave it out"),
         (
             ["measure", "--rig", "RIG", "-o", "LOG", "--model-from", "LOG", "--force"],
             "is the log with the model",
@@ -274,7 +274,7 @@ def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     code, told = typed([*command, "--calibration", str(still_lab.lenses)], answers)
     assert code == 0, told
     assert "Traceback" not in told
-    assert "1 place measured into" in told
+    assert "1 point measured into" in told
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
     assert all(5 < count < 40 for count in counted(log).values())
 

@@ -124,12 +124,12 @@ def test_password_is_asked_for_and_never_shown_or_recorded(
     assert b"hush" not in log.read_bytes()
     assert "hush" not in done.out + done.err
     done = ipsys("init", tmp_path / "again.toml", "--from", log)
-    assert "write that of each source in place of ***" in done.out
+    assert "in each source, replace *** by its password" in done.out
     done = ipsys("record", "--rig", tmp_path / "again.toml", "-o", tmp_path / "b.mcap", "--camera", "white")
     assert done.code == 1
     assert re.fullmatch(
-        r"ipsys: camera white: http://admin:\*\*\*@\S+/white: its password is not known, a log holds none; "
-        r"write it in place of \*\*\*\n",
+        r"ipsys: camera white: http://admin:\*\*\*@\S+/white: its password is missing, because a log "
+        r"holds none; replace \*\*\* by the password\n",
         done.err,
     )
 
@@ -384,7 +384,7 @@ def test_a_full_disk_ends_it_with_a_complete_log(
             done = ipsys("record", "--rig", rig, "-o", disk / "a.mcap", "--seconds", "60")
         found = frames(disk / "a.mcap")
     assert done.code == 1
-    assert "the disk is full; recording has stopped, and the log is complete" in done.err
+    assert "the disk is full; the recording has stopped. The log is complete" in done.err
     assert all(len(jpegs) > 5 for jpegs in found.values())
 
 
@@ -406,7 +406,7 @@ def test_existing_file_is_overwritten_only_with_the_option(
     ("cameras", "said"),
     [
         ('name = "red"', "no camera has a source"),
-        ('name = "red"\nsource = "carrier_pigeon:7"', "'carrier_pigeon:7' is none of"),
+        ('name = "red"\nsource = "carrier_pigeon:7"', "'carrier_pigeon:7' has an unknown type; use one of"),
         ('name = "red"\nsource = "http://127.0.0.1:9/x"', "http://127.0.0.1:9/x"),
         (
             'name = "red"\nsource = "a:1"\n[[cameras]]\nname = "white"\nsource = "a:1"',
@@ -414,7 +414,7 @@ def test_existing_file_is_overwritten_only_with_the_option(
         ),
         (
             'name = "red"\nsource = "usb:7"\n[[cameras]]\nname = "white"\nsource = "usb:/dev/video7"',
-            "cameras red and white are one device, /dev/video7",
+            "cameras red and white have the same device, /dev/video7",
         ),
         ('name = "red"\nstamp = "middle"', 'stamp is \'middle\'; write "start" or "end"'),
         ('name = "red"\nsourc = "a"', "unknown key 'sourc'"),
@@ -445,14 +445,16 @@ def test_calibration_is_scaled_to_another_size_of_the_same_shape(
         once = ("record", "--rig", rig, "--camera", "red", "--seconds", "1", "-o")
         done = ipsys(*once, tmp_path / "a.mcap", "--calibration", f"red={lens(640, 400)}")
         assert done.code == 1
-        assert "sends 320 x 240 px, its calibration is for 640 x 400, of another shape" in done.err
+        assert (
+            "sends 320 x 240 px, but its calibration is for 640 x 400, with another aspect ratio" in done.err
+        )
     with streams(pictures[0], tmp_path) as rig:
         done = ipsys(*once, tmp_path / "b.mcap", "--calibration", f"red={lens(640, 480)}")
         assert "camera red: its calibration is scaled from 640 to 320 px" in done.err
     video = encode(pictures[0].parent, "red.mp4", "-c:v", "libx264", "-bf", "0", "-pix_fmt", "yuv420p")
     rig.write_text(re.sub(r"http://\S+/red", f"file:{video}", rig.read_text()))
     done = ipsys(*once, tmp_path / "c.mcap", "--calibration", f"red={lens(640, 400)}")
-    assert "sends 320 x 240 px, its calibration is for 640 x 400, of another shape" in done.err
+    assert "sends 320 x 240 px, but its calibration is for 640 x 400, with another aspect ratio" in done.err
     with Session([tmp_path / "b.mcap"]) as session:
         (held,) = session.payloads([session.calibrations["red"]])
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)

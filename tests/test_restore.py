@@ -110,7 +110,7 @@ def test_killed_live_run_is_completed_by_repair(
         for command in ("info", "replay", "verify", "latency", "view"):
             done = ipsys(command, log)
             assert (done.code, done.err.count("\n")) == (1, 1)
-            assert "is being recorded or written just now" in done.err
+            assert "is being recorded or written now" in done.err
         assert "another process is writing it" in ipsys("repair", log).err
         assert program.poll() is None
         program.send_signal(signal.SIGKILL)
@@ -119,7 +119,7 @@ def test_killed_live_run_is_completed_by_repair(
     for command in ("info", "replay", "verify", "measure", "latency", "view"):
         done = ipsys(command, log)
         assert done.code == 1
-        assert f"its recorder was killed, or the file was cut off. What it holds can be saved. Run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
+        assert f"its recorder was killed, or the file was cut off. Its messages can be saved. Run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
     done = ipsys("repair", log)
     assert done.code == 0, done.err
     assert "monday.mcap repaired" in done.out
@@ -134,11 +134,11 @@ def test_killed_live_run_is_completed_by_repair(
             looked_at = session.count(f"/runs/edges/cameras/{camera}/markers")
             assert looked_at + skipped(session, camera) == session.count(topic) > 50
             assert looked_at > 20
-    assert ipsys("verify", log).out.endswith("a replay equals the log\n")
+    assert ipsys("verify", log).out.endswith("the replay is identical to the log\n")
     # A busy machine skips frames; a replay of all frames would be another run.
     done = ipsys("replay", log, "--as-live")
     assert done.code == 0, done.err
-    assert "nothing to do: all of it is up to date" in done.err
+    assert "nothing to do: all results are up to date" in done.err
     assert not [topic for topic in topics_of(log) if "_2/" in topic]
     again = pipeline.replay([log], Request(model_from=calibration, as_live=True))
     assert not any(one.fresh for one in again)
@@ -194,7 +194,7 @@ def test_run_with_other_content_is_left_unchanged(
                 write_message(writer, _moved(message, session.end_ns), counts)
     done = ipsys("repair", log)
     assert done.code == 0, done.err
-    assert "run poly was cut short, and is left so: /runs/poly/tracks is another one at" in done.err
+    assert "run poly stays unfinished: /runs/poly/tracks has other content at" in done.err
     apart = {one.topic for one in verify([log], None, lambda *_: None) if not one.equal}
     assert apart == {"/runs/poly/tracks", "/runs/poly/poses"}
     with Session([log]) as session:
@@ -259,7 +259,7 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
             frames = sum(session.count(topic) for topic in session.images.values())
             markers = sum(session.count(topic) for topic in session.topics(MARKERS, "edges"))
     assert program.returncode == 1, out
-    assert "the disk is full; recording has stopped, and the log is complete" in err
-    assert verified.out.endswith("a replay equals the log\n")
-    assert "nothing to do: all of it is up to date" in replayed.err
+    assert "the disk is full; the recording has stopped. The log is complete" in err
+    assert verified.out.endswith("the replay is identical to the log\n")
+    assert "nothing to do: all results are up to date" in replayed.err
     assert frames >= markers > 50

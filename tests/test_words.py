@@ -1,4 +1,4 @@
-"""Docstrings and comments are plain English: no sentence begins with a relative clause."""
+"""Docstrings, comments and texts are plain English: no sentence begins with a relative clause."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ import re
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
+from ipsys_log.cli.app import app
 from tests.conftest import ROOT
 
 # Such a sentence starts without a subject; with a question mark, it is a question.
 _OPENING = re.compile(r"(?:^|[.;:!?]\s+)(Who|What|Whether|Where|Of|That which)\b(?![^.]*\?)")
+# An error begins with a small letter.
+_TEXT_OPENING = re.compile(_OPENING.pattern, re.IGNORECASE)
 # Phrases of an earlier dialect; docs/glossary.md has the standard terms.
 _PHRASES = (
     "lies still",
@@ -28,9 +33,15 @@ _PHRASES = (
     "were not looked at",
     "how a camera hangs",
 )
+_TEXT_PHRASES = (*_PHRASES, "there is no such", "no such camera", "is no number", "anew", "is made first")
+# A shorter text is a part of a sentence, such as "of focus".
+_FEWEST_WORDS = 4
+# Stages write these texts into derived channels: docs/decisions/stage-texts.md. A new text is a new version.
+_STAGE_TEXTS: tuple[str, ...] = ()
 _FILES = sorted(
     path for folder in ("ipsys_log", "benchmarks", "tests") for path in ROOT.glob(f"{folder}/**/*.py")
 )
+_SOURCES = [path for path in _FILES if path.is_relative_to(ROOT / "ipsys_log")]
 
 
 def sentences(source: str) -> Iterator[tuple[int, str]]:
@@ -60,6 +71,49 @@ def faults(source: str) -> list[str]:
                 found.append(f"line {line}: begins with {opening[1]!r}: {' '.join(paragraph.split())[:70]}")
         found += [f"line {line}: {phrase!r}" for phrase in _PHRASES if phrase in plain.lower()]
     return found
+
+
+def texts(source: str) -> Iterator[tuple[int, str]]:
+    """Yield the strings of a source that are not docstrings, each with its line; x stands for a value."""
+    tree = ast.parse(source)
+    skipped: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr):
+            skipped.add(id(node.value))
+        elif isinstance(node, ast.JoinedStr):
+            skipped.update(id(part) for part in node.values if isinstance(part, ast.Constant))
+    for node in ast.walk(tree):
+        if id(node) in skipped:
+            continue
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value
+        elif isinstance(node, ast.JoinedStr):
+            parts = [str(part.value) if isinstance(part, ast.Constant) else "x" for part in node.values]
+            yield node.lineno, "".join(parts)
+
+
+def text_faults(text: str) -> list[str]:
+    """Return the faults of a text for a person: an error, a remark, a help text, a title."""
+    if len(text.split()) < _FEWEST_WORDS or text in _STAGE_TEXTS:
+        return []
+    found = []
+    for paragraph in re.split(r"\n\s*\n", text):
+        opening = _TEXT_OPENING.search(" ".join(paragraph.split()))
+        if opening:
+            found.append(f"{opening[1]!r} begins a sentence: {' '.join(paragraph.split())[:90]}")
+    return found + [f"{phrase!r}: {text[:90]}" for phrase in _TEXT_PHRASES if phrase in text.lower()]
+
+
+def help_texts(command: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the help of a command, of its options and of its subcommands, each with its name."""
+    yield path, command.help or ""
+    for parameter in command.params:
+        yield f"{path} {parameter.opts[0]}", getattr(parameter, "help", None) or ""
+    for name, subcommand in getattr(command, "commands", {}).items():
+        yield from help_texts(subcommand, f"{path} {name}")
+
+
+_HELP = list(help_texts(typer.main.get_command(app), "ipsys"))
 
 
 @pytest.mark.parametrize("path", _FILES, ids=[str(path.relative_to(ROOT)) for path in _FILES])
@@ -146,3 +200,33 @@ def test_page_guard_finds_texts_of_every_page() -> None:
     assert "Measured so far" in found["measure.html"]
     assert "Nothing yet." in found["measure.js"]
     assert "Error map" in found["session.html"]
+
+
+@pytest.mark.parametrize("path", _SOURCES, ids=[str(path.relative_to(ROOT)) for path in _SOURCES])
+def test_texts_for_people_are_plain(path: Path) -> None:
+    said = [(line, text_faults(text)) for line, text in texts(path.read_text(encoding="utf-8"))]
+    assert [f"line {line}: {fault}" for line, found in said for fault in found] == []
+
+
+@pytest.mark.parametrize(("name", "text"), _HELP, ids=[name for name, _ in _HELP])
+def test_help_is_plain(name: str, text: str) -> None:
+    assert text or name.endswith("--help")
+    assert text_faults(text) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        'raise IpsysError("what is recorded is not shown")',
+        'raise IpsysError(f"{path}: where it is seen, nobody knows")',
+        'say(f"{count} frames. Of these, one is right")',
+        'say("the camera has gone; plug it in " "anew")',
+        'help = "Whether the log is read again."',
+    ],
+)
+def test_the_guard_sees_a_fault_in_a_text(source: str) -> None:
+    assert [fault for _, text in texts(source) for fault in text_faults(text)]
+
+
+def test_a_question_is_no_fault_in_a_text() -> None:
+    assert text_faults("Where is the marker now?") == []

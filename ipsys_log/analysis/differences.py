@@ -63,7 +63,7 @@ def explain_no_overlap(first: Extent, second: Extent) -> str | None:
     """
     if not (len(first.times_ns) and len(second.times_ns)):
         side = "second" if len(first.times_ns) else "first"
-        text = f"the {side} has no markers, points, positions or tracks: run 'ipsys replay' on its log"
+        text = f"the {side} has no markers, camera points, positions or tracks: run 'ipsys replay' on its log"
         return text if len(first.times_ns) or len(second.times_ns) else None
     if first.cameras and second.cameras and not first.cameras & second.cameras:
         sides = _names(first.cameras), _names(second.cameras)
@@ -231,5 +231,5 @@ def _describe(left: _Row | None, right: _Row | None) -> str:
         return f"publish times differ by {right[1] - left[1]} ns, {time_text}"
     ids = sorted(left[3].keys() ^ right[3].keys())
     if ids:
-        return f"marker {ids[0]} is only in one of them, {time_text}"
+        return f"marker {ids[0]} is only in one of the messages, {time_text}"
     return f"content differs, {time_text}"

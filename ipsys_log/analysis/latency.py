@@ -86,7 +86,7 @@ def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
     with Session(paths) as session:
         latencies: list[Latency] = session.payloads(session.topics(LATENCY))
         if not latencies:
-            raise IpsysError(f"{session}: holds no latencies; only 'ipsys live' writes them")
+            raise IpsysError(f"{session}: has no latencies; only 'ipsys live' writes them")
     return latencies
 
 

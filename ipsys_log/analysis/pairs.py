@@ -68,8 +68,8 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
         points_m = np.array([row[1:] for row in values], dtype=np.float64)
         if not (np.abs(points_m) <= _FARTHEST_M).all():
             raise IpsysError(
-                f"camera {key[0]}: a camera point of marker {key[1]} is not a possible point; run "
-                "camera-frame again, with --run and another name"
+                f"camera {key[0]}: a camera point of marker {key[1]} is impossible; run camera-frame again, "
+                "with --run and another name"
             )
         sightings[key] = Sightings(times_ns, points_m)
     return sightings
@@ -119,7 +119,7 @@ def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement
         if measurement.id in active:
             raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
         if measurement.marker_id is None:
-            raise IpsysError(f"measurement {measurement.id} names no marker; withdraw it and measure again")
+            raise IpsysError(f"measurement {measurement.id} has no marker; withdraw it and measure again")
         active[measurement.id] = measurement
     return list(active.values())
 
@@ -182,7 +182,7 @@ def build_pairs(
         assert marker_id is not None  # active_measurements has checked it
         if not rig.knows(marker_id) or marker_id not in seen_ids:
             raise IpsysError(
-                f"measurement {measurement.id} names marker {marker_id}, which "
+                f"measurement {measurement.id} is of marker {marker_id}, which "
                 f"{'no camera saw' if rig.knows(marker_id) else 'is not in the rig'} "
                 f"(seen: {', '.join(map(str, seen_ids)) or 'none'}); correct the id or the rig"
             )
@@ -199,13 +199,13 @@ def build_pairs(
 
 
 def _check_duplicates(camera: str, pairs: Iterable[Pair]) -> None:
-    """Check that no pair occurs twice: it would count double, and a fit would know it when it is held out."""
+    """Check that no pair occurs twice: when one copy is held out, the other would stay in the fit."""
     seen: dict[bytes, str] = {}
     for pair in pairs:
         twin = seen.setdefault(pair.camera_m.tobytes() + pair.world_m.tobytes(), pair.measurement)
         if twin != pair.measurement:
             raise IpsysError(
-                f"camera {camera}: measurements {twin} and {pair.measurement} are one and the same pair, to "
+                f"camera {camera}: measurements {twin} and {pair.measurement} are the same pair, to "
                 "the last digit; withdraw one of them"
             )
 
@@ -244,15 +244,17 @@ def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[s
     measurements = list(measurements)
     labels = sorted({label for m in measurements for label in m.splits} - {"test"})
     if train == "test":
-        raise IpsysError("--train test: these places are held out to evaluate on; fit on other ones")
+        raise IpsysError(
+            "--train test: these points are held out for the evaluation; fit to points with another label"
+        )
     if not any(m.splits for m in measurements):
         ids = np.array(sorted(m.id for m in measurements))
         shuffled = np.random.default_rng(seed).permutation(ids).tolist()
         held_out = len(shuffled) // 5
         return set(shuffled[held_out:]), set(shuffled[:held_out])
     if train not in labels:
-        known = f"use --train with one of {', '.join(labels)}" if labels else "label some to fit on"
-        raise IpsysError(f"no measurement is labelled {train!r}; {known}")
+        known = f"use --train with one of {', '.join(labels)}" if labels else "label some for the fit"
+        raise IpsysError(f"no measurement has the label {train!r}; {known}")
     fitted = {m.id for m in measurements if train in m.splits}
     return fitted, {m.id for m in measurements if "test" in m.splits} - fitted
 
@@ -298,7 +300,7 @@ def locate_measurements(
     places, faults = [], []
     for measurement in active:
         if rig is None and measurement.point is None:
-            faults.append(f"measurement {measurement.id} cannot be placed: the log has no rig")
+            faults.append(f"measurement {measurement.id} has no position: the log has no rig")
             continue
         try:
             # The rig is not used if the measurement has a world point.

@@ -174,7 +174,7 @@ def plan_points(
     [1.0, 0.0, 0.0]
     """
     if not len(candidates_m):
-        raise IpsysError("the floor has no room to lay a marker on; correct width_m and depth_m in lab.toml")
+        raise IpsysError("the floor is too small for a marker; correct width_m and depth_m in lab.toml")
     shares = [_Share(view, floor_m, candidates_m, tape_m2, radius_m) for view in views]
     on_floor, near = (
         np.any([getattr(s, attribute) for s in shares], axis=0) for attribute in ("on_floor", "near")

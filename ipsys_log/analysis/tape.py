@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import crossing_angle, multilaterate, tape_covariance
 from ipsys_log.messages import Measurement, Rig
+from ipsys_log.units import CM_PER_M
 
 __all__ = [
     "RiggedMeasurement",
@@ -143,7 +144,7 @@ def reference_points(measurement: Measurement, rig: Rig) -> Array:
         if distance.reference not in known:
             raise IpsysError(
                 f"measurement {measurement.id}: reference point {distance.reference!r} is not in the rig "
-                f"(known: {', '.join(known) or 'none'}); add it to lab.toml and give that with --rig"
+                f"(known: {', '.join(known) or 'none'}); add it to lab.toml, and give the file with --rig"
             )
     return np.array([known[distance.reference] for distance in measurement.distances]).reshape(-1, 2)
 
@@ -191,12 +192,14 @@ def find_weak_points(places: Iterable[RiggedMeasurement]) -> list[WeakPoint]:
 def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
     if len(measurement.distances) < 2 or measurement.height_m is None:
         raise IpsysError(
-            f"{where} has neither a world point nor two distances, or more, and a height; measure it again"
+            f"{where} needs a world point, or two or more distances and a height; measure it again"
         )
     _check_lengths(measurement, where)
     references_m = reference_points(measurement, rig)
     if len({distance.reference for distance in measurement.distances}) < 2:
-        raise IpsysError(f"{where}: all its distances are from one reference point; measure from another too")
+        raise IpsysError(
+            f"{where}: all its distances are from one reference point; measure from another one, too"
+        )
     distances_m = np.array([distance.distance_m for distance in measurement.distances])
     sigmas_m = _tape_sigmas(measurement, rig, where)
     try:
@@ -229,7 +232,8 @@ def _check_lengths(measurement: Measurement, where: str) -> None:
     for distance in measurement.distances:
         if not abs(distance.distance_m) <= _FARTHEST_M:
             raise IpsysError(
-                f"{where}: a tape of {distance.distance_m:g} m is too long; withdraw it and measure again"
+                f"{where}: a tape of {distance.distance_m * CM_PER_M:g} cm is too long; withdraw it and "
+                "measure again"
             )
 
 
@@ -240,5 +244,7 @@ def _check_point(world_m: Array, where: str) -> None:
 
 def _check_sigma(sigma_m: float, where: str) -> float:
     if not 0 <= sigma_m <= _FARTHEST_M:
-        raise IpsysError(f"{where}: {sigma_m} m is no standard deviation; withdraw it and measure it again")
+        raise IpsysError(
+            f"{where}: {sigma_m} m is not a standard deviation; withdraw it and measure it again"
+        )
     return max(sigma_m, _FINEST_M)

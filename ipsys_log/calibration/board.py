@@ -81,22 +81,27 @@ def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str
     match = _FORM.fullmatch(text.strip().lower())
     if match is None:
         raise IpsysError(
-            f"--board {text}: write the inner corners of a chessboard as 6x4, or the squares of a ChArUco "
-            "board as charuco:4x5"
+            f"--board {text}: is not a board; write the inner corners of a chessboard as 6x4, or the squares "
+            "of a ChArUco board as charuco:4x5"
         )
     columns, rows = int(match["columns"]), int(match["rows"])
     charuco = match["kind"] == "charuco:"
     least = 3
     if not (least <= columns <= _MOST and least <= rows <= _MOST):
         unit = "squares" if charuco else "inner corners"
-        raise IpsysError(f"--board {text}: a board has {least} to {_MOST} {unit} in each direction")
+        raise IpsysError(
+            f"--board {text}: has a wrong size; a board has {least} to {_MOST} {unit} in each direction"
+        )
     if not 1e-4 <= square_m <= 10:
-        raise IpsysError(f"--square {square_m:g}: give the side of a square in metres, such as 0.03")
+        raise IpsysError(
+            f"--square {square_m:g}: is not a length; give the side of a square in metres, such as 0.03"
+        )
     if not charuco:
         return Board(columns, rows, square_m, inverted=inverted)
     if not 0.1 <= marker_scale <= 0.95:
         raise IpsysError(
-            f"--marker-scale {marker_scale:g}: give a marker's side as a share of a square's, as 0.75"
+            f"--marker-scale {marker_scale:g}: is not between 0 and 1; give the side of a marker as a "
+            "fraction of the side of a square, such as 0.75"
         )
     board = Board(columns, rows, square_m, marker_scale, dictionary.upper(), inverted)
     _check_dictionary(board)
@@ -106,12 +111,16 @@ def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str
 def _check_dictionary(board: Board) -> None:
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
-        raise IpsysError(f"--dictionary {board.dictionary}: none of OpenCV's; such as DICT_4X4_50")
+        raise IpsysError(
+            f"--dictionary {board.dictionary}: is unknown to OpenCV; give one such as DICT_4X4_50"
+        )
     markers = board.columns * board.rows // 2
     known = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
     if markers > known:
         raise IpsysError(
-            f"--dictionary {board.dictionary}: has {known} markers, the board {markers}; name a larger one"
+            f"--dictionary {board.dictionary}: has {known} markers, but the board has {markers}; give a "
+            "larger "
+            "dictionary"
         )
 
 

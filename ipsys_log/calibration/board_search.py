@@ -95,13 +95,13 @@ def search_images(
         (without if view.sighting is None else shown).add(grey)
         progress(count)
     if not views:
-        raise IpsysError(f"{source}: none of {count} pictures can be read")
+        raise IpsysError(f"{source}: none of the {count} pictures can be read; check the files")
     usual_size = check_sizes([(viewed.name, viewed.size) for viewed in views], source)
     if all(viewed.view.sighting is None for viewed in views):
         hint_text = describe_other_board(
             without.images, board, trying, [viewed.view.grid for viewed in views]
         )
-        raise NotSeenError(f"{source}: {board} is not seen in any of {count} pictures{hint_text}")
+        raise NotSeenError(f"{source}: {board} is not found in any of the {count} pictures{hint_text}")
     if not force and board.marker_scale is None:
         check_chessboard_size([viewed.view.grid for viewed in views], board, source)
     elif not force:
@@ -120,11 +120,11 @@ def search_images(
 
 def _reason(view: View, board: Board) -> str:
     if view.grid is None:
-        return "the board is not seen"
+        return "the board is not found"
     columns, rows = view.grid
     if fits_in(view.grid, board.grid):
-        return f"only {columns} x {rows} of its corners are seen"
-    return f"a grid of {columns} x {rows} corners is seen instead"
+        return f"only {columns} x {rows} of its corners are found"
+    return f"a grid of {columns} x {rows} corners is found instead"
 
 
 def check_sizes(sizes: Sequence[tuple[str, Size]], source: str) -> Size:

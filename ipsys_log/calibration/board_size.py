@@ -146,10 +146,10 @@ def describe_other_board(
             return answer
     if board.marker_scale is None:
         return (
-            "; give the inner corners, one less than the squares in each direction, and see that the whole "
-            "board is in the picture, with a white margin"
+            "; give the number of inner corners, which is one less than the squares in each direction, and "
+            "show the whole board, with a white margin"
         )
-    return "; give columns x rows of its squares, and the --dictionary that its markers are of"
+    return "; give columns x rows of its squares, and the --dictionary of its markers"
 
 
 def check_chessboard_size(sizes: Sequence[Size | None], board: Board, source: str) -> None:
@@ -174,7 +174,7 @@ def check_chessboard_size(sizes: Sequence[Size | None], board: Board, source: st
     larger_board = _sized(board, larger)
     shown = sum(_same(size, larger) for size in sizes)
     raise IpsysError(
-        f"{source}: {board} is a part of {larger_board}, which {shown} of {total} pictures of a board show: "
+        f"{source}: {board} is only a part of the board: {shown} of {total} pictures show {larger_board}; "
         f"give --board {larger_board.columns}x{larger_board.rows}; {_FORCE}"
     )
 
@@ -194,9 +194,9 @@ def check_charuco_size(images: Sequence[Grey], board: Board, source: str) -> Non
         return
     rows = max(size.rows, board.rows) if size.columns == board.columns else size.rows
     raise IpsysError(
-        f"{source}: {size.image_count} of {len(images)} tried pictures have the markers of "
-        f"{replace(board, columns=size.columns, rows=rows)} or more, not of {board.columns} x {board.rows}: "
-        f"give --board charuco:{size.columns}x{rows}; {_FORCE}"
+        f"{source}: {size.image_count} of {len(images)} checked pictures show the markers of "
+        f"{replace(board, columns=size.columns, rows=rows)} or a larger board, not of {board.columns} x "
+        f"{board.rows}; give --board charuco:{size.columns}x{rows}; {_FORCE}"
     )
 
 
@@ -206,8 +206,8 @@ def _mirrored(images: Sequence[Grey], board: Board) -> str:
     if not seen:
         return ""
     return (
-        f"; but it is seen mirrored in {seen} of {len(images)} tried: webcam programs may mirror pictures; "
-        "turn that off, and take the pictures again"
+        f"; but it is mirrored in {seen} of {len(images)} checked pictures: some webcam programs mirror "
+        "images; turn this off, and take the pictures again"
     )
 
 
@@ -238,7 +238,7 @@ def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
     seen_count = sum(_same(shown, size) for shown in sizes)
     option = f"--board {seen_board.columns}x{seen_board.rows}"
     turn = f" and {_inversion(board)}" if kind.inverted != board.inverted else ""
-    return f"; but {seen_board} is seen in {seen_count} of {len(sizes)} tried: give {option}{turn}"
+    return f"; but {seen_board} is in {seen_count} of {len(sizes)} checked pictures: give {option}{turn}"
 
 
 def _other_charuco(images: Sequence[Grey], kind: Board, board: Board) -> str:
@@ -254,7 +254,9 @@ def _other_charuco(images: Sequence[Grey], kind: Board, board: Board) -> str:
     if not options:
         return ""
     options_text = " and ".join(options)
-    return f"; but {seen_board} is seen in {size.image_count} of {len(images)} tried: give {options_text}"
+    return (
+        f"; but {seen_board} is in {size.image_count} of {len(images)} checked pictures: give {options_text}"
+    )
 
 
 def _largest_board(sizes: Sequence[Size | None]) -> Size | None:

@@ -133,14 +133,14 @@ def calibrate(
     faults.append(_large_error_fault(model, solved, corners, search.size_px))
     _refuse(camera, faults, force)
     faults.append(_few_images_fault(camera, fitted, bad, search, force))
-    notes = tuple(f"written only for --force: {fault}" for fault in faults if fault)
+    notes = tuple(f"written only because of --force: {fault}" for fault in faults if fault)
     return _build_result(camera, model, search, fitted, solved, bad, chosen.spare, notes)
 
 
 def _refuse(camera: str, faults: list[str], force: bool) -> None:
     for fault in faults:
         if fault and not force:
-            raise IpsysError(f"camera {camera}: {fault}; or give --force")
+            raise IpsysError(f"camera {camera}: {fault}; or use --force")
 
 
 def _start(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
@@ -152,8 +152,9 @@ def _start(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, 
 
 def _too_similar_error(camera: str) -> IpsysError:
     return IpsysError(
-        f"camera {camera}: the pictures do not tell the lens, for they show the board in too few ways; "
-        "tilt it to all sides, and hold it near and far and all over the image"
+        f"camera {camera}: the intrinsics cannot be estimated, because the poses of the board are too "
+        "similar; "
+        "tilt it to all sides, near and far, in all parts of the image"
     )
 
 
@@ -195,7 +196,7 @@ def _large_error_fault(
     better = find_better_model(model, corners, size_px, error_px)
     todo = "check that the board is flat, that its size is right, and that all pictures are of one camera"
     if better is not None:
-        todo = f"--lens {better.name} leaves {better.rms_px:.2f} px: use it"
+        todo = f"use --lens {better.name}, with an error of {better.rms_px:.2f} px"
     return f"the RMS reprojection error is {error_px:.1f} px, too large for a usable calibration; {todo}"
 
 
@@ -209,7 +210,7 @@ def _few_images_fault(
     reasons_text = (
         f" ({'; '.join(f'{n} x {reason}' for reason, n in reasons.most_common(3))})" if reasons else ""
     )
-    todo = ["take at least 15, with the board all over the image and tilted to all sides"]
+    todo = ["take at least 15, with the board in all parts of the image and tilted to all sides"]
     if used:
         pixels = np.concatenate([s.pixels for s in used])
         coverage = measure_coverage(pixels, search.size_px, np.stack([s.outline for s in used]))
@@ -289,18 +290,18 @@ def _doubts(model: LensModel, solved: SolveResult, size_px: tuple[int, int]) -> 
         better = find_better_model(model, solved.corners, size_px, error_px)
         if better is not None:
             notes.append(
-                f"the RMS reprojection error is {error_px:.2f} px; --lens {better.name} leaves "
-                f"{better.rms_px:.2f} px: use it"
+                f"the RMS reprojection error is {error_px:.2f} px; with --lens {better.name} it is "
+                f"{better.rms_px:.2f} px: use this lens model"
             )
         elif error_px > _OFF_PX:
             notes.append(f"the RMS reprojection error is {error_px:.1f} px: check that the board is flat")
     unsure = float((sigmas[:2] / lens[:2]).max())
     if unsure > _UNSURE:
         notes.append(
-            f"the focal length is only known to {unsure:.1%}: add pictures with the board tilted and near"
+            f"the focal length is uncertain ({unsure:.1%}): add pictures with the board tilted and near"
         )
     if model.distortion_model == "rational_polynomial" and sigmas[4:].max() > _UNTOLD:
-        notes.append("these pictures do not tell eight coefficients from one another: use --lens pinhole")
+        notes.append("eight coefficients cannot be estimated from these pictures: use --lens pinhole")
     return notes
 
 
@@ -309,8 +310,8 @@ def _softness(used: list[BoardSighting]) -> list[str]:
     if soft_px < _SOFT_PX:
         return []
     return [
-        f"edges are {soft_px:.1f} px wide in all pictures: more light, a shorter exposure or a sharper focus "
-        "would help"
+        f"edges are {soft_px:.1f} px wide in all pictures: add light, shorten the exposure, or correct the "
+        "focus"
     ]
 
 

@@ -115,16 +115,16 @@ def advise(coverage: Coverage) -> list[str]:
     if coverage.empty_sides:
         *most, last = coverage.empty_sides
         sides = f"{', '.join(most)} and {last} edges" if most else f"{last} edge"
-        lines.append(f"no board near the {sides} of the image: hold it there too")
+        lines.append(f"no board near the {sides} of the image: move it there, too")
     elif coverage.share < _ENOUGH_SHARE:
-        lines.append(f"the board covered {coverage.share:.0%} of the image: move it all over the view")
+        lines.append(f"the board covered {coverage.share:.0%} of the image: move it over the whole image")
     if coverage.position_count < _ENOUGH_PLACES:
-        places = "place that differs" if coverage.position_count == 1 else "places that differ"
+        places = "position" if coverage.position_count == 1 else "different positions"
         lines.append(f"the board was held at {coverage.position_count} {places}: move it more")
     if coverage.tilted < _ENOUGH_TILTED:
         lines.append(
             f"tilted by 25 degrees or more in {coverage.tilted} pictures: tilt the board to all sides, "
-            "for the focal length is told from that"
+            "because the focal length depends on the tilt"
         )
     return lines
 
@@ -189,9 +189,9 @@ def _fault(sighting: BoardSighting, board: Board, usual_px: float) -> str | None
         count < LEAST_CORNERS
         or min(len(set(line)) for line in board.grid_positions(sighting.ids).T.tolist()) < 2
     ):
-        return f"only {count} corners are seen" if count < LEAST_CORNERS else "its corners lie on one line"
+        return f"only {count} corners are found" if count < LEAST_CORNERS else "its corners lie on one line"
     if usual_px and sighting.blur_px > max(_BLURRED * usual_px, _BLURRED_PX):
-        return f"blurred: edges are {sighting.blur_px:.1f} px wide, in the sharp pictures {usual_px:.1f}"
+        return f"blurred: edges are {sighting.blur_px:.1f} px wide, but {usual_px:.1f} px in sharp pictures"
     return None
 
 
@@ -214,7 +214,7 @@ def _spread(
         distances = np.minimum(distances, new_distances)
     used = set(order)
     spare = [
-        ExcludedSighting(s.name, f"shows the board nearly as {good[nearest[n]].name} does")
+        ExcludedSighting(s.name, f"the board has nearly the same pose as in {good[nearest[n]].name}")
         for n, s in enumerate(good)
         if n not in used
     ]

@@ -83,7 +83,7 @@ def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[ImageSou
     missing = [camera for camera in cameras if camera not in by_camera]
     if missing:
         known = ", ".join(by_camera)
-        raise IpsysError(f"--camera {missing[0]}: there are no frames of such a camera (only of {known})")
+        raise IpsysError(f"--camera {missing[0]}: this camera has no frames; the cameras are {known}")
     wanted = {c: parts for c, parts in by_camera.items() if not cameras or c in cameras}
     return [_joined(camera, parts) for camera, parts in wanted.items()]
 
@@ -107,7 +107,7 @@ def _sources_of(path: Path, cameras: Sequence[str]) -> list[ImageSource]:
     if path.is_dir():
         return _folder(path, cameras)
     if not path.is_file():
-        raise IpsysError(f"{path}: there is no such log, folder, picture or video")
+        raise IpsysError(f"{path}: does not exist; give a log, folder, picture or video")
     if path.suffix.lower() == ".mcap":
         return _log(path, requested=bool(cameras))
     if path.suffix.lower() in _IMAGE_SUFFIXES:
@@ -116,12 +116,12 @@ def _sources_of(path: Path, cameras: Sequence[str]) -> list[ImageSource]:
     if path.suffix.lower() in _VIDEOS:
         return [_video(path, cameras)]
     image, video = _IMAGE_SUFFIXES[0], _VIDEOS[0]
-    raise IpsysError(f"{path}: is neither a log (.mcap), a picture ({image} ...) nor a video ({video} ...)")
+    raise IpsysError(f"{path}: is not a log (.mcap), a picture ({image} ...) or a video ({video} ...)")
 
 
 def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
     if len(cameras) > 1:
-        raise IpsysError(f"{path}: is of one camera; give one --camera, or calibrate one after the other")
+        raise IpsysError(f"{path}: is of one camera, but several are given; give one --camera")
     if cameras:
         return check_name(cameras[0], "--camera")
     name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
@@ -190,7 +190,7 @@ def _video(path: Path, cameras: Sequence[str]) -> ImageSource:
     total, opened = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.isOpened()
     video.release()
     if not opened:
-        raise IpsysError(f"{path}: is no video that can be read; convert it to H.264 in an .mp4")
+        raise IpsysError(f"{path}: cannot be read as a video; convert it to H.264 in an .mp4")
     name = _camera_name(path.stem, path, cameras)
     return ImageSource(name, str(path), max(total, 0), partial(_read_video, path, _stride(total)))
 

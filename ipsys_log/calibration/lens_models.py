@@ -203,5 +203,5 @@ def find_lens_model(name: str) -> LensModel:
         There is no lens model with this name.
     """
     if name not in LENS_MODELS:
-        raise IpsysError(f"--lens {name}: there is no such lens; use one of {', '.join(LENS_MODELS)}")
+        raise IpsysError(f"--lens {name}: is not known; use one of {', '.join(LENS_MODELS)}")
     return LENS_MODELS[name]

@@ -337,8 +337,10 @@ def _split_outliers(corners: Corners, residuals_px: Array) -> tuple[NDArray[np.b
     excluded = []
     for n in np.flatnonzero(scattered | off):
         if scattered[n]:
-            reason = f"corners far off: {counts[n] - remaining[n]:.0f} of {counts[n]:.0f}"
+            reason = f"wrong corners: {counts[n] - remaining[n]:.0f} of {counts[n]:.0f}"
         else:
-            reason = f"does not fit: its corners are {rest_px[n]:.2f} px off, usually {usual_px:.2f}"
+            reason = (
+                f"does not fit: its reprojection error is {rest_px[n]:.2f} px, but usually {usual_px:.2f} px"
+            )
         excluded.append(ExcludedImage(int(n), reason))
     return near & ~(scattered | off)[corners.image_numbers], excluded

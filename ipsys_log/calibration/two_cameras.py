@@ -213,8 +213,8 @@ def two_cameras_fault(split: TwoCameras, names: Sequence[str]) -> str:
     """Return the fault text for images of two cameras, with the images of each camera."""
     groups = ", ".join(_named(names, split.second == second) for second in (False, True))
     return (
-        f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; one set of "
-        f"intrinsics leaves {split.one_px:.2f} px, two leave {split.two_px:.2f}"
+        f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; the reprojection "
+        f"error is {split.one_px:.2f} px with one set of intrinsics, {split.two_px:.2f} px with two"
     )
 
 

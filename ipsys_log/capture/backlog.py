@@ -176,7 +176,7 @@ class Backlog:
         for late in skipped:
             camera = str(late.camera)
             self.skipped[camera] += 1
-            text = f"a frame of camera {camera} is recorded but was not looked at: the stages are too slow"
+            text = f"a frame of camera {camera} is skipped: processing cannot keep up. The frame is recorded"
             event = Event(late.log_time_ns, FRAME_SKIPPED, text, camera)
             self._log.put(Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event))
 

@@ -117,7 +117,7 @@ class CameraReader:
         if not begun:
             raise SourceError(
                 f"camera {self._camera.name}: {hide_password(str(self._camera.source))} sends no frames; "
-                "look whether another program uses it"
+                "check that no other program uses it"
             )
 
     def _attend(self) -> None:
@@ -136,7 +136,10 @@ class CameraReader:
             self.fault = fault
             if self._has_first_frame.is_set():
                 # The other cameras may run for hours. The traceback is shown only after they have ended.
-                text = f"camera {self._camera.name}: the program failed ({fault!r}); nothing more comes of it"
+                text = (
+                    f"camera {self._camera.name}: internal error ({fault!r}); this camera is no "
+                    "longer recorded"
+                )
                 self._say("camera_failed", text)
         finally:
             self._report_lost(now=True)
@@ -160,7 +163,7 @@ class CameraReader:
         except SourceError as error:
             if self.state.up:
                 self.state.up, self._lost_ns = False, shared.clock.now_ns()
-                self._say("camera_lost", f"{error}; trying again")
+                self._say("camera_lost", f"{error}; ipsys tries again")
             return error
         return None
 
@@ -220,8 +223,8 @@ class CameraReader:
         if self._since_key == MAX_FRAMES_WITHOUT_KEYFRAME:
             text = (
                 f"camera {self._camera.name}: no keyframe in {MAX_FRAMES_WITHOUT_KEYFRAME} frames; "
-                "after one that is skipped or damaged nothing can be looked at; "
-                "set its keyframe interval (GOP) to a second or two"
+                "frames after a skipped or damaged one cannot be decoded until the next keyframe; "
+                "set its keyframe interval (GOP) to 1 or 2 s"
             )
             self._say_once("no_keyframes", text)
 
@@ -231,11 +234,12 @@ class CameraReader:
         if before in (None, frame.format):
             return
         text = (
-            f"camera {name}: sends {frame.format} now, and {before} before, and no log holds both; "
-            f"set it back to {before}, or begin a new recording"
+            f"camera {name}: its format changed from {before} to {frame.format}, but a log can hold "
+            "only one; "
+            f"set the camera to {before}, or start a new recording"
         )
         if not self.state.up:
-            self._say_once("camera_lost", f"{text}; trying again")
+            self._say_once("camera_lost", f"{text}; ipsys tries again")
         raise SourceError(text)
 
     def _note_size(self, frame: Frame) -> None:
@@ -249,8 +253,8 @@ class CameraReader:
         self.state.size_px = size_px
         if before is not None:
             new, old = (f"{width} x {height} px" for width, height in (size_px, before))
-            text = f"camera {self._camera.name}: its pictures are {new} now, and were {old}; calibrations "
-            self._say("camera_size", f"{text}are for one size: set it back")
+            text = f"camera {self._camera.name}: its image size changed from {old} to {new}; a calibration "
+            self._say("camera_size", f"{text}is valid for one size; set it back")
 
     def _report_lost(self, now: bool = False) -> None:
         """Report the frames lost since the last report."""
@@ -262,7 +266,10 @@ class CameraReader:
         missed = state.missed - self._missed_before
         if missed and (now or time_ns - self._missed_named_ns >= _NAMED_EVERY_NS):
             self._missed_before, self._missed_named_ns = state.missed, time_ns
-            self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
+            self._say(
+                "frames_missed",
+                f"{missed} frames of camera {name} are missing: the camera or its driver lost them",
+            )
 
     def _report_late(self, now_ns: int) -> None:
         """Write an event before the first late frame without a stamp."""
@@ -270,9 +277,9 @@ class CameraReader:
         if stall is None:
             return
         text = (
-            f"camera {self._camera.name}: the recorder stood still for "
-            f"{(stall.end_ns - stall.start_ns) / NS_PER_S:.1f} s; its frames come late now, and their times "
-            "are not right"
+            f"camera {self._camera.name}: the recorder was suspended for "
+            f"{(stall.end_ns - stall.start_ns) / NS_PER_S:.1f} s; its frames arrive late now, with "
+            "wrong times"
         )
         self._say(STAMP_UNRELIABLE, text, stall.start_ns)
 
@@ -282,8 +289,8 @@ class CameraReader:
         if start_ns is None or end_ns is None or not self._late.has_caught_up():
             return
         text = (
-            f"camera {self._camera.name}: its frames are in time again; those from {format_time(start_ns)} "
-            f"to {format_time(end_ns)} UTC came late"
+            f"camera {self._camera.name}: its frames arrive in time again; the frames from "
+            f"{format_time(start_ns)} to {format_time(end_ns)} UTC were late"
         )
         self._say(STAMP_UNRELIABLE, text, start_ns, end_ns)
 

@@ -53,15 +53,19 @@ def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
     """
     number = (camera.source or "").partition(":")[2]
     if not number.isdecimal():
-        raise SourceError(f"camera {camera.name}: {camera.source}: here a camera has a number: usb:0, usb:1")
+        raise SourceError(
+            f"camera {camera.name}: {camera.source}: this system numbers its cameras; write usb:0 or usb:1"
+        )
     device = cv2.VideoCapture(int(number))
     try:
         if not device.isOpened():
-            raise SourceError(f"camera {camera.name}: there is no camera {number}, or another program has it")
+            raise SourceError(
+                f"camera {camera.name}: camera number {number} does not exist, or another program uses it"
+            )
         report_refused_settings(camera, _set(device, camera), say)
         say(
-            f"camera {camera.name}: this system hands over decoded pictures; they are encoded as JPEG again, "
-            "and get their time of arrival"
+            f"camera {camera.name}: this system gives only decoded images; ipsys encodes them as JPEG again, "
+            "with their time of arrival"
         )
         yield _frames(device, f"camera {camera.name}: {camera.source}")
     finally:
@@ -103,7 +107,7 @@ def _frames(device: cv2.VideoCapture, label: str) -> Iterator[Frame | None]:
     while True:
         success, image = device.read()
         if not success:
-            raise SourceError(f"{label}: sends no frames; plug it in anew, or into another USB port")
+            raise SourceError(f"{label}: sends no frames; plug it in again, or into another USB port")
         data = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=_QUALITY, colorspace="BGR")
         yield Frame(data, "jpeg", None)
 
@@ -166,7 +170,7 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
             other = names.setdefault(device, camera.name)
             if other != camera.name:
                 raise IpsysError(
-                    f"cameras {other} and {camera.name} are one device, {device}; give each its own"
+                    f"cameras {other} and {camera.name} have the same device, {device}; give each its own"
                 )
 
 
@@ -188,8 +192,8 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
             check_playback_source(camera)
         elif sys.platform == "linux" and not Path(device_path(source)).exists():
             raise IpsysError(
-                f"camera {camera.name}: there is no device {device_path(source)!r}; 'ipsys cameras' "
-                "lists what is attached"
+                f"camera {camera.name}: device {device_path(source)!r} does not exist; 'ipsys cameras' "
+                "lists the attached cameras"
             )
 
 
@@ -216,18 +220,18 @@ def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextMan
 def _opener(camera: RigCamera) -> Open:
     if not camera.source:
         raise IpsysError(
-            f'camera {camera.name}: the rig gives no source; write e.g. source = "usb:/dev/video0"'
+            f'camera {camera.name}: has no source in the rig; write, for example, source = "usb:/dev/video0"'
         )
     shown = hide_password(camera.source)
     if shown == camera.source and (f"{HIDDEN}@" in shown or f"={HIDDEN}" in shown):
         raise IpsysError(
-            f"camera {camera.name}: {shown}: its password is not known, a log holds none; write it in place "
-            f"of {HIDDEN}"
+            f"camera {camera.name}: {shown}: its password is missing, because a log holds none; replace "
+            f"{HIDDEN} by the password"
         )
     opener = OPENERS.get(camera.source.partition(":")[0].lower())
     if opener is None:
         if shown.startswith("/dev/"):
-            raise IpsysError(f'camera {camera.name}: source {shown!r}: write it as "usb:{shown}"')
+            raise IpsysError(f'camera {camera.name}: source {shown!r}: has no type; write "usb:{shown}"')
         schemes = ", ".join(f"{scheme}:" for scheme in OPENERS)
-        raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {schemes}")
+        raise IpsysError(f"camera {camera.name}: source {shown!r} has an unknown type; use one of {schemes}")
     return opener

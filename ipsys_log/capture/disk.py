@@ -135,7 +135,7 @@ def describe_disk_full(path: Path, error: WriteError) -> str:
     )
     size = format_bytes(path.stat().st_size)
     return (
-        f"{path}: {cause}; recording has stopped, and the log is complete up to then: "
+        f"{path}: {cause}; the recording has stopped. The log is complete up to this time: "
         f"{count} messages, {seconds:.1f} s, {size}. {remedy}"
     )
 
@@ -143,7 +143,8 @@ def describe_disk_full(path: Path, error: WriteError) -> str:
 def describe_disk_failure(path: Path, fault: OSError) -> str:
     """Describe what to do with a log that may be incomplete on a failed disk."""
     return (
-        f"{path}: {describe_disk_fault(fault)} during the recording; messages may be lost. To check the log: "
+        f"{path}: {describe_disk_fault(fault)} during the recording; messages may be missing. To check "
+        "the log: "
         f"ipsys repair {path}. Record to another disk"
     )
 
@@ -184,7 +185,7 @@ class DiskRoom:
         return self.free_bytes / self.bytes_per_s if self.bytes_per_s > 0 else None
 
     def is_short(self, seconds: float | None = None) -> bool:
-        """Return whether the disk is full before ``seconds``, or before 10 minutes if no end is set."""
+        """Return whether the disk will be full within ``seconds``; within 10 minutes if no end is set."""
         return self.remaining_s is not None and self.remaining_s < (
             LOW_DISK_WARNING_S if seconds is None else seconds
         )
@@ -218,9 +219,9 @@ class DiskRoom:
         rate_hz = max((camera.rate_hz or _USUAL_RATE_HZ for camera in cameras), default=_USUAL_RATE_HZ)
         ways = [f"a lower rate_hz in lab.toml ({rate_hz / 2:g} halves it)", "a smaller width and height"]
         if any(state.format == "jpeg" for state in states.values()):
-            ways.append("a lower JPEG quality or H.264, where the camera can")
-        ways.append("ipsys measure, which keeps only a second of each place")
-        return "to make it smaller: " + "; ".join(ways)
+            ways.append("a lower JPEG quality or H.264, if the camera supports it")
+        ways.append("ipsys measure, which keeps only about 1 s of frames of each point")
+        return "to use less disk space: " + "; ".join(ways)
 
 
 def expected_bytes_per_s(cameras: Iterable[RigCamera], states: Mapping[str, CameraState]) -> float:

@@ -118,7 +118,7 @@ _NEAR = 0.01
 class ActualSettings(NamedTuple):
     """The actual settings of a camera.
 
-    None means that the camera does not let us set the value. For the rate, None means that it is not known.
+    None means that the camera cannot set the value. For the rate, None means that it is not known.
     """
 
     width: int | None = None
@@ -141,12 +141,15 @@ def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Sa
     Examples
     --------
     >>> report_refused_settings(RigCamera("red", rate_hz=60.0), ActualSettings(1920, 1080, 30.0), print)
-    camera red: asked for 60 frames/s, gives 30
+    camera red: asked for 60 frames/s, but the camera gives 30
     """
     size = (camera.width or settings.width, camera.height or settings.height)
     if settings.width and settings.height and size != (settings.width, settings.height):
         text = " x ".join(str(side) for side in size)
-        say(f"camera {camera.name}: asked for {text} px, gives {settings.width} x {settings.height}")
+        say(
+            f"camera {camera.name}: asked for {text} px, but the camera gives {settings.width} x "
+            f"{settings.height}"
+        )
     rows = (
         ("frames/s", camera.rate_hz, settings.rate_hz),
         ("s of exposure", camera.exposure_s, settings.exposure_s),
@@ -157,9 +160,9 @@ def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Sa
         if requested is None or (actual is None and unit == "frames/s"):
             continue
         if actual is None:
-            say(f"camera {camera.name}: asked for {requested:g} {unit}, which it does not let us set")
+            say(f"camera {camera.name}: asked for {requested:g} {unit}, but the camera cannot set this")
         elif abs(requested - actual) > _NEAR * max(abs(requested), abs(actual)):
-            say(f"camera {camera.name}: asked for {requested:g} {unit}, gives {actual:g}")
+            say(f"camera {camera.name}: asked for {requested:g} {unit}, but the camera gives {actual:g}")
 
 
 def device_path(source: str) -> str:

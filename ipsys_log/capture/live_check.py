@@ -102,9 +102,9 @@ class CameraMonitor:
         sharpness = fine / max(best, 1e-9)
         warnings = [f"marker {n} is seen {count} times" for n, count in sorted(counts.items()) if count > 1]
         if brightness < _DARK or spread < _FLAT:
-            warnings.append("the picture is dark or empty: is the lens covered?")
+            warnings.append("the image is dark or empty: check that the lens is not covered")
         elif sharpness < _BLURRED:
-            warnings.append("blurred: give it more light, or a fixed exposure_s in lab.toml")
+            warnings.append("the image is blurred: add light, or set a fixed exposure_s in lab.toml")
         if unknown:
             warnings.append(_unknown(unknown))
         return FrameCheck(tuple(sorted(counts)), unknown, brightness, sharpness, tuple(warnings))
@@ -117,6 +117,4 @@ def _unknown(ids: tuple[int, ...]) -> str:
         subject, todo = f"marker {names} is", "to track it"
     else:
         subject, todo = f"markers {names} are", "to track them"
-    return (
-        f"{subject} seen, but not in the rig; {todo} add the line [[markers]] to it, and below id = {ids[0]}"
-    )
+    return f"{subject} seen, but not in the rig; {todo}, add [[markers]] with id = {ids[0]} to lab.toml"

@@ -124,7 +124,8 @@ def check_start(
     models = [model for _, model in _copied(request, until)]
     _check(rig, cameras, lenses, models, until)
     return [
-        f"camera {name}: {request.model_from} has no model of it; it is recorded, and places no robots"
+        f"camera {name}: {request.model_from} has no model of this camera; it is recorded, but not used "
+        "for tracking"
         for model in models
         for name in sorted(set(cameras) - {camera.camera for camera in model.cameras})
     ]
@@ -136,13 +137,13 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
     Raises
     ------
     IpsysError
-        The model has none of them.
+        The model has none of the cameras.
     """
     known = sorted(camera.camera for camera in model.cameras)
     if not set(known) & set(cameras):
         raise IpsysError(
-            f"the model {model.name} is of the cameras {', '.join(known)}, and none of them is here, but "
-            f"{', '.join(cameras)}; give a model of these, or name the cameras in lab.toml as they were then"
+            f"the model {model.name} is for the cameras {', '.join(known)}, but the rig has only "
+            f"{', '.join(cameras)}; give a model of these, or use the names of the model in lab.toml"
         )
 
 
@@ -164,7 +165,7 @@ def _check(
     if missing and any(CAMERA_POINTS in stage.writes for stage in _causal(until)):
         name = missing[0]
         raise IpsysError(
-            f'camera {name} has no lens: write calibration = "{name}.yaml" into lab.toml, or give '
+            f'camera {name} has no calibration: write calibration = "{name}.yaml" into lab.toml, or give '
             f"--calibration {name}=file.yaml"
         )
     for model in models:
@@ -172,7 +173,7 @@ def _check(
         heights = [rig.height_of(marker.id) for marker in rig.markers] or [rig.marker_height_m]
         if reads_height(model.name) and None in heights:
             raise IpsysError(
-                f"{model.name} needs the height at which markers are carried: write marker_height_m into "
+                f"{model.name} needs the height of the markers above the floor: write marker_height_m into "
                 "lab.toml"
             )
 
@@ -188,8 +189,8 @@ def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
     for name, state in cameras.items():
         if state.format in ("h264", "h265"):
             raise IpsysError(
-                f"camera {name} sends {state.format}, of which no single seconds can be kept: set it to "
-                "MJPEG, or record all of it, with 'ipsys record --measure'"
+                f"camera {name} sends {state.format}, but ipsys measure can keep short parts only of MJPEG: "
+                "set the camera to MJPEG, or record everything with 'ipsys record --measure'"
             )
 
 

@@ -74,7 +74,7 @@ class LiveCameras:
         self._arrived = threading.Condition()
         self._saving: list[_Saving] = []
         self._closed = self._ending = False
-        self._reason = "the recording has ended; measure in its log with: ipsys measure LOG"
+        self._reason = "the recording has ended; to measure in its log: ipsys measure LOG"
         self._started, self._stopped = threading.Event(), threading.Event()
         self._heartbeat = Heartbeat(clock)
         shared = ReaderContext(
@@ -173,7 +173,7 @@ class LiveCameras:
             closed = self._closed
         if saving.fault is not None:
             raise SourceError(
-                f"maybe not saved: the disk has failed ({saving.fault.strerror}); record to another disk"
+                f"perhaps not saved: the disk has failed ({saving.fault.strerror}); record to another disk"
             )
         if saving.confirmed:
             return
@@ -181,7 +181,7 @@ class LiveCameras:
             raise SourceError(f"not saved: {self._reason}")
         if is_waiting:
             raise SourceError("not saved: the disk is too slow; try again")
-        raise SourceError("maybe not saved: the disk does not answer; look into the log")
+        raise SourceError("perhaps not saved: the disk does not answer; check the log")
 
     def confirm(self, message: Message, fault: OSError | None = None) -> None:
         """Report that a message is on the disk, or the error of the disk. Any thread may call it."""

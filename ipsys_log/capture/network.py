@@ -74,10 +74,13 @@ class Stamps:
             return
         age_ns = self._clock.now_ns() - time_ns
         self._trusted = _YOUNGEST_NS <= age_ns <= _OLDEST_NS
-        age = f"{abs(age_ns) / NS_PER_S:.3f} s {'behind' if age_ns >= 0 else 'ahead of'} ours"
+        age = (
+            f"{abs(age_ns) / NS_PER_S:.3f} s {'behind' if age_ns >= 0 else 'ahead of'} the clock of "
+            "this machine"
+        )
         if self._trusted:
             self._say(
-                f"camera {self._name}: frames have the camera's own stamps (RTCP), {age}; sync it by NTP"
+                f"camera {self._name}: its frames have the stamps of the camera (RTCP), {age}; sync it by NTP"
             )
         else:
             self._say(f"camera {self._name}: its clock is {age}, so its stamps are not used; sync it by NTP")
@@ -158,7 +161,7 @@ def _read(camera: RigCamera, clock: Clock, say: Say, queue: _Queue, stop: Event)
     except SourceError as error:
         last = error
     except Exception as error:
-        last = SourceError(f"camera {camera.name}: the program failed while it read ({error!r})")
+        last = SourceError(f"camera {camera.name}: internal error while reading ({error!r})")
         raise
     finally:
         _put(queue, last, stop)
@@ -205,7 +208,7 @@ def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, label: str) -> 
     heard_ns = clock.now_ns()
     for packet in packets:
         if not packet.size and clock.now_ns() - heard_ns > _SILENT_S * NS_PER_S:
-            raise SourceError(f"{label}: sends only empty frames; start the camera anew")
+            raise SourceError(f"{label}: sends only empty frames; restart the camera")
         yield packet
         if packet.size:
             heard_ns = clock.now_ns()
@@ -219,10 +222,10 @@ def _open(address: str, label: str) -> InputContainer:
         socket.getaddrinfo(host, None)
     except socket.gaierror as error:
         if error.errno == socket.EAI_NONAME:
-            raise SourceError(f"{label}: there is no host {host!r}; check the address") from error
+            raise SourceError(f"{label}: the host {host!r} does not exist; check the address") from error
         raise SourceError(
-            f"{label}: the name {host!r} cannot be looked up ({error.strerror}); check the network, "
-            "or write the address as a number"
+            f"{label}: the name {host!r} cannot be resolved ({error.strerror}); check the network, "
+            "or use the IP address"
         ) from error
     return av.open(address, options=dict(_OPTIONS), timeout=_SILENT_S)
 
@@ -232,19 +235,21 @@ def _explain(error: Exception) -> str:
     import av
 
     explanations = {
-        av.error.ConnectionRefusedError: "refuses the connection; is the camera on, and the port right?",
-        av.error.HTTPNotFoundError: "the camera has no such path; look it up in the camera's manual",
-        av.error.HTTPUnauthorizedError: "asks for a password, or another; put user:password@ before the host",
-        av.error.HTTPForbiddenError: "the camera forbids it; give the user the right to see the stream",
+        av.error.ConnectionRefusedError: "refuses the connection; check that the camera is on, and the port",
+        av.error.HTTPNotFoundError: "the camera has no such path; find the path in the camera's manual",
+        av.error.HTTPUnauthorizedError: "the password is missing or not accepted; put user:password@ before "
+        "the host",
+        av.error.HTTPForbiddenError: "the user may not see the stream; give the user this right in the "
+        "camera",
         av.error.InvalidDataError: "is not video; give the address of the stream, not of a web page",
-        av.error.ExitError: f"nothing came for {_SILENT_S:g} s; is the camera on, and the network up?",
-        av.error.TimeoutError: "does not answer; is the camera on, and the network up?",
-        av.error.ProtocolNotFoundError: "is of a protocol that FFmpeg does not know; use rtsp:// or http://",
+        av.error.ExitError: f"no data for {_SILENT_S:g} s; check the camera and the network",
+        av.error.TimeoutError: "does not answer; check the camera and the network",
+        av.error.ProtocolNotFoundError: "has a protocol that FFmpeg does not support; use rtsp:// or http://",
     }
     for kind, text in explanations.items():
         if isinstance(error, kind):
             return text
-    return f"cannot be read ({getattr(error, 'strerror', None) or error}); try the address in another player"
+    return f"cannot be read ({getattr(error, 'strerror', None) or error}); test the address in another player"
 
 
 def check_address(camera: RigCamera) -> None:
@@ -264,6 +269,6 @@ def check_address(camera: RigCamera) -> None:
         host = None
     if host is None:
         raise SourceError(
-            f"camera {camera.name}: {hide_password(address)!r} names no host; write it as "
+            f"camera {camera.name}: {hide_password(address)!r} has no host; write it as "
             "http://192.168.1.20:8080/video or rtsp://user:password@192.168.1.20/stream"
         )

@@ -175,7 +175,7 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
             if log.fault is not None and not warned:
                 warned = True
                 source.add_event(
-                    "disk_fault", f"{describe_disk_fault(log.fault)}; what was written just now may be lost"
+                    "disk_fault", f"{describe_disk_fault(log.fault)}; the last written messages may be lost"
                 )
             if message is None:
                 log.flush()
@@ -229,9 +229,7 @@ def open_recording(
                 if log.settle():
                     raise
                 resources.pop_all()  # a torn log cannot be ended, and a hanging write would block here
-                text = (
-                    f"{path}: interrupted while it was written; see what it holds with: ipsys repair {path}"
-                )
+                text = f"{path}: interrupted during writing; to check the log: ipsys repair {path}"
                 raise IpsysError(text) from error
     except WriteError as error:
         raise IpsysError(describe_disk_full(path, error)) from error
@@ -250,7 +248,7 @@ def _create(path: Path, overwrite: bool) -> LogWriter:
             writer.move(path)
         except (OSError, WriteError) as error:
             partial.unlink(missing_ok=True)
-            raise LogError(f"{path}: is as it was, a new one cannot be made: {error}") from error
+            raise LogError(f"{path}: is unchanged, because the new log cannot be created: {error}") from error
         return writer
     finally:
         os.close(old)
@@ -273,7 +271,7 @@ def fitting_lenses(
         width, height = sizes_px.get(camera) or (lens.width, lens.height)
         fitting[camera] = scale_intrinsics(lens, width, height, f"camera {camera}")
         if width != lens.width:
-            say(f"camera {camera}: its calibration is scaled from {lens.width} to {width} px of width")
+            say(f"camera {camera}: its calibration is scaled from a width of {lens.width} px to {width} px")
     return fitting
 
 

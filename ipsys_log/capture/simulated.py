@@ -158,12 +158,14 @@ def parse_source(camera: RigCamera) -> SimulatedCamera:
         if key not in setting_types:
             raise IpsysError(
                 f"camera {camera.name}: the simulated lab has no setting {key!r}; "
-                f"it has board, {', '.join(setting_types)}"
+                f"the settings are board, {', '.join(setting_types)}"
             )
         try:
             values[key] = setting_types[key](text)
         except ValueError as error:
-            raise IpsysError(f"camera {camera.name}: {key}={text} is no number") from error
+            raise IpsysError(
+                f"camera {camera.name}: {key}={text} is not a number; write {key}=1, for example"
+            ) from error
     settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]
     if name not in settings.cameras:
         names = ", ".join(f"sim:{other}" for other in settings.cameras)

@@ -112,7 +112,7 @@ def advise(demands: Sequence[BandwidthDemand]) -> list[str]:
     --------
     >>> three = [BandwidthDemand(name, 1, 480, "a hub", "MJPG", 1920, 1080, 30.0) for name in ("a", "b", "c")]
     >>> print(advise(three)[0])
-    cameras a, b and c share USB bus 1 (a hub) and need 48.5 MB/s of its 48: plug one into another bus, or ask for 25 frames/s of each, or for 1600 x 1200 px
+    cameras a, b and c share USB bus 1 (a hub) and need 48.5 MB/s of its 48: plug one camera into another bus, or set 25 frames/s for each, or set 1600 x 1200 px
     """  # noqa: E501
     by_bus = defaultdict(list)
     for demand in demands:
@@ -129,7 +129,7 @@ def _explain(bus: int, shared: Sequence[BandwidthDemand]) -> str | None:
     needed, most = (_wire_bytes(shared, each) for each in (_needed, lambda demand: demand.most))
     carries = f"MB/s of its {_CARRIES * _MICROFRAMES_PER_S / 1e6:.0f}"
     if needed > _CARRIES:
-        ways = ["plug one into another bus"] if names else []
+        ways = ["plug one camera into another bus"] if names else []
         ways += _smaller(shared)
         demand_text = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
         return f"{subject} USB bus {bus} ({hubs}) and {demand_text} {carries}: {', or '.join(ways)}"
@@ -151,16 +151,16 @@ def _smaller(shared: Sequence[BandwidthDemand]) -> list[str]:
     for rate_hz in _RATES_HZ:
         slower = [demand._replace(rate_hz=min(rate_hz, demand.rate_hz)) for demand in shared]
         if _wire_bytes(slower, _needed) <= _CARRIES:
-            ways.append(f"ask for {rate_hz} frames/s" + (" of each" if len(shared) > 1 else ""))
+            ways.append(f"set {rate_hz} frames/s" + (" for each" if len(shared) > 1 else ""))
             break
     largest = max(demand.width * demand.height for demand in shared)
     for width, height in _SIZES:
         less = [demand._replace(width=width, height=height) for demand in shared]
         if width * height < largest and _wire_bytes(less, _needed) <= _CARRIES:
-            ways.append(f"{'' if ways else 'ask '}for {width} x {height} px")
+            ways.append(f"set {width} x {height} px")
             break
     if any(demand.format in _BYTES_PER_PX for demand in shared):
-        ways.append("take a camera that gives MJPG")
+        ways.append("use a camera with MJPG")
     return ways
 
 
@@ -274,7 +274,7 @@ def _hub(usb: Path) -> str:
     name = " ".join(filter(None, (_read(hub / "manufacturer"), _read(hub / "product"))))
     # The root of the tree is the controller in the machine.
     if _read(hub / "devpath") in ("", "0"):
-        return f"the machine's own, controller {hub.parent.name}"
+        return f"built in, controller {hub.parent.name}"
     return f"{name or 'a hub'} at port {_read(hub / 'devpath')}"
 
 

@@ -102,13 +102,13 @@ _GAIN, _AUTO_GAIN = 0x980913, 0x980912
 _EXPOSURE_UNITS = 10_000  # of 100 us, in a second
 
 _FAULTS = {
-    errno.ENOENT: "there is no such device; see: ipsys cameras",
-    errno.ENODEV: "has gone; is its cable plugged in?",
-    errno.EACCES: "may not be opened; put yourself into the group video, and log in again",
-    errno.EBUSY: "is in use by another program; end that first",
-    errno.ENOTTY: "is no camera; see: ipsys cameras",
-    errno.ENOSPC: "its USB bus has no room left for it; what would fit: ipsys cameras --rig lab.toml",
-    errno.EPROTO: "does not answer as a camera should; plug it in anew",
+    errno.ENOENT: "does not exist; to list the cameras: ipsys cameras",
+    errno.ENODEV: "is disconnected; check its cable",
+    errno.EACCES: "cannot be opened: no permission; add your user to the group video, and log in again",
+    errno.EBUSY: "is in use by another program; close that program",
+    errno.ENOTTY: "is not a camera; to list the cameras: ipsys cameras",
+    errno.ENOSPC: "its USB bus has too little bandwidth; for advice: ipsys cameras --rig lab.toml",
+    errno.EPROTO: "does not answer like a camera; plug it in again",
 }
 
 
@@ -132,7 +132,7 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
             actual, layout = _set_up(device, camera, label)
             report_refused_settings(camera, actual, say)
             if layout is not None:
-                note = f"its {layout.format} pictures are encoded as JPEG once"
+                note = f"ipsys encodes its {layout.format} images as JPEG"
                 say(f"camera {camera.name}: gives no MJPG; {note}")
             buffers = _map_buffers(device, stack)
             v4l2.send_request(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
@@ -145,7 +145,7 @@ def _faults(label: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        message = _FAULTS.get(error.errno or 0, f"cannot be read ({error.strerror}); plug it in anew")
+        message = _FAULTS.get(error.errno or 0, f"cannot be read ({error.strerror}); plug it in again")
         raise SourceError(f"{label}: {message}") from error
 
 
@@ -154,13 +154,13 @@ def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings,
     offers = v4l2.list_formats(device)
     name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
     if name is None:
-        raise SourceError(f"{label}: offers only {', '.join(offers)}; a camera that gives MJPG is needed")
+        raise SourceError(f"{label}: has only {', '.join(offers)}; use a camera with MJPG")
     requested = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
     requested.width, requested.height = camera.width or 1920, camera.height or 1080
     format = v4l2.send_request(device, v4l2.S_FMT, requested)
     if format.pixelformat != v4l2.fourcc(name):
         raise SourceError(
-            f"{label}: does not give {name} at {camera.width} x {camera.height}; take another size"
+            f"{label}: does not have {name} at {camera.width} x {camera.height}; set another size"
         )
     if camera.exposure_s is not None:
         _control(device, _SLOWER_IN_THE_DARK, 0)
@@ -275,7 +275,7 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
         if data and capture.layout is not None:
             data = encode_raw(data, capture.layout) or b""
             if not data:
-                say(f"camera {capture.camera.name}: sends pictures that are not whole; they are left out")
+                say(f"camera {capture.camera.name}: sends incomplete images; they are not recorded")
         if not data:
             _check_heard(capture, clock.now_ns() - heard_ns)
             yield None
@@ -287,7 +287,7 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
 
 def _check_heard(capture: _Capture, silent_ns: int) -> None:
     if silent_ns > _SILENT_S * NS_PER_S:
-        raise SourceError(f"{capture.label}: sends no frames; plug it in anew, or into another USB port")
+        raise SourceError(f"{capture.label}: sends no frames; plug it in again, or into another USB port")
 
 
 def _missed(last: int | None, sequence: int) -> int:
@@ -309,10 +309,10 @@ def _say_stamps(camera: RigCamera, flags: int, say: Say) -> None:
     """Report the meaning of the driver's stamps if the rig has no meaning, or a different one."""
     head = f"camera {camera.name}: the driver stamps"
     if flags & v4l2.STAMP_CLOCK != v4l2.STAMP_MONOTONIC:
-        say(f"{head} by another clock, so frames get the time they arrive at")
+        say(f"{head} with another clock, so its frames get their time of arrival")
         return
     meaning = "start" if flags & v4l2.STAMP_SOURCE == v4l2.STAMP_OF_START else "end"
     if camera.stamp is None:
-        say(f'{head} the {meaning} of a frame; put into the rig: stamp = "{meaning}"')
+        say(f'{head} the {meaning} of a frame; write into the rig: stamp = "{meaning}"')
     elif camera.stamp != meaning:
-        say(f"{head} the {meaning} of a frame, the rig says: {camera.stamp}")
+        say(f"{head} the {meaning} of a frame, but the rig has {camera.stamp!r}")

@@ -84,7 +84,7 @@ def open_video(path: Path, say: Say) -> Iterator[Iterator[TimedFrame]]:
             frames = _passed(container, stream, name)
         else:
             reason = "frames that need later ones" if name else f"{stream.codec_context.name} video"
-            say(f"{path}: has {reason}, which no log holds; its pictures are encoded anew, as JPEG")
+            say(f"{path}: has {reason}, which a log cannot hold; ipsys encodes its frames again, as JPEG")
             frames = _encoded(container, stream)
         yield _guarded(path, frames)
 
@@ -209,7 +209,7 @@ def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterato
         topic = session.images.get(camera_name or camera.name)
         if topic is None:
             names = ", ".join(f"{path}?{other}" for other in session.images) or "none"
-            raise SourceError(f"camera {camera.name}: {path}: has no such camera; it has: {names}")
+            raise SourceError(f"camera {camera.name}: {path}: does not have this camera; it has {names}")
         yield _play(_recorded(session, topic), clock)
 
 
@@ -223,7 +223,7 @@ def check_playback_source(camera: RigCamera) -> tuple[Path, str]:
     """
     path, camera_name = split_source(camera.source or "")
     if not path.is_file():
-        raise SourceError(f"camera {camera.name}: {path}: there is no such file")
+        raise SourceError(f"camera {camera.name}: {path}: does not exist")
     return path, camera_name
 
 
@@ -244,7 +244,9 @@ def _recorded(session: Session, topic: str) -> Iterator[TimedFrame]:
     start_ns: int | None = None
     for message in session.messages([topic]):
         if not isinstance(message.payload, (CompressedImage, CompressedVideo)):
-            raise SourceError(f"{session}: {topic}: its pictures are not compressed; only such are played")
+            raise SourceError(
+                f"{session}: {topic}: its images are not compressed; only compressed images can be played"
+            )
         start_ns = message.publish_time_ns if start_ns is None else start_ns
         since_ns = message.publish_time_ns - start_ns
         yield TimedFrame(since_ns, message.payload.data, message.payload.format)

@@ -41,10 +41,10 @@ def find_video(container: InputContainer, label: str) -> VideoStream:
         The container has no video, or only a single image.
     """
     if not container.streams.video:
-        raise SourceError(f"{label}: is not video; give the address of the camera's picture stream")
+        raise SourceError(f"{label}: is not video; give the address of the camera's stream")
     stream = container.streams.video[0]
     if container.format.name in _SINGLE:
-        raise SourceError(f"{label}: is a single picture; give the address of the camera's stream")
+        raise SourceError(f"{label}: is a single image; give the address of the camera's stream")
     return stream
 
 

@@ -28,17 +28,15 @@ __all__ = ["add_commands"]
 
 NoLogs = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    typer.Argument(help="Logs, read as one. Results go to the last.", metavar="[LOG]..."),
+    typer.Argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
 ]
 Plot = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE", help="Draw the floor map and the pictures of the cameras: .png, .pdf, .svg or .jpg."
-    ),
+    typer.Option(metavar="FILE", help="Draw the floor map and the camera images: .png, .pdf, .svg or .jpg."),
 ]
 Output = Annotated[
     Path | None,
-    log_option(help="A new log for the results. Without a log, what the cameras sent is kept there too."),
+    log_option(help="A new log for the results. Without LOG, it also gets the camera frames."),
 ]
 
 
@@ -52,13 +50,13 @@ def align(
     calibration: Calibrations = None,
     corners: Corners = None,
     seconds: Annotated[
-        float, typer.Option(min=0.1, metavar="SECONDS", help="Without a log: how long to look.")
+        float, typer.Option(min=0.1, metavar="SECONDS", help="Without LOG: duration of the recording.")
     ] = 3.0,
     plot: Plot = None,
     output: Output = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say how to tilt each camera so that it looks straight down, and which floor all cameras see.
+    """Show the tilt that makes each camera look straight down, and the floor that all cameras see.
 
     The command uses markers that lie on the floor: four or more in each image, or one marker that is laid
     down at one calibration point after the other. If the log has calibration points, the command also reports
@@ -84,7 +82,7 @@ def align(
         options = {"rig": None, "calibration": None, "corners": corners, "kept": kept}
         _align([log], options, plot, as_json)
     if output is None:
-        remarks.print("nothing is kept; -o name.mcap keeps the frames and what was found", markup=False)
+        remarks.print("no frames or results are kept; to keep them, add -o name.mcap", markup=False)
 
 
 def _prepare_now(
@@ -96,7 +94,7 @@ def _prepare_now(
     from ipsys_log.runs.options import Request
 
     if rig is None:
-        raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
+        raise IpsysError("no log is given; name a log, or give --rig lab.toml to use its cameras now")
     lab = prepare_lab(rig, None, calibration)
     check_start(lab.rig, lab.names, lab.lenses, Request(corners=corners), "camera-frame")
     if output is not None:

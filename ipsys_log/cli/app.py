@@ -28,16 +28,16 @@ from ipsys_log.stages import ENTRIES
 
 __all__ = ["EXAMPLES", "PANELS", "arrange"]
 
-_STAGES = "The stages of replay, one by one"
+_STAGES = "Single stages of replay"
 # The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
 _PLACED: dict[str, tuple[str, ...]] = {
-    "The first day, in this order": (
+    "First day, in this order": (
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
     ),
-    "How good it is, and where to measure next": ("evaluate", "plan", "report"),
-    "Look into a log": ("info", "runs", "view", "verify", "diff", "latency", "repair"),
+    "Accuracy, and the next points to measure": ("evaluate", "plan", "report"),
+    "Inspect a log": ("info", "runs", "view", "verify", "diff", "latency", "repair"),
     _STAGES: (),
-    "Without cameras of your own": ("simulate", "import"),
+    "Without cameras": ("simulate", "import"),
 }
 
 
@@ -53,7 +53,7 @@ PANELS = all_panels()
 EXAMPLES: dict[str, str] = {
     "init": """
 ipsys init lab.toml                      # an example with comments
-ipsys init lab.toml --from monday.mcap   # the rig that a log holds
+ipsys init lab.toml --from monday.mcap   # the rig of a log
 ipsys init lab.toml --simulated          # to try all commands
 """,
     "markers": """
@@ -62,35 +62,35 @@ ipsys markers --ids 0-11 --length 0.08 --page letter
 ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
 """,
     "cameras": """
-ipsys cameras                    # a source for lab.toml, for each camera
-ipsys cameras --rig lab.toml     # can USB carry what it asks for?
+ipsys cameras                    # the source of each camera
+ipsys cameras --rig lab.toml     # is USB fast enough for the rig?
 """,
     "calibrate": """
 ipsys calibrate photos/red --board 6x4              # a folder: red.yaml
-ipsys calibrate --rig lab.toml --board 6x4          # what cameras send now
+ipsys calibrate --rig lab.toml --board 6x4          # use the cameras now
 ipsys calibrate red.mp4 --board charuco:4x5 --camera red --plot red.png
 """,
     "align": """
-ipsys align --rig lab.toml                     # what the cameras see now
-ipsys align monday.mcap --plot alignment.png   # of a log, with a picture
+ipsys align --rig lab.toml                     # use the cameras now
+ipsys align monday.mcap --plot alignment.png   # of a log, with a figure
 """,
     "record": """
 ipsys record -o monday.mcap                      # the cameras of lab.toml
-ipsys record -o calibration.mcap --measure       # and enter the tape
-ipsys record -o calibration.mcap --measure --host 0.0.0.0    # by phone
+ipsys record -o calibration.mcap --measure       # and enter tape readings
+ipsys record -o calibration.mcap --measure --host 0.0.0.0    # on a phone
 ipsys record -o short.mcap --camera red --seconds 10
 """,
     "measure": """
-ipsys measure --rig lab.toml -o cal.mcap --host 0.0.0.0    # by phone, now
+ipsys measure --rig lab.toml -o cal.mcap --host 0.0.0.0    # on a phone, now
 ipsys measure calibration.mcap                     # in a finished log
-ipsys measure calibration.mcap --terminal          # here, no page
+ipsys measure calibration.mcap --terminal          # in this terminal
 ipsys measure calibration.mcap --csv places.csv    # from a sheet
 """,
     "replay": """
 ipsys replay calibration.mcap                      # fit and evaluate poly
 ipsys replay calibration.mcap --model best --plot floor.png
 ipsys replay monday.mcap --model-from calibration.mcap
-ipsys replay calibration.mcap --rig lab.toml       # with a mended rig
+ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
 """,
     "live": """
 ipsys live --model-from calibration.mcap -o monday.mcap
@@ -98,7 +98,7 @@ ipsys live --model-from calibration.mcap --model best --view -o b.mcap
 """,
     "evaluate": """
 ipsys evaluate calibration.mcap                    # all models
-ipsys evaluate calibration.mcap --details          # and all figures
+ipsys evaluate calibration.mcap --details          # with details
 ipsys evaluate calibration.mcap --model poly --model best --plots figures
 """,
     "plan": """
@@ -168,8 +168,8 @@ def _with_one_reading(command: Callable[..., Any]) -> Callable[..., Any]:
 app = typer.Typer(
     name="ipsys",
     help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
-    "replay it, compare models on it, look at it.",
-    epilog="The help of a command ends with examples: ipsys record --help. To try all of it without a "
+    "replay it, compare models on it, view it.",
+    epilog="The help of a command ends with examples: ipsys record --help. To try all commands without a "
     "camera: ipsys init lab.toml --simulated. docs/glossary.md explains the terms.",
     no_args_is_help=True,
     add_completion=False,

@@ -22,55 +22,65 @@ __all__ = ["add_commands"]
 
 Sources = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    typer.Argument(help="Logs, folders of pictures, pictures, videos.", metavar="[SOURCE]..."),
+    typer.Argument(help="Logs, folders of pictures, pictures or videos.", metavar="SOURCE"),
 ]
 RigNow = Annotated[
     Path | None,
-    typer.Option(
-        "--rig", metavar="FILE", help="Without a source: take what the cameras of this rig send now."
-    ),
+    typer.Option("--rig", metavar="FILE", help="Without SOURCE: use the cameras of this rig now."),
 ]
 Seconds = Annotated[
-    float, typer.Option(min=1.0, metavar="SECONDS", help="How long to take it, while you move the board.")
+    float,
+    typer.Option(min=1.0, metavar="SECONDS", help="Without SOURCE: duration, while you move the board."),
 ]
 BoardName = Annotated[
     str,
     typer.Option(
         metavar="COLUMNSxROWS",
-        help="The inner corners of a chessboard, as 6x4; or the squares of a ChArUco board, as charuco:4x5.",
+        help="Inner corners of a chessboard, such as 6x4, or squares of a ChArUco board, such as "
+        "charuco:4x5.",
     ),
 ]
 Square = Annotated[
-    float, typer.Option(metavar="METRES", help="Side of a square, in m. The lens does not depend on it.")
+    float, typer.Option(metavar="METRES", help="Side of a square, in m. It does not change the intrinsics.")
 ]
 MarkerScale = Annotated[
-    float, typer.Option(metavar="SHARE", help="Side of a ChArUco board's markers, as a share of a square's.")
+    float,
+    typer.Option(metavar="SHARE", help="Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
-Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The dictionary of a ChArUco board's markers.")]
-Inverted = Annotated[bool, typer.Option("--inverted", help="Black and white of the board are exchanged.")]
+Dictionary = Annotated[
+    str, typer.Option(metavar="NAME", help="Dictionary of the markers of a ChArUco board.")
+]
+Inverted = Annotated[bool, typer.Option("--inverted", help="The board has black and white exchanged.")]
 Lens = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help="fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 (without k3), or "
-        "pinhole8 (and k4 k5 k6).",
+        help="Distortion model: fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 "
+        "(without k3) or "
+        "pinhole8 (with k4 k5 k6).",
     ),
 ]
 Cameras = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
         metavar="CAMERA",
-        help="Only this camera of the log or the rig; repeat it for several. With pictures or a video: the "
+        help="Use only this camera of the log or rig; repeat it for several. With pictures or a video: the "
         "name of the camera.",
     ),
 ]
 Output = Annotated[
     Path,
-    typer.Option("--output", "-o", metavar="PATH", help="The folder to write to, or the file: red.yaml."),
+    typer.Option(
+        "--output", "-o", metavar="PATH", help="Folder of the files, or one file, such as red.yaml."
+    ),
 ]
 Formats = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--format", metavar="NAME", help="opencv (the default), ros or kalibr; repeat for several."),
+    typer.Option(
+        "--format",
+        metavar="NAME",
+        help="File format: opencv (the default), ros or kalibr; repeat it for several.",
+    ),
 ]
 Plot = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: .png, .pdf, .svg or .jpg.")
@@ -79,8 +89,9 @@ Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Override four checks: no file is overwritten; most pictures show no larger board than --board; "
-        "the result is usable (RMS of at most 2 px, 5 pictures or more); all pictures are of one camera.",
+        help="Override four checks: no file is overwritten; the board in the pictures is not larger "
+        "than --board; "
+        "the RMS is at most 2 px, from 5 pictures or more; all pictures are of one camera.",
     ),
 ]
 
@@ -204,8 +215,9 @@ def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
 
     if rig is None:
         raise IpsysError(
-            "name pictures, a video or a log of a board, or give --rig lab.toml to take what its cameras "
-            "send now"
+            "no source is given; name pictures, a video or a log of a board, or give --rig lab.toml to "
+            "use its "
+            "cameras now"
         )
     lab = prepare_lab(rig, only, None, with_lenses=False)
     return lab._replace(cameras=[show_board(camera, board) for camera in lab.cameras])
@@ -214,7 +226,7 @@ def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
 @contextmanager
 def _record_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
     say(
-        "move the board through all of each picture, tilted this way and that, and hold it still; "
+        "move the board over the whole image of each camera, tilt it to all sides, and hold it still often; "
         "the frames are not kept"
     )
     with record_now(lab, seconds) as log:
@@ -229,7 +241,7 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
     if output.suffix.lower() in (".yaml", ".yml"):
         if len(cameras) > 1 or len(formats) > 1:
-            raise IpsysError(f"--output {output}: one file for several lenses; name a folder")
+            raise IpsysError(f"--output {output}: is one file, but there are several cameras; name a folder")
         targets = {cameras[0]: {formats[0]: output}}
         check_file(output, "--output", [])
     else:
@@ -251,7 +263,7 @@ def _check_free(path: Path, force: bool) -> None:
     if (text := describe_broken_link(path)) is not None:
         raise IpsysError(text)
     if path.exists() and not force:
-        raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")
+        raise IpsysError(f"{path}: exists already; choose another --output, or give --force to overwrite it")
 
 
 def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
@@ -289,5 +301,5 @@ def _show(one: CalibrationResult, files: list[Path], for_rig: bool) -> None:
     for path in files:
         console.print(f"{path} written", markup=False)
     if for_rig:
-        console.print(f'in lab.toml, under [[cameras]], name = "{one.camera}":', markup=False)
+        console.print(f'put into lab.toml, under [[cameras]] with name = "{one.camera}":', markup=False)
         console.print(f'calibration = "{files[0].as_posix()}"\n', markup=False)

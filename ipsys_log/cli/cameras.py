@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands"]
 
-_NONE = """no cameras are attached by USB
-  a network camera needs no list: put its address into the rig file, source = "rtsp://..." or "http://..."
-  without any camera, source = "sim:red" shows the simulated lab: ipsys init lab.toml --simulated"""
+_NONE = """no USB camera is attached
+  for a network camera, put its address into lab.toml: source = "rtsp://..." or "http://..."
+  without a camera, source = "sim:red" is a simulated one: ipsys init lab.toml --simulated"""
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -29,19 +29,23 @@ def add_commands(app: typer.Typer) -> None:
 def cameras(
     rig: Annotated[
         Path | None,
-        typer.Option("--rig", metavar="FILE", help="A rig file: say whether USB carries what it asks for."),
+        typer.Option(
+            "--rig", metavar="FILE", help="Check that USB is fast enough for the cameras of this rig."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the cameras attached by USB: device, modes, bus and hub; and whether USB carries them all at once.
+    """List the USB cameras with device, modes, bus and hub, and check that USB is fast enough for all.
 
-    Without a rig that is reckoned with each at its largest mode. Cameras on the network are not listed."""
+    Without --rig, the check uses the largest mode of each camera. Network cameras are not listed."""
     from ipsys_log.capture.usb_bus import advise, list_demands
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import load_rig
 
     if sys.platform != "linux":
-        raise IpsysError("ipsys cameras: only Linux lists them; elsewhere they are usb:0, usb:1 and so on")
+        raise IpsysError(
+            "ipsys cameras: lists cameras only on Linux; on this system, write usb:0, usb:1 and so on"
+        )
     from ipsys_log.capture.usb_bus import find_cameras
 
     attached = find_cameras()
@@ -76,5 +80,5 @@ def _describe(camera: UsbCamera) -> str:
         text = ", ".join(f"{rate:.3g}" for rate in sorted(set(each), reverse=True))
         lines.append(f"  {name:<5}{width:>5} x {height:<5}{text} frames/s")
     if camera.fault:
-        lines.append(f"  cannot be asked for its modes: {camera.fault}")
+        lines.append(f"  its modes cannot be read: {camera.fault}")
     return "\n".join(lines)

@@ -28,12 +28,12 @@ def add_commands(app: typer.Typer) -> None:
 
 def verify(
     logs: Logs,
-    run: Annotated[_Run, typer.Option("--run", metavar="NAME", help="Only this run.")] = None,
+    run: Annotated[_Run, typer.Option("--run", metavar="NAME", help="Use only this run.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make every run of a log again from what it read, and compare each channel byte for byte.
+    """Compute every run of a log again from its inputs, and compare each channel byte for byte.
 
-    Frames that were skipped live are passed over. Exits with code 1 if anything differs."""
+    Frames that live processing skipped are excluded. The exit code is 1 if there is a difference."""
     from ipsys_log import api
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
 
@@ -47,7 +47,7 @@ def verify(
         console.print(comparison_table(comparisons, ("log", "again")))
         difference = first_difference(comparisons)
         console.print(
-            "a replay equals the log" if difference is None else difference,
+            "the replay is identical to the log" if difference is None else difference,
             style="green" if difference is None else "red",
             markup=False,
         )
@@ -55,24 +55,26 @@ def verify(
 
 
 def diff(
-    first: Annotated[Path, typer.Argument(help="A log.")],
+    first: Annotated[Path, typer.Argument(metavar="FIRST", help="The first log.")],
     second: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Argument(help="The log to compare with; without it, --run twice names two runs of the first."),
+        typer.Argument(
+            metavar="SECOND", help="The second log. Without it, --run twice compares two runs of the first."
+        ),
     ] = None,
     run: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
             "--run",
             metavar="NAME",
-            help="The run of both logs; or twice: that of the first, that of the second.",
+            help="The run to compare. Give it twice to compare two runs.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare the runs of two logs, or two runs of one log, channel by channel, and print the differences.
 
-    Exits with code 1 if anything differs."""
+    The exit code is 1 if there is a difference."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
     from ipsys_log.runs.verify import diff as compare
@@ -80,9 +82,11 @@ def diff(
 
     names: list[str | None] = list(run) if run else [None]
     if len(names) > 2:
-        raise IpsysError("--run: name one run, or one of each log")
+        raise IpsysError("--run: is given more than twice; name one run, or one for each side")
     if second is None and len(names) < 2:
-        raise IpsysError("name a second log, or with --run twice two runs of one")
+        raise IpsysError(
+            "there is nothing to compare with; name a second log, or give --run twice for two runs of one log"
+        )
     sides = first, second or first, (names[0], names[-1])
     comparisons = compare(*sides)
     # If a distance could be measured, they have frames in common.
@@ -108,11 +112,11 @@ def latency(
     logs: Logs,
     plot: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(metavar="FILE", help="Draw the steps: .png, .pdf, .svg or .jpg."),
+        typer.Option(metavar="FILE", help="Draw the processing steps: .png, .pdf, .svg or .jpg."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show how long each step took when a log was recorded live, from the frame to its position."""
+    """Show the latency of each step of a live recording, from the frame to its position."""
     from dataclasses import asdict
 
     from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s

@@ -157,5 +157,5 @@ def _print_many(outcomes: Sequence[Outcome]) -> list[Outcome]:
     many = {kind for kind, count in alike.items() if count > _MANY_RUNS}
     for stage, fresh in alike:
         if (stage, fresh) in many:
-            remarks.print(f"{stage:<13} {alike[stage, fresh]} runs {'made' if fresh else 'up to date'}")
+            remarks.print(f"{stage:<13} {alike[stage, fresh]} runs {'computed' if fresh else 'up to date'}")
     return [outcome for outcome in outcomes if outcome.remarks or (outcome.stage, outcome.fresh) not in many]

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["HELP", "LetterError", "agreed", "answer", "ask_marker", "ask_numbers", "ask_places"]
 
 HELP = (
-    "centimetres, such as 123.4; a begins the place anew, s skips it, u undoes the last one, q ends; Enter "
-    "keeps what stands in brackets"
+    "type centimetres, such as 123.4; a: start the point again, s: skip it, u: undo the last point, q: end; "
+    "Enter keeps the value in brackets"
 )
 _LETTERS = ("a", "s", "u", "q")
 _SIDES = {**dict.fromkeys(("l", "left", "links"), "left"), **dict.fromkeys(("r", "right", "rechts"), "right")}
@@ -57,7 +57,7 @@ def agreed(question: str, usual: bool) -> bool:
         text = answer(f"{question} [{'Y/n' if usual else 'y/N'}]").lower()
         if not text or text in _YES_NO:
             return _YES_NO.get(text, usual)
-        _complain([f"{text!r} is neither yes nor no; type y or n"])
+        _complain([f"{text!r} is not yes or no; type y or n"])
 
 
 def ask_marker(rig: Rig, usual: str) -> str:
@@ -76,7 +76,9 @@ def ask_numbers(rig: Rig, marker: str, before: TypedEntry | None) -> TypedEntry:
     side = ""
     if needs_side(rig, entered):
         usual = before.side if before else ""
-        question = f"from {entered[0]} to {entered[1]}, it lies left or right?{'' if usual else ' [l/r]'}"
+        question = (
+            f"side of the line from {entered[0]} to {entered[1]}, left or right?{'' if usual else ' [l/r]'}"
+        )
         side = _ask_side(question, usual)
     usual = before.height if before else ""
     height = _ask(
@@ -108,7 +110,7 @@ def _ask_side(question: str, usual: str) -> str:
         typed = answer(question, usual)
         if typed.lower() in _SIDES:
             return _SIDES[typed.lower()]
-        _complain([f"{typed!r} is no side; type l or r" if typed else "type l or r"])
+        _complain([f"{typed!r} is not a side; type l or r" if typed else "type l or r"])
 
 
 def _ask(question: str, field: str, usual: str, read: Read) -> str:
@@ -157,7 +159,7 @@ def ask_places(scene: MeasuringScene) -> None:
             ]
         elif scene.intervals:
             del left[0]
-    console.print("no more places in this log")
+    console.print("all stationary intervals are done")
 
 
 def _ask_place(scene: MeasuringScene, interval: int | None, saved: list[str]) -> str | Measurement:
@@ -194,12 +196,12 @@ def _measure(
         checked = _check(scene, interval, typed)
         _show(checked)
         if checked.faults and interval is None and {fault.field for fault in checked.faults} == {"marker"}:
-            answer("Enter looks again")
+            answer("press Enter to check again")
             continue
         if checked.measurement is None:
             return typed
         doubtful = bool(checked.warnings)
-        if not agreed(f"save {checked.id}{' all the same' if doubtful else ''}?", not doubtful):
+        if not agreed(f"save {checked.id}{' anyway' if doubtful else ''}?", not doubtful):
             return typed
         # The marker may have stopped or moved while the user read the question.
         now = _check(scene, interval, typed)
@@ -231,13 +233,13 @@ def _ask_point(scene: MeasuringScene, interval: int | None, before: TypedEntry |
     console.print()
     if interval is None:
         visible = visible_markers(scene.views(None), scene.rig)
-        console.print(f"markers seen: {', '.join(map(str, visible)) or 'none'}", markup=False)
+        console.print(f"visible markers: {', '.join(map(str, visible)) or 'none'}", markup=False)
         usual = before.marker if before else str(visible[0]) if len(visible) == 1 else ""
         marker = ask_marker(scene.rig, usual)
     else:
         stationary = scene.intervals[interval]
         marker = str(stationary.marker_id)
-        console.print(f"Place {interval + 1} of {len(scene.intervals)}", style="bold")
+        console.print(f"Stationary interval {interval + 1} of {len(scene.intervals)}", style="bold")
     observations = observe_marker(scene.views(interval), int(marker))
     console.print(
         observations.text, style="green" if observations.state == "still" else "yellow", markup=False
@@ -253,16 +255,14 @@ def _show(checked: EntryCheck) -> None:
     if checked.point_m is not None:
         x_m, y_m, z_m = checked.point_m.tolist()
         known = "" if checked.sigma_m is None else f" +- {checked.sigma_m * CM_PER_M:.1f} cm"
-        where = "" if checked.on_floor is None else ", within the floor's edges" if checked.on_floor else ""
-        console.print(
-            f"x {x_m:.3f} m, y {y_m:.3f} m{known}, {z_m * CM_PER_M:.1f} cm high{where}", markup=False
-        )
+        where = "" if checked.on_floor is None else ", on the floor area" if checked.on_floor else ""
+        x_cm, y_cm, z_cm = x_m * CM_PER_M, y_m * CM_PER_M, z_m * CM_PER_M
+        console.print(f"x {x_cm:.1f} cm, y {y_cm:.1f} cm{known}, height {z_cm:.1f} cm{where}", markup=False)
     for name, off_m in checked.residuals_m:
-        console.print(f"  {name} disagrees by {off_m * CM_PER_M:+.1f} cm", markup=False)
+        console.print(f"  residual of the distance to {name}: {off_m * CM_PER_M:+.1f} cm", markup=False)
     for prediction in checked.predictions:
-        console.print(
-            f"  model of {prediction.camera}: {prediction.off_m * CM_PER_M:.1f} cm off", markup=False
-        )
+        off_cm = prediction.off_m * CM_PER_M
+        console.print(f"  distance to the prediction of {prediction.camera}: {off_cm:.1f} cm", markup=False)
     for text in checked.warnings:
         console.print(text, style="yellow", markup=False)
 
@@ -278,12 +278,12 @@ def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
 
     active = {measurement.id: measurement for measurement in active_measurements(scene.history())}
     if not active:
-        console.print("nothing is measured yet", style="yellow")
+        console.print("the log has no measurements yet", style="yellow")
         return None
     own = [name for name in saved if name in active]
     last = active[own[-1]] if own else list(active.values())[-1]
     if not own and not _agreed_to_withdraw(last):
-        console.print("nothing is withdrawn", style="yellow")
+        console.print("no measurement is withdrawn", style="yellow")
         return None
     try:
         scene.add([withdrawal_of(scene.history(), last.id)])
@@ -301,8 +301,6 @@ def _agreed_to_withdraw(measurement: Measurement) -> bool:
     tapes = ", ".join(f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances)
     text = f"{measurement.id} (marker {measurement.marker_id}{': ' if tapes else ''}{tapes})"
     try:
-        return agreed(
-            f"nothing measured in this session; {text} is of an earlier session. Withdraw it?", False
-        )
+        return agreed(f"this session has no measurements; {text} is of an earlier one. Withdraw it?", False)
     except LetterError:
         return False

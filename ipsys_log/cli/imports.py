@@ -16,7 +16,7 @@ _MCAP_MAGIC = b"\x89MCAP"
 
 
 def add_commands(app: typer.Typer) -> None:
-    group = typer.Typer(help="Turn the data of others into a log.", no_args_is_help=True)
+    group = typer.Typer(help="Convert other recordings into a log.", no_args_is_help=True)
     group.command("imsel")(imsel)
     group.command("images")(images)
     group.command("videos")(videos)
@@ -24,10 +24,13 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def imsel(
-    folder: Annotated[Path, typer.Argument(help="The authors' data, or a clone of their repository.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of the paper's data, or a clone of its repository."),
+    ],
     output: NewLog,
 ) -> None:
-    """Import the measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
+    """Import the data of the paper (Ou et al., Robotica 2023): .mat files and camera YAML files."""
     _refuse_log(folder)
     from ipsys_log.exchange.imsel import read_imsel
     from ipsys_log.runs.output import write_log
@@ -37,23 +40,27 @@ def imsel(
 
 
 def images(
-    folder: Annotated[Path, typer.Argument(help="A folder with one sub-folder of pictures per camera.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A folder with one sub-folder of pictures per camera.")
+    ],
     output: NewLog,
     rig: RigFile = None,
     calibration: Calibrations = None,
     rate: Annotated[
-        float, typer.Option(metavar="HZ", help="Pictures per second, where they have no times.")
+        float, typer.Option(metavar="HZ", help="Pictures per second, if they have no times.")
     ] = 1.0,
     times: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|names",
-            help="When each was taken: a CSV file with the columns file (red/0001.jpg) and time; or names if "
-            "the files' names are times. A time is s, ms, us or ns since 1970, or 2024-05-31T12:30:00.25Z.",
+            help="Times of the pictures: a CSV file with the columns file (red/0001.jpg) and time, or "
+            "names if "
+            "the file names are times. A time is in s, ms, us or ns since 1970, or like "
+            "2024-05-31T12:30:00.25Z.",
         ),
     ] = None,
 ) -> None:
-    """Import a folder of images, one sub-folder per camera; without --times the n-th ones belong together."""
+    """Import a folder of images. Without --times, images with the same number have the same time."""
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.exchange.image_folders import find_images, find_times, read_images
     from ipsys_log.runs.output import write_log
@@ -65,23 +72,25 @@ def images(
     lab = load_matching_rig(rig, lambda: pictures)
     write_log(output, read_images(pictures, lab, lenses, rate, taken_ns))
     if not times and len({len(paths) for paths in pictures.values()}) > 1:
-        remarks.print("cameras have unequal numbers of pictures: the n-th of each are taken for one instant")
+        remarks.print(
+            "the cameras have different numbers of pictures: pictures with the same number get the same time"
+        )
     counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
     console.print(f"{output} written: pictures: {counts}")
 
 
 def videos(
     files: Annotated[
-        list[str], typer.Argument(metavar="CAMERA=FILE...", help="A video for each camera: red=red.mp4.")
+        list[str], typer.Argument(metavar="CAMERA=FILE", help="A video for each camera: red=red.mp4.")
     ],
     output: NewLog,
     rig: RigFile = None,
     calibration: Calibrations = None,
     start: Annotated[
-        str, typer.Option(metavar="TIME", help="When all of them begin: s since 1970, or ISO 8601.")
+        str, typer.Option(metavar="TIME", help="Start of all videos: s since 1970, or ISO 8601.")
     ] = "2020-01-01T00:00:00Z",
 ) -> None:
-    """Videos that begin at one instant. MJPEG, H.264 and H.265 go into the log as they are."""
+    """Import videos that start at the same time. The log gets MJPEG, H.264 and H.265 unchanged."""
     from ipsys_log.capture.video_files import read_videos
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.exchange.image_folders import parse_start
@@ -108,8 +117,8 @@ def _refuse_log(path: Path) -> None:
         return  # a folder, or no file: the importer reports it
     if is_log:
         raise IpsysError(
-            f"{path}: is a log already and needs no import. See what it holds with: ipsys info {path}; "
-            f"then: ipsys replay {path}"
+            f"{path}: is already a log and needs no import. To list its contents: ipsys info {path};  "
+            f"to process it: ipsys replay {path}"
         )
 
 
@@ -121,8 +130,8 @@ def _by_camera(files: list[str]) -> dict[str, Path]:
     for option in files:
         camera, equals, name = option.partition("=")
         if not equals:
-            raise IpsysError(f"{option}: write it as camera=file.mp4")
+            raise IpsysError(f"{option}: has no camera name; write camera=file.mp4")
         if check_name(camera, f"{option}: camera name") in paths:
-            raise IpsysError(f"{option}: two videos of one camera, {camera!r}")
+            raise IpsysError(f"{option}: camera {camera!r} has two videos; give one")
         paths[camera] = Path(name)
     return paths

@@ -16,20 +16,22 @@ __all__ = ["add_commands"]
 
 Runs = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--run", metavar="NAME", help="A run to show, instead of the newest; repeat for several."),
+    typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),
 ]
 Save = Annotated[
     Path | None,
-    typer.Option("--save", metavar="FILE", help="Write a Rerun recording (.rrd); needs no screen."),
+    typer.Option(
+        "--save", metavar="FILE", help="Write a Rerun recording (.rrd) instead of opening the viewer."
+    ),
 ]
 _HTML = (
     Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("--html", metavar="FILE", help="The page, instead of the log's name with .html."),
+        typer.Option("--html", metavar="FILE", help="The page to write. Default: the log's name with .html."),
     ],
     None,
 )
-_HELP = f"Write one HTML page that says how good the models of a log are; it needs no network.{MORE}"
+_HELP = f"Write an HTML page with the accuracy of a log's models. The page needs no network.{MORE}"
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -59,7 +61,7 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
 
 
 def runs(logs: Logs, as_json: AsJson = False) -> None:
-    """Show the runs of a log: stage, inputs, parameters, version of ipsys, and whether it is up to date.
+    """Show the runs of a log: stage, inputs, parameters, version of ipsys, and state.
 
     The state is: current; out of date, with the reason (replay computes it again as a new run); not
     repeatable (its inputs are not in the log); unfinished (its writer was stopped).
@@ -76,13 +78,13 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
 
 
 def repair(
-    log: Annotated[Path, typer.Argument(help="A log whose writer was killed, or that was cut off.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A damaged or incomplete log.")],
 ) -> None:
-    """Repair a log in place: keep all whole records, report what is gone, and finish its runs.
+    """Repair a log in place: keep all complete records, report the losses, and complete its runs.
 
-    All bytes that are taken out are kept in <log>.damaged. A log that cannot be repaired is not changed. If
-    ipsys live or record --detect was killed, its recorded frames without results are processed now. This
-    repeats the runs to check them; Ctrl-C leaves it to ipsys replay.
+    The removed bytes are kept in <log>.damaged. A log that cannot be repaired is not changed. If ipsys live
+    or record --detect was killed, the command also processes the recorded frames that have no results. For
+    this it computes the runs again. After Ctrl-C, ipsys replay can do this instead.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
@@ -100,7 +102,7 @@ def repair(
         with progress_bar() as progress:
             print_outcomes(finish_runs(log, progress))
     except IpsysError as error:  # the log itself is complete
-        remarks.print(f"its runs cannot be finished: {error}", style="yellow", markup=False)
+        remarks.print(f"unfinished runs cannot be completed: {error}", style="yellow", markup=False)
 
 
 def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
@@ -123,7 +125,7 @@ def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
         if named:
             remarks.print(f"{kind:<21} run {named}")
     if save is not None:
-        remarks.print(f"{save} written; look at it with: rerun {save}")
+        remarks.print(f"{save} written; to view it: rerun {save}")
 
 
 def _check_save(save: Path, logs: list[Path]) -> None:
@@ -132,7 +134,7 @@ def _check_save(save: Path, logs: list[Path]) -> None:
     from ipsys_log.report.files import check_file
 
     if save.suffix != ".rrd":
-        raise IpsysError(f"--save {save}: Rerun opens recordings that end in .rrd; name it {save.stem}.rrd")
+        raise IpsysError(f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd")
     check_file(save, "--save", logs)
 
 

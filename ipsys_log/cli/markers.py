@@ -17,11 +17,13 @@ __all__ = ["add_commands"]
 
 RigNow = Annotated[
     Optional[Path],  # noqa: UP045
-    typer.Option("--rig", metavar="FILE", help="Print the markers of this rig file, each at its length."),
+    typer.Option("--rig", metavar="FILE", help="Print the markers of this rig file, in their true size."),
 ]
 Ids = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option(metavar="LIST", help="Print these ids, such as 1,2,3 or 0-9, instead of those of the rig."),
+    typer.Option(
+        metavar="LIST", help="Print these ids, such as 1,2,3 or 0-9, instead of the ids of the rig."
+    ),
 ]
 Length = Annotated[
     Optional[float],  # noqa: UP045
@@ -39,11 +41,11 @@ BoardName = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         metavar="COLUMNSxROWS",
-        help="Print a board for ipsys calibrate, by the inner corners of a chessboard, such as 6x4, or the "
+        help="Print a board for ipsys calibrate: inner corners of a chessboard, such as 6x4, or "
         "squares of a ChArUco board, such as charuco:4x5.",
     ),
 ]
-Square = Annotated[float, typer.Option(metavar="METRES", help="Side of a board's square, in m.")]
+Square = Annotated[float, typer.Option(metavar="METRES", help="Side of a square of the board, in m.")]
 MarkerScale = Annotated[
     float,
     typer.Option(metavar="SHARE", help="Side of a ChArUco marker, as a fraction of the side of a square."),
@@ -89,7 +91,7 @@ def markers(
     from ipsys_log.report.print_pages import choose_paper, draw_pages, lay_out
 
     if output.suffix.lower() != ".pdf":
-        raise IpsysError(f"--output {output}: only PDF keeps the true size; use a name that ends in .pdf")
+        raise IpsysError(f"--output {output}: only a PDF keeps the true size; use a name that ends in .pdf")
     check_file(output, "--output", [])
     if output.exists() and not force:
         raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
@@ -105,10 +107,12 @@ def markers(
     console.print(f"{output} written: {count} of {paper.name}, {_contents(prints)}", markup=False)
     if page is None and paper.name != "A4":
         console.print(
-            "A4 is too small. A copy shop prints A3; --length 0.14 gives markers that fit onto A4",
+            "A4 is too small. Print on A3, or use --length 0.14 for markers that fit on A4",
             markup=False,
         )
-    console.print('print it at 100 % ("actual size"), and measure the ruler: 10 cm', markup=False)
+    console.print(
+        'print at 100 % ("actual size"), and check that the printed ruler is 10 cm long', markup=False
+    )
 
 
 def _marker_prints(
@@ -120,7 +124,7 @@ def _marker_prints(
     lab = _lab(rig, length, dictionary)
     wanted = None if ids is None else _parse_ids(ids, lab.dictionary)
     if wanted is None and not lab.markers:
-        raise IpsysError(f"{rig}: lists no [[markers]]; name the ids, such as --ids 0-9")
+        raise IpsysError(f"{rig}: has no [[markers]]; give ids, such as --ids 0-9")
     return rig_prints(lab, wanted, length)
 
 
@@ -137,7 +141,9 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
     if rig is not None:
         lab = load_rig(rig)
     elif length is None:
-        raise IpsysError("--ids: give the side of the markers too, such as --length 0.1, or --rig lab.toml")
+        raise IpsysError(
+            "--ids: the side of the markers is missing; add --length 0.1 (in m), or --rig lab.toml"
+        )
     else:
         lab = Rig("lab", (dictionary or _DICTIONARY).upper(), length)
     marker_detector(lab.dictionary)
@@ -162,11 +168,13 @@ def _parse_ids(text: str, dictionary: str) -> list[int]:
     for part in text.split(","):
         first, dash, last = (text.strip() for text in part.partition("-"))
         if not first.isdecimal() or (dash and not last.isdecimal()) or len(part) > 12:
-            raise IpsysError(f"--ids {text}: write ids as 1,2,3 or as 0-9")
+            raise IpsysError(f"--ids {text}: is not a list of ids; write 1,2,3 or 0-9")
         ids += range(int(first), min(int(last or first), int(first) + _MOST) + 1)
     size = dictionary_size(dictionary)
     if not ids or (size is not None and max(ids) >= size):
-        raise IpsysError(f"--ids {text}: {dictionary} has the ids 0 to {(size or 1) - 1}; name some of these")
+        raise IpsysError(
+            f"--ids {text}: {dictionary} has the ids 0 to {(size or 1) - 1}; give ids in this range"
+        )
     return list(dict.fromkeys(ids))
 
 

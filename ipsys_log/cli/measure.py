@@ -38,27 +38,34 @@ Log = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Argument(
         metavar="LOG",
-        help="A finished log; the measurements go into it. Without one: what the cameras of --rig send now.",
+        help="A finished log, which gets the measurements. Without LOG: use the cameras of --rig now.",
     ),
 ]
 Output = Annotated[
     Optional[Path],  # noqa: UP045
-    log_option(help="Without a LOG: the log to write, with about a second of frames of each place."),
+    log_option(help="Without LOG: the log to write, with about 1 s of frames of each point."),
 ]
-Terminal = Annotated[bool, typer.Option("--terminal", help="Ask here in the terminal instead of on a page.")]
+Terminal = Annotated[bool, typer.Option("--terminal", help="Ask in the terminal instead of on a page.")]
 Sheet = Annotated[
     Path | None,
-    typer.Option("--csv", metavar="SHEET", help="Read a sheet (docs/measuring.md has its header) instead."),
+    typer.Option(
+        "--csv",
+        metavar="SHEET",
+        help="Read the measurements from a sheet; docs/measuring.md shows the columns.",
+    ),
 ]
 Insist = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="With --csv: write rows that look wrong. With cameras: overwrite the log of -o if there is one.",
+        help="With --csv: write rows that look wrong, too. With cameras: overwrite an existing log of -o.",
     ),
 ]
 Places = Annotated[
-    bool, typer.Option("--places", help="Only list where markers lie still, as a sheet numbers them.")
+    bool,
+    typer.Option(
+        "--places", help="Only list the stationary intervals of the markers, with their numbers for a sheet."
+    ),
 ]
 
 # The model that a replay fits, and the number of calibration points that gives good results.
@@ -100,23 +107,25 @@ def measure(
     from ipsys_log.extras import check_installed
 
     if sum((terminal, csv is not None, places)) > 1:
-        raise IpsysError("--terminal, --csv and --places exclude one another; give one of them")
+        raise IpsysError("--terminal, --csv and --places cannot be used together; give one of them")
     if not (terminal or ends):
         check_installed("the measuring page needs", "starlette", "uvicorn")
     if log is not None:
         _refuse(
-            "cameras; leave out LOG, or this",
+            "live cameras; leave out LOG or this option",
             output=output,
             camera=camera,
             model_from=model_from,
         )
         if csv is None:
-            _refuse("--csv, or cameras; leave it out", force=force)
+            _refuse("--csv or live cameras; leave it out", force=force)
         _measure_log(log, terminal, csv, force, places, host, port, rig, calibration, corners, as_json)
         return
-    _refuse("a finished log; name it", csv=csv, places=places)
+    _refuse("a finished log; name the log", csv=csv, places=places)
     if rig is None or output is None:
-        raise IpsysError("name a finished log, or give --rig lab.toml -o places.mcap to measure with cameras")
+        raise IpsysError(
+            "no log is given; name a finished log, or give --rig lab.toml -o places.mcap to use cameras"
+        )
     from ipsys_log.cli.measure_live import measure_now
 
     measured = measure_now(output, rig, camera, calibration, corners, model_from, force, terminal, host, port)
@@ -130,7 +139,7 @@ def _refuse(where: str, **options: object) -> None:
 
     for name, value in options.items():
         if value:
-            raise IpsysError(f"--{name.replace('_', '-')} is for {where}")
+            raise IpsysError(f"--{name.replace('_', '-')} is only for {where}")
 
 
 def _measure_log(
@@ -175,7 +184,7 @@ def _measure_log(
         _show_next(log, scene.history())
     if rig is not None:
         remarks.print(
-            f"give --rig {rig} to ipsys replay, too: it measured with these reference points", markup=False
+            f"give --rig {rig} to ipsys replay, too: the measurements use its reference points", markup=False
         )
 
 
@@ -190,7 +199,7 @@ def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         console.print(f"open {page.url}", markup=False)
-        remarks.print("Ctrl-C ends it; every place is in the log as soon as it is saved")
+        remarks.print("Ctrl-C ends the measuring; every saved point is already in the log")
         try:
             page.wait(lambda: bool(signals))
         finally:
@@ -204,7 +213,7 @@ def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
         print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
         return
     also = f", {withdrawn} withdrawn" if withdrawn else ""
-    console.print(f"{count} place{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
+    console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
 
 
 def _show_next(log: Path, history: Sequence[Measurement]) -> None:
@@ -217,11 +226,11 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
         return
     if count < _GOOD:
         remarks.print(
-            f"places in it: {count}; a model needs {min_pairs(_MODEL)} or more that each camera sees, and "
-            f"gets good with some {_GOOD}",
+            f"calibration points in the log: {count}; each camera must see {min_pairs(_MODEL)} or more for a "
+            f"model, and about {_GOOD} for a good one",
             markup=False,
         )
-    remarks.print(f"then: ipsys replay {log}", markup=False)
+    remarks.print(f"next: ipsys replay {log}", markup=False)
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:

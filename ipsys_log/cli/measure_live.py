@@ -54,7 +54,7 @@ def measure_now(
 
         check_port_free(host, port)
     ends = "q" if terminal else "Ctrl-C"
-    doing = f"measuring into {output}; {ends} ends it"
+    doing = f"measuring into {output}; {ends} to end"
     with open_cameras(lab, output, None, doing, not terminal) as (cameras, settings, status):
         scene = live_scene(settings, cameras, model)
         consumers: list[Consumer] = [status, scene]
@@ -110,7 +110,7 @@ def say_faults(page: PageServer) -> None:
     """Print the faults of the page's server at the end, when the screen is free for a traceback."""
     if page.exceptions.count:
         remarks.print(
-            f"faults of ipsys in the measuring page: {page.exceptions.count}; the first one:", style="red"
+            f"internal errors of the measuring page: {page.exceptions.count}; the first one:", style="red"
         )
         remarks.print(page.exceptions.first, markup=False, highlight=False)
 

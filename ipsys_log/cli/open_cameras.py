@@ -36,7 +36,7 @@ __all__ = [
 
 
 # The name of a log that exists only while the command runs.
-SENT_NOW = "what the cameras sent"
+SENT_NOW = "the camera images"
 # The description of the log of --model-from in messages.
 MODEL = "the log with the model"
 # Duration of the frames that are kept for a measured point.
@@ -82,7 +82,9 @@ def prepare_lab(
     for camera in lab.cameras:
         if camera.width and camera.height and camera.width < camera.height:
             text = f"camera {camera.name}: {camera.width} x {camera.height} px is upright"
-            remarks.print(f"{text}: are width and height exchanged?", style="yellow", markup=False)
+            remarks.print(
+                f"{text}: check that width and height are not exchanged", style="yellow", markup=False
+            )
     return lab
 
 
@@ -92,9 +94,9 @@ def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -
     files = [("a calibration", Path(option.rpartition("=")[2])) for option in calibration or ()]
     for camera in cameras:
         if camera.calibration is not None:
-            files.append((f"the lens of camera {camera.name}", rig.parent / camera.calibration))
+            files.append((f"the calibration of camera {camera.name}", rig.parent / camera.calibration))
         if str(camera.source).startswith("file:"):
-            files.append((f"what camera {camera.name} plays", split_source(str(camera.source))[0]))
+            files.append((f"the source of camera {camera.name}", split_source(str(camera.source))[0]))
     return files
 
 
@@ -119,7 +121,7 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     try:
         journal_path(output).exists()
     except OSError as error:
-        shorter = "; give a shorter name" if error.errno == errno.ENAMETOOLONG else ""
+        shorter = "; choose a shorter name" if error.errno == errno.ENAMETOOLONG else ""
         raise IpsysError(f"-o {output}: {error.strerror}{shorter}") from error
     check_file(output, "-o", [])
     if not output.exists():
@@ -147,7 +149,7 @@ def open_cameras(
 
     Parameters
     ----------
-    doing : text for the beginning if the command does not record; then the end has no text on frames.
+    doing : text printed at the start of a command that does not record; without it, the end reports frames.
     panel : the screen is free for a table of the cameras.
     until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
 
@@ -176,7 +178,7 @@ def open_cameras(
         monitor = stack.enter_context(CameraMonitor(lab.rig))
         status = LiveStatus(attached.states, monitor, output, monotonic, growing)
         _say_room(lab, attached, free_room(output, expected), seconds, doing)
-        say(doing or f"recording into {output}; Ctrl-C ends it")
+        say(doing or f"recording into {output}; Ctrl-C to end")
         if panel:
             stack.enter_context(_on_screen(status))
         yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
@@ -238,13 +240,13 @@ def record_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[P
 
     with TemporaryDirectory(prefix="ipsys-") as folder:
         log = keep or Path(folder) / "now.mcap"
-        doing = None if keep else f"looking for {seconds:g} s"
+        doing = None if keep else f"recording for {seconds:g} s"
         try:
             with open_cameras(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
                 pipeline.record(cameras, settings, log, [status])
         except Interrupted as interrupt:
             kept = (
-                f"{keep} has the frames up to the interruption"
+                f"{keep} has the frames before the interruption"
                 if keep and keep.exists()
                 else "no frame was kept"
             )

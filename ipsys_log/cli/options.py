@@ -57,7 +57,7 @@ def annotate(parameter: Parameter) -> Any:
 
 Logs = Annotated[
     list[Path],
-    typer.Argument(help="Logs, read as one. Results go to the last.", metavar="LOG..."),
+    typer.Argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
 ]
 
 
@@ -82,55 +82,55 @@ def _named_as_log(path: Path | None) -> Path | None:
         from ipsys_log.errors import IpsysError
 
         page = "; ipsys report --html FILE writes a page" if path.suffix.lower() in (".html", ".htm") else ""
-        raise IpsysError(f"-o {path}: -o is for a new log, which ends in .mcap{page}")
+        raise IpsysError(f"-o {path}: the name of a new log ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
-    remarks.print(f"-o {path}: the log is called {named}", markup=False)
+    remarks.print(f"-o {path}: the log gets the name {named}", markup=False)
     return named
 
 
 # The options that every command uses for the name of a new log.
 log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
-NewLog = Annotated[Path, log_option(help="The log to write, a file that ends in .mcap.")]
+NewLog = Annotated[Path, log_option(help="The log to write, with a name that ends in .mcap.")]
 RigFile = Annotated[
     Path | None,
-    typer.Option("--rig", metavar="FILE", help="A rig file (lab.toml) to use instead of what the log holds."),
+    typer.Option("--rig", metavar="FILE", help="Use this rig file (lab.toml) instead of the rig in the log."),
 ]
 Calibrations = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
-        help="The lens of a camera, instead of the log's or the rig's: a YAML of OpenCV or ROS, or a log "
-        "that holds it. Repeat it for each camera; without CAMERA= a log gives those of all.",
+        help="Use these camera intrinsics: a YAML file of OpenCV or ROS, or a log "
+        "with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
 Corners = Annotated[Optional[str], build_option(CORNERS)]  # noqa: UP045
 Method = Annotated[str, build_option(METHOD)]
 Only = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--camera", metavar="NAME", help="Only this camera of the rig; repeat it for several."),
+    typer.Option("--camera", metavar="NAME", help="Use only this camera of the rig; repeat it for several."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite the log if there is one of that name.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing log of this name.")]
 Host = Annotated[
     str | None,
     typer.Option(
         "--host",
         metavar="ADDRESS",
-        help="Let a phone in this network open the page, at 0.0.0.0 (all addresses of this machine) or at "
-        "one of them. It is shown with a secret that is new at each start. Without it: this machine alone.",
+        help="Let a phone in this network open the page: 0.0.0.0 for all addresses of this machine, or "
+        "one address. The page has a new secret at each start. Default: only this machine.",
     ),
 ]
 Port = Annotated[
     int,
-    typer.Option(min=0, max=65535, metavar="PORT", help="The port of the page; 0 takes any that is free."),
+    typer.Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0 for any free port."),
 ]
 RigNow = Annotated[
-    Path, typer.Option("--rig", metavar="FILE", help="The rig file; each camera has a source there.")
+    Path, typer.Option("--rig", metavar="FILE", help="The rig file, with a source for each camera.")
 ]
 ModelOfOther = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option(
-        "--model-from", metavar="LOG", help="While measuring, say where this log's model puts a place."
+        "--model-from", metavar="LOG", help="While measuring, compare each point with the model of this log."
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -160,12 +160,16 @@ def load_calibrations(
                 recorded = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
             calibrations = {c: lens for c, lens in recorded.items() if c in cameras()}
             if not calibrations:
-                raise IpsysError(f"--calibration {option}: holds no calibration of these cameras")
+                raise IpsysError(
+                    f"--calibration {option}: has no calibration of these cameras; give another log"
+                )
         else:
-            raise IpsysError(f"--calibration {option}: write it as camera=file.yaml, or name a log (.mcap)")
+            raise IpsysError(
+                f"--calibration {option}: has no camera name; write camera=file.yaml, or name a log (.mcap)"
+            )
         for name in calibrations:
             if name in lenses:
-                raise IpsysError(f"--calibration: two cameras of one name, {name!r}")
+                raise IpsysError(f"--calibration: camera {name!r} has two calibrations; give one")
         lenses.update(calibrations)
     return lenses
 

@@ -26,15 +26,15 @@ _MOST_PLACES = 50
 # Without a floor in the rig, this is the largest height of a marker.
 _HIGHEST_M = 5.0
 
-Places = Annotated[int, typer.Option(metavar="N", help="How many places.")]
-Model = Annotated[str, typer.Option(metavar="NAME", help="The model that is to become better.")]
+Places = Annotated[int, typer.Option(metavar="N", help="Number of points to propose.")]
+Model = Annotated[str, typer.Option(metavar="NAME", help="The model to improve.")]
 Heights = Annotated[
     Optional[list[float]],  # noqa: UP045
     typer.Option(
         "--height-m",
         metavar="METRES",
-        help="Height of the marker above the floor; repeat it for several. Else the heights used so far, in "
-        "turn.",
+        help="Height of the marker above the floor, in m; repeat it for several. Default: the heights of the "
+        "measured points, in turn.",
     ),
 ]
 Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
@@ -61,9 +61,9 @@ def plan(
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say where to measure next: the places that lower the predicted error over the floor most.
+    """Propose the next points to measure, which reduce the predicted error over the floor most.
 
-    A model that the log does not hold yet is fitted first, to the places measured so far.
+    If the log has no such model yet, the command fits one first.
     """
     from ipsys_log.messages.channels import MODEL, RIG
     from ipsys_log.report.files import check_figure_file
@@ -117,7 +117,8 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
 
     if not 1 <= places <= _MOST_PLACES:
         raise IpsysError(
-            f"--places {places}: plan 1 to {_MOST_PLACES} places at a time, and again when these are measured"
+            f"--places {places}: is not between 1 and {_MOST_PLACES}; plan fewer points, measure them, and "
+            "plan again"
         )
     with Session(logs) as session:
         rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
@@ -129,12 +130,12 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
         for height_m in heights_m:
             if not (math.isfinite(height_m) and 0 <= height_m <= max(spans_m, default=_HIGHEST_M)):
                 raise IpsysError(
-                    f"--height-m {height_m:g}: no marker is laid there in this lab; give metres, such as 0.15"
+                    f"--height-m {height_m:g}: is not a height in this lab; give metres, such as 0.15"
                 )
         if not measured(LogView(session, rig=rig)) and copied_run(session, model) is None:
             raise IpsysError(
-                f"{session}: no place is measured yet, so there is nothing to plan from: first measure about "
-                "10 places, spread over the view of each camera out to its edges, at the heights in use"
+                f"{session}: has no calibration points, so a plan is not possible; first measure about 10 "
+                "points over the whole view of each camera, at the heights in use"
             )
 
 
@@ -142,8 +143,8 @@ def _headline(found: PlannedFloor) -> str:
     from ipsys_log.report.plan import means_cm
 
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
-    subject = "this place" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} places"
-    return f"predicted mean error over the floor now {before} cm; with {subject} {after} cm"
+    subject = "this point" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} points"
+    return f"predicted mean error over the floor: {before} cm now, {after} cm with {subject}"
 
 
 def _table(found: PlannedFloor) -> Table:
@@ -152,21 +153,23 @@ def _table(found: PlannedFloor) -> Table:
     from ipsys_log.report.plan import means_cm
     from ipsys_log.units import CM_PER_M
 
-    title = f"Where to measure next, for the model {found.model} of run {found.run}"
+    title = f"Next points to measure, for the model {found.model} of run {found.run}"
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    for name in ("", "x m", "y m", "high cm"):
+    for name in ("", "x cm", "y cm", "height cm"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("by tape, m", overflow="fold")
+    table.add_column("tape cm", overflow="fold")
     table.add_column("seen by", overflow="fold")
     table.add_column("mean error cm", justify="right", no_wrap=True)
     places = found.plan.places
     means = means_cm(places[0].mean_before_m, *(place.mean_after_m for place in places))
     for number, place in enumerate(places, 1):
         x, y, z = place.point_m.tolist()
-        distances = [f"{name} {value:.2f}" for name, value in found.distances_m(place.point_m).items()]
+        distances = [
+            f"{name} {value * CM_PER_M:.0f}" for name, value in found.distances_m(place.point_m).items()
+        ]
         side = found.side(place.point_m)
         table.add_row(
-            str(number), f"{x:.2f}", f"{y:.2f}", f"{z * CM_PER_M:g}",
+            str(number), f"{x * CM_PER_M:.0f}", f"{y * CM_PER_M:.0f}", f"{z * CM_PER_M:g}",
             ", ".join([*distances, *([side] if side else [])]) or "-", ", ".join(place.cameras),
             f"{means[number - 1]} -> {means[number]}",
         )  # fmt: skip

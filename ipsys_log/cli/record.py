@@ -33,9 +33,9 @@ __all__ = ["add_commands"]
 
 Seconds = Annotated[
     Optional[float],  # noqa: UP045
-    typer.Option(min=0.1, metavar="SECONDS", help="Stop by itself after so many seconds."),
+    typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
 ]
-View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun meanwhile.")]
+View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
 
 _NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
 
@@ -51,10 +51,13 @@ def record(
     rig: RigNow = Path("lab.toml"),
     camera: Only = None,
     calibration: Calibrations = None,
-    detect: Annotated[bool, typer.Option("--detect", help="Find the markers and write them too.")] = False,
+    detect: Annotated[bool, typer.Option("--detect", help="Detect the markers and write them, too.")] = False,
     corners: Corners = None,
     measure: Annotated[
-        bool, typer.Option("--measure", help="Enter tape measurements meanwhile, on a page for the phone.")
+        bool,
+        typer.Option(
+            "--measure", help="Enter tape measurements during the recording, on a page for the phone."
+        ),
     ] = False,
     host: Host = None,
     port: Port = 8000,
@@ -62,7 +65,7 @@ def record(
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
-    """Record the frames of the cameras as they come, until Ctrl-C."""
+    """Record the camera frames, unchanged, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start
@@ -72,7 +75,10 @@ def record(
     from ipsys_log.runs.options import Request
 
     if model_from is not None and not measure:
-        raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
+        raise IpsysError(
+            f"--model-from {model_from}: has no effect without --measure; add --measure, or track with: "
+            "ipsys live"
+        )
     if measure:
         check_installed("--measure needs", "starlette", "uvicorn")
     lab = prepare_lab(rig, camera, calibration)
@@ -89,7 +95,8 @@ def record(
     with open_cameras(lab, output, seconds) as (cameras, settings, status):
         for name in sorted(set(lab.names) - set(lab.lenses)):
             text = (
-                f'camera {name} has no lens; a replay needs one: calibration = "{name}.yaml" in the rig file'
+                f"camera {name} has no calibration, but a replay needs one; write calibration = "
+                f'"{name}.yaml" into the rig file'
             )
             remarks.print(text, style="yellow", markup=False)
         if measure:
@@ -114,7 +121,7 @@ def live(
         typer.Option(
             "--model",
             metavar="NAME",
-            help="Which of its models, such as best; repeat it for several. Default: poly if it has that.",
+            help="Model of this log, such as best; repeat it for several. Default: poly, if the log has it.",
         ),
     ] = None,
     camera: Only = None,
@@ -125,7 +132,7 @@ def live(
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
-    """Track robots live: record, and process every frame by all stages up to fuse, until Ctrl-C."""
+    """Track robots live: record, and process every frame with all stages up to fuse, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start

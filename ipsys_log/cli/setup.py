@@ -18,31 +18,31 @@ __all__ = ["add_commands"]
 # The settings of the simulated lab that have an option: default, help. The defaults equal those of the
 # library, and a test checks this; importing the library only for a help text is too slow.
 SETTINGS: dict[str, tuple[int | float, str]] = {
-    "seed": (0, "The same seed gives the same bytes."),
-    "width": (1920, "Width of a frame, in px; the lens scales with it."),
+    "seed": (0, "Seed of the random numbers. The same seed gives the same bytes."),
+    "width": (1920, "Width of a frame, in px. The focal length scales with it."),
     "height": (1080, "Height of a frame, in px."),
-    "markers": (3, "How many lie or drive on the floor at once."),
-    "stations": (50, "About how many measured places each camera sees."),
-    "frames_per_station": (5, "Frames of each camera while the markers lie still."),
+    "markers": (3, "Number of markers on the floor at the same time."),
+    "stations": (50, "Approximate number of calibration points that each camera sees."),
+    "frames_per_station": (5, "Frames of each camera in a stationary interval."),
     "rate_hz": (30.0, "Frames per second."),
     "row_time_ns": (0, "Rolling shutter: time between the exposures of two rows, in ns; 31000 is typical."),
-    "exposure_s": (0.0, "Motion blur: how long each row is exposed, in s; 0.0167 is typical."),
-    "drive_s": (15.0, "How long the robots drive after the stations, in s."),
-    "drive_speed_m_s": (0.5, "How fast the robots drive, in m/s."),
-    "psf_sigma_px": (0.7, "Blur of the optics: sigma of the point-spread, in px."),
-    "black": (35.0, "Grey level of a marker's black, 0 to 255."),
-    "white": (205.0, "Grey level of a marker's white, 0 to 255."),
-    "noise_sigma": (2.0, "Noise of the sensor, in grey levels."),
-    "gamma": (1.0, "Gamma of the camera; 1 is linear."),
-    "jpeg_quality": (90, "Quality of the frames, 1 to 100."),
-    "mount_height_m": (2.1, "How high the cameras hang, in m."),
+    "exposure_s": (0.0, "Motion blur: exposure time of each row, in s; 0.0167 is typical."),
+    "drive_s": (15.0, "Driving time of the robots after the calibration points, in s."),
+    "drive_speed_m_s": (0.5, "Speed of the robots, in m/s."),
+    "psf_sigma_px": (0.7, "Blur of the optics: sigma of the point spread function, in px."),
+    "black": (35.0, "Grey level of black on a marker, 0 to 255."),
+    "white": (205.0, "Grey level of white on a marker, 0 to 255."),
+    "noise_sigma": (2.0, "Sensor noise (standard deviation), in grey levels."),
+    "gamma": (1.0, "Gamma of the cameras; 1 is linear."),
+    "jpeg_quality": (90, "JPEG quality of the frames, 1 to 100."),
+    "mount_height_m": (2.1, "Height of the cameras above the floor, in m."),
     "marker_length_m": (0.2, "Side of a marker's black square, in m."),
-    "tape_sigma_m": (0.003, "How badly the tape is read, in m."),
+    "tape_sigma_m": (0.003, "Standard deviation of the tape readings, in m."),
 }
 
 # The beginning of the rig file of the simulated lab.
 _SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
-# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers lie still.
+# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers do not move.
 
 """
 
@@ -53,19 +53,17 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def init(
-    path: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("lab.toml"),
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="The rig file to write.")] = Path("lab.toml"),
     log: Annotated[
         Path | None,
-        typer.Option(
-            "--from", metavar="LOG", help="Write the rig that a log holds, and what it tells of the cameras."
-        ),
+        typer.Option("--from", metavar="LOG", help="Write the rig of a log, with its camera settings."),
     ] = None,
     simulated: Annotated[
         bool,
         typer.Option(
             "--simulated",
-            help="Write the rig of the simulated lab, to try all commands without a camera, and a sheet with "
-            "what a tape reads there.",
+            help="Write the rig of the simulated lab, to try all commands without a camera, and a sheet of "
+            "its tape measurements.",
         ),
     ] = False,
 ) -> None:
@@ -75,7 +73,7 @@ def init(
 
     if simulated:
         if log is not None:
-            raise IpsysError("--from and --simulated exclude each other; give one of them")
+            raise IpsysError("--from and --simulated cannot be used together; give one of them")
         _init_simulated(path)
         return
     text = example_toml() if log is None else _rig_of(log)
@@ -83,7 +81,7 @@ def init(
     console.print(f"{path} written: edit it to describe your lab")
     if HIDDEN in text:
         console.print(
-            f"a log holds no passwords: write that of each source in place of {HIDDEN}", markup=False
+            f"a log has no passwords: in each source, replace {HIDDEN} by its password", markup=False
         )
 
 
@@ -98,7 +96,7 @@ def _init_simulated(path: Path) -> None:
     console.print(
         f"{tape} written: the tape measurements of its {len(lying)} stationary markers", markup=False
     )
-    console.print(f"then: ipsys align --rig {path}", markup=False)
+    console.print(f"next: ipsys align --rig {path}", markup=False)
 
 
 def _write_new(texts: dict[Path, str]) -> None:
@@ -138,9 +136,9 @@ def _rig_of(log: Path) -> str:
 
 
 def simulate(output: Path, **settings: Any) -> None:
-    """Render a lab with ground truth: points measured by tape, then a drive.
+    """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
 
-    By default it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
+    The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
     from ipsys_log.runs.output import write_log
     from ipsys_log.simulation.lab import simulate
     from ipsys_log.simulation.settings import LabSettings
@@ -149,7 +147,7 @@ def simulate(output: Path, **settings: Any) -> None:
     with say_kept(lambda _: text), progress_bar(lambda name: True) as progress:
         counts = write_log(output, simulate(LabSettings(**settings), progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
-    console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} measured places")
+    console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")
 
 
 def _simulate_command() -> Callable[..., None]:

@@ -6,7 +6,7 @@ runs until it is stopped gives exit code 0; every other one gives 128 plus its n
 that the process inherited as ignored stays ignored (``nohup``).
 
 An interrupt is an exception, and other packages may suppress it: the import of an extension module does. So
-it is raised again until it arrives.
+the interrupt is raised again until the command receives it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = [
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
-_KEPT = "complete results are kept, and nothing else was changed"
+_KEPT = "complete results are kept; nothing else is changed"
 
 
 class Interrupted(KeyboardInterrupt):

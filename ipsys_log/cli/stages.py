@@ -46,13 +46,13 @@ _SHARED: dict[str, tuple[Any, Any]] = {
         Annotated[
             Optional[str],  # noqa: UP045
             typer.Option(
-                "--run", metavar="NAME", help="A name for the new run, instead of edges, poly, poly_2 ..."
+                "--run", metavar="NAME", help="Name of the new run, instead of edges, poly, poly_2 ..."
             ),
         ],
         None,
     ),
     "output": (
-        Annotated[_Path, log_option(help="Write the results to a new log instead.")],
+        Annotated[_Path, log_option(help="Write the results to a new log, not to the last LOG.")],
         None,
     ),
     "as_json": (AsJson, False),
@@ -70,7 +70,7 @@ _PRINTS: dict[str, tuple[Any, Any]] = {
             bool,
             typer.Option(
                 "--details",
-                help="Print all figures, too: errors by camera, every outlier, models by number of points.",
+                help="Print details, too: errors by camera, every outlier, models by number of points.",
             ),
         ],
         False,
@@ -86,7 +86,7 @@ _ORDER = (
     *("run", "output", "as_live", "skip_ambiguous"),
 )
 
-MORE = "\n\nWhat it needs and the log does not hold yet is made first."
+MORE = "\n\nThe command runs missing stages first."
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -194,7 +194,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
         named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
         if not named:
             return f"{logs[-1]} is unchanged: no run was complete"
-        return f"complete in {logs[-1]}: {named}. The same command continues there"
+        return f"complete in {logs[-1]}: {named}. To continue, repeat the command"
 
     return added
 
@@ -276,4 +276,4 @@ def _remark(outcomes: list[Outcome], target: Path | None) -> None:
     if any(outcome.fresh for outcome in outcomes):
         remarks.print(f"results are in {target}", markup=False)
     else:
-        remarks.print("nothing to do: all of it is up to date")
+        remarks.print("nothing to do: all results are up to date")

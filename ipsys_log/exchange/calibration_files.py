@@ -49,7 +49,7 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
         The file cannot be read, or lacks the matrix, the coefficients or the image size.
     """
     if not path.is_file():
-        raise IpsysError(f"{path}: there is no such calibration file; 'ipsys calibrate' writes one")
+        raise IpsysError(f"{path}: does not exist; 'ipsys calibrate' writes a calibration file")
     try:
         storage = cv2.FileStorage(_as_file_storage(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         k, d = _read_matrix(storage, _K), _read_matrix(storage, _D)
@@ -60,9 +60,11 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
     except (cv2.error, SystemError, ValueError) as error:
         raise IpsysError(f"{path}: is not a calibration in OpenCV's YAML format") from error
     if k is None or d is None or k.size != 9 or not width or not height:
-        raise IpsysError(f"{path}: lacks the camera matrix, the distortion coefficients or the image size")
+        raise IpsysError(
+            f"{path}: the camera matrix, the distortion coefficients or the image size is missing"
+        )
     if width < 0 or height < 0:
-        raise IpsysError(f"{path}: its image width or height must be 1 to {_WIDEST_PX} pixels")
+        raise IpsysError(f"{path}: the image width and height must be 1 to {_WIDEST_PX} pixels")
     model = _MODEL_OF_NAME.get(model_name, model_name) or _MODEL_OF_COUNT.get(
         d.size, f"with {d.size} coefficients"
     )
@@ -193,10 +195,10 @@ def check_format(name: str, lens_model: str) -> None:
         The format does not exist, or does not support the lens model.
     """
     if name not in FORMATS:
-        raise IpsysError(f"--format {name}: there is no such format; use one of {', '.join(FORMATS)}")
+        raise IpsysError(f"--format {name}: is not known; use one of {', '.join(FORMATS)}")
     if name == "kalibr" and lens_model not in ("fisheye", "pinhole4"):
         raise IpsysError(
-            f"--format kalibr: Kalibr has four coefficients, --lens {lens_model} has more; "
+            f"--format kalibr: Kalibr has four coefficients, but --lens {lens_model} has more; "
             "use --lens fisheye or --lens pinhole4"
         )
 
@@ -229,6 +231,6 @@ def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
         name = next(iter(topics)) if len(topics) == 1 else camera
         if name not in topics:
             names = ", ".join(topics) or "none"
-            raise IpsysError(f"{path}: holds no calibration of camera {camera}; it has those of: {names}")
+            raise IpsysError(f"{path}: has no calibration of camera {camera}, only of {names}")
         lens: CameraCalibration = log.payloads([topics[name]])[-1]
     return replace(lens, frame_id=camera)

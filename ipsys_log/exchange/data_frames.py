@@ -90,7 +90,7 @@ def read_table(
     """
     pandas = import_pandas()
     if name not in TABLES:
-        raise IpsysError(f"there is no table {name!r}; use one of {', '.join(TABLES)}")
+        raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
     if name in _ITEMS:
         tables = [_item_table(pandas, session, _ITEMS[name], run, start_ns, end_ns) for run in runs]
     else:

@@ -87,7 +87,7 @@ def find_times(images: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
                 raise IpsysError(f"{times}: has no row for {path.parent.name}/{path.name}; add it")
             other = seen.setdefault(times_ns[path], path)
             if other is not path:
-                raise IpsysError(f"{path}: has the time of {other.name}; give each picture its own")
+                raise IpsysError(f"{path}: has the same time as {other.name}; give each picture its own time")
     return times_ns
 
 
@@ -107,7 +107,7 @@ def _time(text: str, where: str) -> int:
         return parse_time(text)
     except ValueError as error:
         raise IpsysError(
-            f"{where}: {text!r} is no time; write s, ms, us or ns since 1970, or 2024-05-31T12:30:00.25Z"
+            f"{where}: {text!r} is not a time; write s, ms, us or ns since 1970, or 2024-05-31T12:30:00.25Z"
         ) from error
 
 
@@ -118,12 +118,14 @@ def _read_table(table: Path, images: Mapping[str, list[Path]]) -> dict[Path, int
         with table.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             if not set(_COLUMNS) <= set(rows.fieldnames or ()):
-                raise IpsysError(f"{table}: its first line must name the columns {' and '.join(_COLUMNS)}")
+                raise IpsysError(f"{table}: the first line must name the columns {' and '.join(_COLUMNS)}")
             for row in rows:
                 label = f"{table}: line {rows.line_num}"
                 path = by_name.get(row["file"] or "")
                 if path is None:
-                    raise IpsysError(f"{label}: no picture is called {row['file']!r}; write red/0001.jpg")
+                    raise IpsysError(
+                        f"{label}: picture {row['file']!r} does not exist; write it like red/0001.jpg"
+                    )
                 times_ns[path] = _time(row["time"] or "", label)
     except OSError as error:
         raise IpsysError(f"{table}: cannot be read: {error.strerror}") from error
@@ -151,7 +153,7 @@ def find_images(folder: Path) -> dict[str, list[Path]]:
         The folder has no images, or an image has a format that cannot be read.
     """
     if not folder.is_dir():
-        raise IpsysError(f"{folder}: there is no such folder")
+        raise IpsysError(f"{folder}: does not exist; give a folder of pictures")
     pictures = {}
     for sub in sorted(path for path in folder.iterdir() if path.is_dir()):
         files = [path for path in sub.iterdir() if path.is_file() and not path.name.startswith(".")]
@@ -159,7 +161,7 @@ def find_images(folder: Path) -> dict[str, list[Path]]:
         if unreadable:
             suffixes = ", ".join(FORMATS)
             raise IpsysError(
-                f"{unreadable[0]}: only {suffixes} are read; convert the picture, or take it out"
+                f"{unreadable[0]}: only {suffixes} can be read; convert the picture, or remove it"
             )
         images = [path for path in files if path.suffix.lower() in FORMATS]
         if images:
@@ -200,11 +202,11 @@ def read_images(
         A camera with intrinsics has no images, or the rate is invalid.
     """
     if not 1e-6 <= rate_hz <= 1e6:
-        raise IpsysError(f"--rate {rate_hz:g}: give pictures per second, above 0")
+        raise IpsysError(f"--rate {rate_hz:g}: is not a rate; give pictures per second, above 0")
     strange = sorted(set(lenses) - set(images))
     if strange:
         names = ", ".join(images)
-        raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {names})")
+        raise IpsysError(f"--calibration {strange[0]}: this camera has no pictures; the folder has {names}")
     taken_ns = times_ns if times_ns is not None else _even_times(images, rate_hz)
     # Messages of the same instant get log times 1 ns apart.
     log_ns = min(taken_ns.values()) - len(lenses) - 1 if times_ns is not None else START_NS

@@ -84,7 +84,7 @@ def _matrices(data: bytes) -> Iterator[bytes]:
             kind, size = _TAG.unpack_from(whole)
             body = whole[_TAG.size :]
         if kind != _MATRIX or len(body) != size:
-            raise ValueError("it holds data other than tables")
+            raise ValueError("it has data other than tables")
         yield body
 
 
@@ -92,10 +92,10 @@ def _table(matrix: bytes) -> tuple[str, NDArray[np.float64]]:
     """Parse flags, dimensions, name and numbers: each has a tag and is padded to 8 bytes."""
     parts = list(_parts(matrix))
     if [kind for kind, _ in parts[:-1]] != [_FLAGS, _DIMENSIONS, _TEXT] or parts[-1][0] not in _NUMBERS:
-        raise ValueError("a table lacks some of its parts")
+        raise ValueError("parts of a table are missing")
     (_, flags), (_, sizes), (_, name), (kind, numbers) = parts
     if len(flags) != 8 or flags[0] not in _CLASSES or flags[1]:
-        raise ValueError("it holds data other than real numbers")
+        raise ValueError("it has data other than real numbers")
     rows, columns = struct.unpack("<ii", sizes)
     values = np.frombuffer(numbers, _NUMBERS[kind])
     if min(rows, columns) < 0 or rows * columns != len(values):
@@ -166,11 +166,11 @@ def _training(count: int) -> str:
 
 def _find(folder: Path, name: str) -> Path:
     if not folder.is_dir():
-        raise IpsysError(f"{folder}: there is no such folder; name that of the authors' .mat files")
+        raise IpsysError(f"{folder}: does not exist; give the folder of the paper's .mat files")
     matches = sorted(folder.rglob(name), key=lambda path: (len(path.parts), path))
     if not matches:
         raise IpsysError(
-            f"{folder}: has no {name}; name the folder of the authors' data, or of their repository"
+            f"{folder}: has no {name}; give the folder of the paper's data, or of its repository"
         )
     return matches[0]
 

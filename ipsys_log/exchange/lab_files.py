@@ -29,17 +29,17 @@ def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigC
     for name in only:
         if name not in known:
             raise IpsysError(
-                f"--camera {name}: {path} has no such camera (it has {', '.join(known) or 'none'})"
+                f"--camera {name}: {path} does not have this camera; it has {', '.join(known) or 'none'}"
             )
     cameras = [camera for camera in rig.cameras if (camera.name in only if only else camera.source)]
     for camera in cameras:
         if camera.source is None:
             raise IpsysError(
-                f'{path}: camera {camera.name} has no source, such as source = "usb:/dev/video0"'
+                f'{path}: camera {camera.name} has no source; write, for example, source = "usb:/dev/video0"'
             )
     if not cameras:
         raise IpsysError(
-            f'{path}: no camera has a source; give each one, such as source = "usb:/dev/video0" '
+            f'{path}: no camera has a source; write one for each camera, such as source = "usb:/dev/video0" '
             "(see 'ipsys cameras')"
         )
     return rig, cameras
@@ -69,5 +69,7 @@ def load_lenses(
             lenses[camera.name] = intrinsics_of(camera)
     unknown = sorted(set(lenses) - set(names))
     if unknown:
-        raise IpsysError(f"--calibration {unknown[0]}: no such camera is recorded (only {', '.join(names)})")
+        raise IpsysError(
+            f"--calibration {unknown[0]}: this camera is not recorded; the cameras are {', '.join(names)}"
+        )
     return lenses

@@ -99,7 +99,7 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
         raise IpsysError(f"{where}: its matrix or coefficients are not valid; calibrate again")
     if not (0 < lens.width <= _WIDEST_PX and 0 < lens.height <= _WIDEST_PX):
         raise IpsysError(
-            f"{where}: {lens.width} x {lens.height} px is no image size; write the size in pixels into it"
+            f"{where}: {lens.width} x {lens.height} px is not an image size; correct the size in pixels"
         )
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
@@ -148,8 +148,8 @@ def scale_intrinsics(lens: CameraCalibration, width: int, height: int, where: st
         return lens
     if lens.width * height != lens.height * width:
         raise IpsysError(
-            f"{where}: sends {width} x {height} px, its calibration is for {lens.width} x {lens.height}, of "
-            "another shape; calibrate at the size that is recorded"
+            f"{where}: sends {width} x {height} px, but its calibration is for {lens.width} x {lens.height}, "
+            "with another aspect ratio; calibrate at the recorded size"
         )
     scale = width / lens.width
     # (0, 0) is the centre of the first pixel, not its corner.

@@ -42,7 +42,7 @@ def check_covariance(covariance_px2: Array, where: str) -> None:
         The matrix is not a covariance. The text names ``where``.
     """
     if not (np.isfinite(covariance_px2).all() and np.trace(covariance_px2) > 0):
-        raise IpsysError(f"{where}: covariance_px2 has no variance in it; detect the markers again")
+        raise IpsysError(f"{where}: covariance_px2 has no variance; detect the markers again")
 
 
 def pixel_slopes(uv: Array, lens: CameraCalibration) -> Array:
@@ -135,7 +135,7 @@ def camera_point(corners_uv: Array, length_m: float | Array) -> Array:
     _, lengths = _sides(corners_uv)
     perimeter = lengths.sum(axis=-1)
     if (perimeter == 0.0).any():
-        raise ValueError("the four corners fall together")
+        raise ValueError("the four corners are at one point")
     z_m = 4.0 * length_m / perimeter  # eq. (3)
     points_m: Array = np.ones((*perimeter.shape, 3))
     points_m[..., :2] = _centre(corners_uv)

@@ -57,13 +57,14 @@ def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> 
     [2.2908, 3.7582]
     """
     if side not in SIDES:
-        raise IpsysError(f"side {side!r} of AB is neither 'left' nor 'right'")
+        raise IpsysError(f"side {side!r} of AB is not valid; write 'left' or 'right'")
     base_m = float(np.hypot(*(b_m - a_m)))
     if base_m == 0.0:
-        raise IpsysError("the two reference points are one and the same; give them different coordinates")
+        raise IpsysError("the two reference points are identical; give them different coordinates")
     if d1_m <= 0 or d2_m <= 0 or not (abs(d1_m - d2_m) <= base_m <= d1_m + d2_m):
         raise IpsysError(
-            f"no triangle has the sides AB = {base_m:.4f} m, d1 = {d1_m:.4f} m and d2 = {d2_m:.4f} m; "
+            f"the distances d1 = {d1_m:.4f} m and d2 = {d2_m:.4f} m do not meet, because AB is "
+            f"{base_m:.4f} m; "
             "measure d1 and d2 again"
         )
     return intersect_circles(a_m, b_m, d1_m, d2_m, side)
@@ -148,11 +149,11 @@ def multilaterate(
     """
     _check_numbers(references_m, distances_m, sigmas_m)
     if side is not None and side not in SIDES:
-        raise IpsysError(f"side {side!r} of AB is neither 'left' nor 'right'")
+        raise IpsysError(f"side {side!r} of AB is not valid; write 'left' or 'right'")
     if are_collinear(references_m) and side is None:
         raise IpsysError(
-            f"the {len(references_m)} reference points lie on one line and the distances fit on both "
-            "sides of it; say whether the place is 'left' or 'right' of it"
+            f"the {len(references_m)} reference points are on one line, so the distances fit on both sides; "
+            "give the side, 'left' or 'right'"
         )
     if len(references_m) == 2:
         (a_m, b_m), (d1_m, d2_m) = references_m, distances_m.tolist()
@@ -319,7 +320,7 @@ def _check_numbers(references_m: Array, distances_m: Array, sigmas_m: Array | No
         )
     if count > 2:
         if (np.linalg.norm(references_m - references_m[0], axis=1) <= _NEAREST_M).all():
-            raise IpsysError("the reference points are one and the same; give them different coordinates")
+            raise IpsysError("the reference points are identical; give them different coordinates")
         if not (np.isfinite(distances_m) & (distances_m > 0)).all():
             raise IpsysError(f"the distances {distances_m.tolist()} m are not all above 0; measure again")
     if sigmas_m is not None and not (np.isfinite(sigmas_m) & (sigmas_m > 0)).all():

@@ -174,7 +174,7 @@ def check_compression(view: View, compression: str) -> None:
     """Refuse a compression that is not in the MCAP specification."""
     if compression not in ("", "zstd", "lz4"):
         raise LogError(
-            f"{view.path} has chunks compressed with {compression!r}, which is not known here. "
+            f"{view.path} has chunks compressed with {compression!r}, which ipsys does not know. "
             "Rewrite it with: mcap compress --compression zstd"
         )
 

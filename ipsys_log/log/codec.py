@@ -158,11 +158,11 @@ def decode(
     items = items or PartCounter(_ITEMS_OF_ONE)
     if name in ROS2_PAYLOADS:
         if encoding != "cdr":
-            raise LogError(f"messages of ROS 2 encoded as {encoding!r} are not read, only cdr")
+            raise LogError(f"messages of ROS 2 encoded as {encoding!r} cannot be read, only cdr")
         return read_ros2(name, data, definition, items)
     payload = PAYLOADS.get(name)
     if payload is None:
-        raise LogError(f"its schema {name!r} is none that ipsys reads")
+        raise LogError(f"its schema {name!r} is not supported")
     try:
         return read_proto(payload, _parse(proto_class(name), data, encoding, items), items)
     except (DecodeError, json_format.ParseError, ValueError, TypeError, RecursionError) as error:
@@ -175,14 +175,14 @@ def _parse(message_class: type[Proto], data: bytes, encoding: str, items: PartCo
     if encoding == "json":
         items.take(sum(map(data.count, (b",", b"{", b"["))))
         return json_format.ParseDict(_read_json(data), message_class(), ignore_unknown_fields=True)
-    raise LogError(f"messages encoded as {encoding!r} are not read, only protobuf and json")
+    raise LogError(f"messages encoded as {encoding!r} cannot be read, only protobuf and json")
 
 
 def _read_json(data: bytes) -> Any:
     """Parse a JSON object; all its texts must be valid UTF-8."""
     value = json.loads(data)
     if not isinstance(value, dict):
-        raise ValueError("it is no object")
+        raise ValueError("it is not an object")
     if b"\\ud" in data.lower():  # half of a surrogate pair; the reader of protobuf fails on it
         json.dumps(value, ensure_ascii=False).encode()
     return _plain_times(value)

@@ -327,13 +327,14 @@ class Session:
                     continue
                 if topic in images and _overlap(reader, other, topic):
                     raise LogError(
-                        f"two cameras of one name: {topic} is in {other.path} and, at the same time, in "
+                        f"two cameras have the same name: {topic} is in {other.path} and, at the same "
+                        "time, in "
                         f"{reader.path}; leave one of them out"
                     )
                 if run_of_topic(topic) is not None:
                     raise LogError(
-                        f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or make "
-                        "that run again with --run and another name"
+                        f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or compute "
+                        "the run again with --run and another name"
                     )
 
     def _cameras(self, channel: Channel) -> dict[str, str]:
@@ -348,7 +349,8 @@ class Session:
                 camera = name if names.count(name) == 1 else clean_name(topic)
                 if camera in topic_of:
                     raise LogError(
-                        f"{self}: two cameras of one name, {camera!r}: {topic_of[camera]} and {topic}; "
+                        f"{self}: two cameras have the same name {camera!r}:  {topic_of[camera]} and "
+                        f"{topic}; "
                         "rename one of the topics"
                     )
                 topic_of[camera] = topic

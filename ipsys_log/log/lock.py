@@ -49,8 +49,9 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
 
 def _without_locks(path: Path, error: OSError) -> str:
     return (
-        f"{path}: its file system gives no locks ({error.strerror}), so two programs could write a log at "
-        "once: write to a local disk, or mount this one with locks (NFS: start rpc.statd, or mount it with "
+        f"{path}: its file system has no locks ({error.strerror}), so two programs could write a log at the "
+        "same time: write to a local disk, or mount this one with locks (NFS: start rpc.statd, or mount "
+        "it with "
         "nolock if only this machine writes there)"
     )
 
@@ -98,7 +99,8 @@ def check_free(path: Path) -> None:
         raise LogError(_why_taken(path))
     if orphan:
         raise LogError(
-            f"{journal_path(path)} belongs to a log that is gone: move that log back, or delete it"
+            f"{journal_path(path)} belongs to a log that does not exist: move the log back, or delete "
+            "this file"
         )
 
 

@@ -56,7 +56,7 @@ class NewFile:
             write_all(self.storage, self.fd, data, self.offset)
         except OSError as error:
             self._failed = True
-            advice = f"what it holds so far can be saved with: ipsys repair {self.path}"
+            advice = f"to save the written part: ipsys repair {self.path}"
             outcome = advice if self.target is None else f"nothing was written: {disk_advice(error)}"
             raise cannot_write(self.target or self.path, error, outcome) from None
         self.offset += len(data)
@@ -70,7 +70,9 @@ class NewFile:
             self.storage.fsync(self.fd)
             if self.target is not None:
                 if self.target.exists():
-                    raise LogError(f"{self.target} appeared while it was written: choose another name")
+                    raise LogError(
+                        f"another program has created {self.target} in the meantime: choose another name"
+                    )
                 self.storage.rename(self.path, self.target)
                 self.path, self.target = self.target, None
             self.storage.fsync_directory(self.path.parent)
@@ -78,7 +80,7 @@ class NewFile:
             outcome = (
                 "nothing was written"
                 if self.target is not None
-                else "it is complete, but perhaps not on the disk"
+                else "the log is complete, but perhaps not on the disk yet"
             )
             raise cannot_write(self.target or self.path, error, f"{outcome}: {disk_advice(error)}") from None
 

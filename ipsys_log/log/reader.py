@@ -193,7 +193,7 @@ class LogReader:
             The log has no such topic, or a record of it is damaged.
         """
         if topic not in self.channels:
-            raise LogError(f"{self.path} has no topic {topic}: see ipsys info {self.path}")
+            raise LogError(f"{self.path} has no topic {topic}. To list the topics: ipsys info {self.path}")
         if self._stored is None:
             self._stored = stored_hashes(self._view, self._contents)
         state = self._stored.get(topic)
@@ -242,7 +242,7 @@ def _open(path: Path) -> tuple[View, Contents]:
         if fault is None and (has_journal or _is_unchanged(view, status_before)):
             if (has_journal or contents.cut_short) and not is_being_written(path):
                 _logger.warning(
-                    "%s: an append to it was interrupted; ipsys reads the old log. Repair it with: "
+                    "%s: an append was interrupted; ipsys reads the old log. To repair it: "
                     "ipsys repair %s",
                     path, path,
                 )  # fmt: skip
@@ -253,7 +253,7 @@ def _open(path: Path) -> tuple[View, Contents]:
             break
         time.sleep(_PAUSE_S)
     if fault is None or (isinstance(fault, NoFooterError) and is_being_written(path)):
-        raise LogError(f"{path} is being recorded or written just now: try again when that has ended")
+        raise LogError(f"{path} is being recorded or written now: try again when this has ended")
     raise fault
 
 

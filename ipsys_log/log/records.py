@@ -147,7 +147,7 @@ def parse_exact(view: View, record_at: RecordAt, data: bytes) -> mcap.McapRecord
     Bytes after the known fields are ignored: later versions of the format may add fields.
     """
     if record_at.opcode not in _READERS:
-        raise view.fault(record_at.offset, f"a record of {_name(record_at.opcode)} has no place there")
+        raise view.fault(record_at.offset, f"a record of {_name(record_at.opcode)} is not allowed there")
     record = parse(_READERS[record_at.opcode], view, record_at, data[HEADER.size :])
     if not data.startswith(to_bytes(record)[HEADER.size :], HEADER.size):
         raise view.fault(
@@ -184,7 +184,7 @@ def parse_chunk_head(view: View, offset: int) -> tuple[RecordAt, ChunkHead]:
     except (struct.error, ValueError) as error:
         raise view.fault(offset, f"the Chunk record is not valid ({error})") from None
     if opcode != Opcode.CHUNK or position + 8 + data_size != HEADER.size + length:
-        raise view.fault(offset, "there is no Chunk record where one must be")
+        raise view.fault(offset, "a Chunk record is missing")
     if offset + HEADER.size + length > view.size:
         raise view.fault(offset, "the Chunk record reaches beyond the end of the file")
     head = ChunkHead(start, end, size, crc, name, offset + position + 8, data_size)
@@ -207,7 +207,7 @@ def parse_message_index(view: View, data: bytes, position: int, channel_id: int,
         fits = end <= len(data) and size + 6 <= length and size % 16 == 0
         if fits and opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
             return data[end - size : end]
-    raise view.fault(offset, f"there is no MessageIndex record of channel {channel_id} where one must be")
+    raise view.fault(offset, f"a MessageIndex record of channel {channel_id} is missing")
 
 
 def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:
@@ -220,10 +220,12 @@ def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:
             raise view.fault(start, "a record is cut off")
         opcode, length = HEADER.unpack_from(block, start - base)
         if opcode == 0:
-            raise view.fault(start, "there is no record where one must be")
+            raise view.fault(start, "a record is missing")
         if length > end - start - HEADER.size:
             room = end - start - HEADER.size
-            raise view.fault(start, f"a {_name(opcode)} record claims {length} bytes, {room} are there")
+            raise view.fault(
+                start, f"a {_name(opcode)} record claims {length} bytes, but the file has {room}"
+            )
         yield RecordAt(opcode, start, HEADER.size + length)
         start += HEADER.size + length
 

@@ -132,7 +132,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
 
 def _check_not_empty(view: View) -> None:
     if not view.size:
-        raise LogError(f"{view.path} is empty: there is nothing to repair, delete it")
+        raise LogError(f"{view.path} is empty: it cannot be repaired; delete it")
 
 
 def _summary(view: View) -> Summary | None:
@@ -272,11 +272,12 @@ def _check(view: View, findings: Survey, plan: _Plan) -> None:
     streamed = sum(new_findings.contents.counts.values())
     difference = disagreement(new, new_findings)
     if not difference and not plan.messages == streamed == count_by_indexes(new):
-        difference = f"{plan.messages} messages were saved, {streamed} would be read"
+        difference = f"{plan.messages} messages would be saved, but {streamed} can be read"
     if difference:
         faults = "; ".join(findings.faults[:3])
         raise LogError(
-            f"{view.path} cannot be repaired ({difference}) and was not changed. Keep a copy. Found: {faults}"
+            f"{view.path} cannot be repaired ({difference}) and was not changed. Keep a copy of it. "
+            f"Found: {faults}"
         )
 
 
@@ -337,9 +338,9 @@ def _report(
     contents = findings.contents
     notes = [f"found: {fault}" for fault in findings.faults]
     if findings.finished and not findings.crc_is_right and not findings.damaged:
-        notes.append("found: the CRC of the data section is wrong; the damaged part is not known")
+        notes.append("found: the CRC of the data section is wrong; the position of the damage is unknown")
     if own_end < view.size:
-        notes.append(f"{view.size - own_end} bytes after its end, perhaps another log, were cut off")
+        notes.append(f"{view.size - own_end} bytes after its end (perhaps another log) were cut off")
     lost_counts, counted = _count_lost(findings, known)
     # Without a CRC and a summary, a removal of whole records cannot be detected.
     is_unsure = findings.finished and not (findings.has_crc and findings.crc_is_right)

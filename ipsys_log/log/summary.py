@@ -150,10 +150,11 @@ def load_contents(view: View) -> Contents:
 def _check_start(view: View) -> None:
     start = view.read(0, min(len(MAGIC), view.size))
     if not start:
-        raise LogError(f"{view.path} is empty: nothing was ever written to it")
+        raise LogError(f"{view.path} is empty: it has no messages")
     if not MAGIC.startswith(start):
         raise LogError(
-            f"{view.path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap"
+            f"{view.path} is not an MCAP file (it starts with {start!r}): give a log, with a name that "
+            "ends in .mcap"
         )
 
 
@@ -164,7 +165,7 @@ def _footer(view: View) -> tuple[int, int, bool]:
     tail = view.read(footer_at, view.size - footer_at) if footer_at >= len(MAGIC) else b""
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
         raise NoFooterError(
-            f"{path} has no end: its recorder was killed, or the file was cut off. What it holds can be "
+            f"{path} has no end: its recorder was killed, or the file was cut off. Its messages can be "
             f"saved. Run: ipsys repair {path}"
         )
     _, _, summary_start, _, crc = FOOTER.unpack_from(tail)

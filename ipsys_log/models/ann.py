@@ -216,7 +216,7 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
         if len(X) < X.shape[1] + 1:
             raise FitError(
                 f"ann needs at least {X.shape[1] + 1} pairs (samples), found {len(X)} sample"
-                f"{'s' if len(X) > 1 else ''}; measure more places"
+                f"{'s' if len(X) > 1 else ''}; measure more points"
             )
         targets = y.reshape(len(y), -1)
         self._single = y.ndim == 1

@@ -177,7 +177,7 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
         if len(X) < X.shape[1] + 3:  # the trend, and two more: without additional pairs, the variance is zero
             raise FitError(
                 f"kriging needs at least {X.shape[1] + 3} pairs (samples), found {len(X)} sample"
-                f"{'s' if len(X) > 1 else ''}; measure more places"
+                f"{'s' if len(X) > 1 else ''}; measure more points"
             )
         targets = y.reshape(len(y), -1)
         self._single = y.ndim == 1

@@ -139,7 +139,7 @@ def _fit_group(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
     )
     if not np.isfinite(solved.x).all():
         raise FitError(
-            "the rays of the camera do not fit the measured places; check the heights of the places"
+            "the rays of the camera do not fit the calibration points; check the heights of the points"
         )
     return camera_rays(solved.x)
 

@@ -47,11 +47,11 @@ def rigid_transform(points: Array, targets: Array) -> tuple[Array, Array]:
     [0.0, 0.0, 2.0]
     """
     if len(points) < 3:
-        raise FitError(f"rigid needs at least 3 pairs, found {len(points)}; measure more places")
+        raise FitError(f"rigid needs at least 3 pairs, found {len(points)}; measure more points")
     mean_x, mean_y = points.mean(axis=0), targets.mean(axis=0)  # eq. (8)
     u, s, vt = np.linalg.svd((points - mean_x).T @ (targets - mean_y))  # eq. (9), (10)
     if s[1] <= 1e-9 * s[0]:
-        raise FitError("rigid needs pairs that do not all lie on one line; measure places beside it")
+        raise FitError("rigid needs pairs that are not all on one line; measure points beside the line")
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
     rotation: Array = vt.T @ flip @ u.T  # eq. (11)
     return rotation, mean_y - rotation @ mean_x  # eq. (12)

@@ -68,7 +68,7 @@ def check_units(rig: Rig, where: str) -> None:
             continue
         meant = [(unit, value * factor) for unit, factor in kind.others]
         likely = [
-            f"{number:g} if that is {unit}" for unit, number in meant if kind.low <= number <= kind.high
+            f"{number:g} if it is in {unit}" for unit, number in meant if kind.low <= number <= kind.high
         ]
         then = " or ".join(likely) or f"{kind.low:g} to {kind.high:g}"
         raise IpsysError(f"{where}: {item}{key} = {value:g} is too {_far(value, kind)}; write {then}")
@@ -76,14 +76,14 @@ def check_units(rig: Rig, where: str) -> None:
     for marker in rig.markers:
         if size is not None and marker.id >= size:
             raise IpsysError(
-                f"{where}: marker id {marker.id}: {rig.dictionary} has only 0 to {size - 1}; write the id "
-                "that is printed, or the dictionary that it was printed from"
+                f"{where}: marker id {marker.id}: {rig.dictionary} has only the ids 0 to {size - 1}; correct "
+                "the id, or the dictionary of the print"
             )
 
 
 def _far(value: float, kind: _Kind) -> str:
     """Return the text that a value is too large or too small for its unit."""
-    return f"much for {kind.unit}" if value > kind.high else f"little for {kind.unit}"
+    return f"large for {kind.unit}" if value > kind.high else f"small for {kind.unit}"
 
 
 def dictionary_size(dictionary: str) -> int | None:

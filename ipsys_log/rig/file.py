@@ -96,8 +96,9 @@ def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[st
         return []
     if len(missing) == len(set(cameras)):
         raise IpsysError(
-            f"{where}: describes the cameras {', '.join(described)}, but there are only "
-            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or remove its [[cameras]]"
+            f"{where}: describes the cameras {', '.join(described)}, but the log has only "
+            f"{', '.join(missing)}. Give the rig of these cameras, rename its cameras, or remove its "
+            "[[cameras]]"
         )
     named = ", ".join(missing)
     return [f"{where}: does not describe camera {named}; defaults are used, such as no rolling shutter"]
@@ -172,18 +173,18 @@ def load_rig(path: Path) -> Rig:
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
-            raise IpsysError(f"{path}: is too large for a rig file; write one with: ipsys init lab.toml")
+            raise IpsysError(f"{path}: is too large for a rig file; to write one: ipsys init lab.toml")
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
+        raise IpsysError(f"{path}: is not a text file; to write a rig file: ipsys init {path}") from error
     except tomllib.TOMLDecodeError as error:
         raise IpsysError(_not_toml(path, error)) from error
     except (ValueError, RecursionError) as error:  # a number or nesting that Python's parser refuses
         raise IpsysError(
             f"{path}: a number has thousands of digits, or tables are nested thousands deep; "
-            f"write a rig file with: ipsys init {path.name}"
+            f"to write a rig file: ipsys init {path.name}"
         ) from error
     for key, item in _ITEMS.items():
         rows = table.get(key, [])
@@ -206,9 +207,9 @@ def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
     lines = path.read_text(encoding="utf-8").split("\n")
     line = lines[int(position[1]) - 1].strip()[:_LONGEST_LINE] if position else ""
     if comma := re.search(r"= *(\d+),(\d+)\s*(#.*)?$", line):
-        return f"{text}: {line}: a decimal comma? Write {comma[1]}.{comma[2]}"
+        return f"{text}: {line}: write the decimal point as {comma[1]}.{comma[2]}"
     if bare := re.search(r"= *([^\s\"'\[{0-9][^#]*?)\s*(#.*)?$", line):
-        return f'{text}: {line}: text stands in quotes; write "{bare[1]}"'
+        return f'{text}: {line}: text needs quotes; write "{bare[1]}"'
     return f"{text}: {line}" if line else text
 
 
@@ -228,7 +229,9 @@ def check_rig(rig: Rig, where: str) -> Rig:
             check_name(marker.robot, f"{where}: robot name")
     _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
     _check_unique((marker.id for marker in rig.markers), f"{where}: two markers have the id")
-    _check_unique((marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers on robot")
+    _check_unique(
+        (marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers have the robot"
+    )
     _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
     lengths = [rig.marker_length_m, *(m.length_m for m in rig.markers if m.length_m is not None)]
     if rig.floor is not None:
@@ -279,7 +282,9 @@ def _check_tape(rig: Rig, where: str) -> None:
     _check_unique(at_m, f"{where}: two reference points are at")
     sigma_m = rig.tape_sigma_m
     if sigma_m is not None and not (math.isfinite(sigma_m) and sigma_m > 0):
-        raise IpsysError(f"{where}: tape_sigma_m = {sigma_m} m is no standard deviation; it must be above 0")
+        raise IpsysError(
+            f"{where}: tape_sigma_m = {sigma_m} m is not a standard deviation; it must be above 0"
+        )
 
 
 def _check_heights(rig: Rig, where: str) -> None:
@@ -289,7 +294,7 @@ def _check_heights(rig: Rig, where: str) -> None:
         if height_m is not None and not 0 <= height_m <= _HIGHEST_M:
             raise IpsysError(
                 f"{where}: {key} is {height_m} m; give the height above the floor in m, 0 to {_HIGHEST_M:g}"
-                + (f"; {height_m / 100:g} if that is cm" if 0 < height_m / 100 <= _HIGHEST_M else "")
+                + (f"; {height_m / 100:g} if it is in cm" if 0 < height_m / 100 <= _HIGHEST_M else "")
             )
 
 
@@ -309,7 +314,7 @@ def _build(item: type[Item], row: Any, where: str) -> Item:
     unknown = sorted(set(row) - set(known))
     if unknown:
         like = get_close_matches(unknown[0], known, 1)
-        meant = f"; was {like[0]} meant?" if like else f"; known are {', '.join(known)}"
+        meant = f"; use {like[0]}" if like else f"; known keys: {', '.join(known)}"
         raise IpsysError(f"{where}: unknown key {unknown[0]!r}{meant}")
     missing = [n for n, f in known.items() if f.default is MISSING and n not in row]
     if missing:

@@ -90,7 +90,7 @@ def check_inputs(
 def _check_versions(
     session: Session, request: Request, models: Sequence[str], stages: Sequence[Stage]
 ) -> None:
-    """Check that this software would not repeat a result of newer software."""
+    """Check that no result to repeat is from newer software."""
     corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
     wanted = {corners, request.method, *models, ""}
     for run in session.runs():
@@ -149,13 +149,13 @@ def _current_run(
 def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:
     if request.run is not None and len(models) > 1:
         raise IpsysError(
-            f"--run {request.run} is the name of one run, but {len(models)} models are asked for; "
-            "say which with --model"
+            f"--run {request.run} is the name of one run, but the command fits {len(models)} models; "
+            "select one with --model"
         )
     if request.model_from is None:
         return
     if any(request.model_from.resolve() == path.resolve() for path in paths):
-        raise IpsysError(f"--model-from {request.model_from}: this is the log itself; leave --model-from out")
+        raise IpsysError(f"--model-from {request.model_from}: is the same log; leave out --model-from")
     if request.train != "train":
         raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")
 
@@ -180,7 +180,7 @@ def _cameras(session: Session, written: Collection[Channel]) -> set[str]:
         return {str(camera_of_topic(topic)) for topic in session.topics(MARKERS, markers)}
     if CAMERA_POINTS not in written or newest_run(session, CAMERA_POINTS) is None:
         unread = session.unread_images()
-        also = f"; {', '.join(unread)} cannot be read by this version" if unread else ""
+        also = f"; this version cannot read {', '.join(unread)}" if unread else ""
         raise IpsysError(f"{session}: has no images to detect markers in{also}")
     return set()
 
@@ -189,12 +189,12 @@ def _check_overrides(session: Session, request: Request, cameras: set[str]) -> N
     """Raise an error for an override that cannot take effect."""
     known = ", ".join(sorted(cameras)) if cameras else "none whose markers are in the log"
     for name in sorted(set(request.lenses) - cameras):
-        raise IpsysError(f"--calibration {name}: the log has no such camera (it has {known})")
+        raise IpsysError(f"--calibration {name}: the log does not have this camera; it has {known}")
     if request.rig is not None and not cameras:
         rigs = session.payloads(session.topics(RIG))
         if any(rig.marker_length_m != request.rig.marker_length_m for rig in rigs):
             raise IpsysError(
-                "--rig: another marker length cannot take effect, the log has camera points but no markers"
+                "--rig: another marker length has no effect, because the log has camera points but no markers"
             )
 
 
@@ -256,8 +256,8 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
     for model in models:
         if len(train) < min_pairs(model):
             raise FitError(
-                f"{session}: {model} needs at least {min_pairs(model)} measured places for each camera, "
-                f"found {len(train)} in all; measure more"
+                f"{session}: {model} needs at least {min_pairs(model)} calibration points for each camera, "
+                f"but the log has {len(train)} in all; measure more"
                 + ("" if model == "rigid" else ", or use --model rigid")
             )
         check_different(model, str(session), train_m)
@@ -334,8 +334,10 @@ def _check_models(
             fitted = {camera.camera for camera in model.cameras}
             if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(
-                    f"--model-from {request.model_from}: its model is of the cameras "
-                    f"{', '.join(sorted(fitted))}, the log has {', '.join(sorted(cameras))}"
+                    f"--model-from {request.model_from}: its model is for the cameras "
+                    f"{', '.join(sorted(fitted))}, but the log has {', '.join(sorted(cameras))}; give a "
+                    "model "
+                    "of these cameras"
                 )
 
 
@@ -346,10 +348,12 @@ def _check_heights(session: Session, request: Request, models: Sequence[str]) ->
         for rig in rigs:
             missing = [m.id for m in rig.markers if rig.height_of(m.id) is None]
             if reads_height(name) and (missing or (not rig.markers and rig.marker_height_m is None)):
-                which = f"marker {missing[0]} is" if missing else "the markers are"
+                which = f"marker {missing[0]}" if missing else "the markers"
                 raise IpsysError(
-                    f"{session}: {name} needs the height at which {which} carried: write marker_height_m "
-                    "into lab.toml ('ipsys init lab.toml --from LOG' writes the log's) and give it with --rig"
+                    f"{session}: {name} needs the height of {which} above the floor: write marker_height_m "
+                    "into lab.toml ('ipsys init lab.toml --from LOG' writes the rig of the log), and "
+                    "give the "
+                    "file with --rig"
                 )
 
 
@@ -357,6 +361,7 @@ def _check_evaluation(session: Session, request: Request, models: Sequence[str])
     view = LogView(session, rig=request.rig)
     if not any(can_evaluate(view, request.options(), model) for model in models):
         raise IpsysError(
-            f"{session}: no measured place is held out to evaluate on, and there are too few (of "
-            f"{len(measured(view))}) to take turns; label some 'test', or measure more"
+            f"{session}: has no held-out points, and its {len(measured(view))} calibration points are "
+            "too few "
+            "for cross-validation; label some 'test', or measure more"
         )

@@ -111,7 +111,9 @@ def _same(one: Message, other: Message) -> bool:
 def _refuse(left: Iterable[Message]) -> None:
     for message in left:
         if not isinstance(message.payload, Event):
-            raise OtherContentError(f"{message.topic} is another one at {format_time(message.log_time_ns)}")
+            raise OtherContentError(
+                f"{message.topic} has other content at {format_time(message.log_time_ns)}"
+            )
 
 
 Make = Callable[[Task, Session, str], Iterable[Message]]
@@ -145,7 +147,7 @@ def run_stage(
         try:
             return _append(session, target, task, replace(record, run=run_name), counts, request, make)
         except OtherContentError as other:
-            remarks = (f"run {run_name} was cut short, and is left so: {other}",)
+            remarks = (f"run {run_name} stays unfinished: {other}",)
     if name is None:
         name = free_name(session, record, task.run, task.stage.writes)
     else:

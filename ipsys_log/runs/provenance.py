@@ -129,7 +129,7 @@ def check_run_name(session: Session, stage: str, name: str, writes: Sequence[Cha
         The run already has that stage.
     """
     if _has_stage(session, stage, name, writes):
-        raise IpsysError(f"run {name} already has the stage {stage} from other input; use another --run name")
+        raise IpsysError(f"run {name} already has the stage {stage} with other input; use another --run name")
     return name
 
 

@@ -57,7 +57,7 @@ class Remarks:
                 self._unknown.add(str(payload.marker_id))
             if payload.kind == "ambiguous_marker" and not self._skip_ambiguous:
                 raise IpsysError(
-                    f"{_said(message)}: give each marker an id of its own, or leave it out of such frames "
+                    f"{_said(message)}: give each marker its own id, or exclude the marker from such frames "
                     "with --skip-ambiguous"
                 )
         elif isinstance(payload, Markers):
@@ -75,20 +75,22 @@ class Remarks:
             raise IpsysError(f"none of {corrupt} frames can be decoded, first: {first}")
         if self._unknown and not self._markers:
             raise IpsysError(
-                f"no marker of the rig is in any frame, but ids {', '.join(sorted(self._unknown))} are: add "
-                "them as [[markers]] to lab.toml and give it with --rig"
+                "no frame has a marker of the rig, but the frames have ids "
+                f"{', '.join(sorted(self._unknown))}: "
+                "add them as [[markers]] to lab.toml, and give the file with --rig"
             )
         rejected = self._events["rejected_marker"]
         if rejected and not self._markers:
             raise IpsysError(
                 f"no marker could be measured in {self._frames} frames, first: "
-                f"{_said(self._first['rejected_marker'])}: change the light or the place of the marker, or "
-                "print it on matt paper"
+                f"{_said(self._first['rejected_marker'])}: change the light, move the marker, or print it on "
+                "matt paper"
             )
         if self._frames and not self._markers:
             raise IpsysError(
-                f"no marker was found in {self._frames} frames: are they printed from the dictionary in the "
-                "rig (give the right one with --rig), whole in the picture, in focus, and free of glare?"
+                f"no marker was found in {self._frames} frames: check that the markers are printed from the "
+                "dictionary of the rig (or give another rig with --rig), completely visible, in focus and "
+                "without glare"
             )
 
     def lines(self) -> tuple[str, ...]:
@@ -112,7 +114,7 @@ class Remarks:
             if len(offsets_px) >= MIN_OFFSETS
         }
         return [
-            f"camera {camera}: edges of black lie {offset_px:.2f} px inside the black (gamma); allowed for"
+            f"camera {camera}: black edges are {offset_px:.2f} px inside the black (gamma); corrected"
             for camera, offset_px in sorted(medians.items())
             if abs(offset_px) >= LEAST_OFFSET_PX
         ]

@@ -80,7 +80,7 @@ def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
             return model, topic
     wanted = f"model {name}" if name else "model"
     option = f" --model {name}" if name else ""
-    raise IpsysError(f"{other}: has no fitted {wanted}; fit one there with: ipsys fit {other}{option}")
+    raise IpsysError(f"{other}: has no fitted {wanted}; to fit one: ipsys fit {other}{option}")
 
 
 def _model_topics(session: Session) -> list[str]:
@@ -118,7 +118,7 @@ def rig_with_offsets(session: Session) -> Rig:
     """
     rigs: list[Rig] = session.payloads(session.topics(RIG))
     if not rigs:
-        raise IpsysError(f"{session}: holds no rig; write an example with 'ipsys init lab.toml'")
+        raise IpsysError(f"{session}: has no rig; to write an example: ipsys init lab.toml")
     run = newest_run(session, MARKERS)
     offsets_by_camera: dict[str, list[float]] = {}
     for message in session.messages(session.topics(MARKERS, run) if run else []):

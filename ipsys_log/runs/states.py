@@ -70,7 +70,7 @@ def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str
     for recorded in recorded_stages(session):
         is_shown = recorded.run.run in wanted and not writes(recorded.run, EVALUATION)
         if is_shown and (recorded.out_of_date or recorded.is_newer):
-            advice = "" if recorded.is_newer else "; ipsys replay makes it again"
+            advice = "" if recorded.is_newer else "; ipsys replay computes it again"
             lines.setdefault(
                 recorded.run.run, f"run {recorded.run.run}: {recorded.run.stage} is {recorded.state}{advice}"
             )

@@ -68,7 +68,7 @@ def verify(
         if not records:
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
-                "make one with 'ipsys replay', or see 'ipsys runs'"
+                "to compute one: ipsys replay; to list the runs: ipsys runs"
             )
         checked = {output.topic for record in records for output in record.outputs}
         repeated = [
@@ -79,7 +79,7 @@ def verify(
             and _is_up_to_date(session, stage.run, checked, say)
         ]
         if not repeated:
-            raise IpsysError(f"{session}: nothing of its runs can be verified; see 'ipsys runs'")
+            raise IpsysError(f"{session}: has no run that can be verified; for the reasons: ipsys runs")
         comparisons = []
         for name in sorted(names):
             stages = [record for record in repeated if record.run == name]
@@ -114,7 +114,7 @@ def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
     """Return a comparison for each channel of the runs that no record names."""
     known = {output.topic for record in session.runs() for output in record.outputs}
     return [
-        Comparison(topic, session.count(topic), 0, 0, 0, "no record says how it was made", 0)
+        Comparison(topic, session.count(topic), 0, 0, 0, "no record of the run", 0)
         for topic in sorted({topic for reader in session.readers for topic in reader.channels} - known)
         if run_of_topic(topic) in names and not topic.endswith("/record") and session.count(topic)
     ]
@@ -139,7 +139,7 @@ def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[C
 
 
 def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> str | None:
-    """Return the reason why two logs or two runs have nothing in common to compare; None if they have.
+    """Return the reason why two logs or two runs cannot be compared; None if they can.
 
     The parameters are those of `diff`.
     """
@@ -155,7 +155,8 @@ def _compared_runs(
     both = names[0] & names[1] if runs[0] is None else names[0]
     if not both:
         raise IpsysError(
-            f"{one} and {other} have no run of the same name (see 'ipsys runs'); give the runs with --run"
+            f"{one} and {other} have no run with the same name; to list the runs: ipsys runs; give the "
+            "runs with --run"
         )
     return both, both if runs[1] is None else names[1]
 
@@ -219,18 +220,20 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
             continue
         if count == 0:
             say(
-                f"run {run.run}: {run.stage} is not verified: {read.topic}, which it has read, is not in "
-                f"{session}; give the log that has it, too"
+                f"run {run.run}: {run.stage} is not verified: its input {read.topic} is not in "
+                f"{session}; give "
+                "the log with this topic, too"
             )
             return False
         text = (
-            f"run {run.run} was made from {read.messages} messages of {read.topic}, and these "
-            f"are not what the log holds now ({count} messages): it is out of date"
+            f"run {run.run} is out of date: it has read {read.messages} messages of {read.topic}, but "
+            "the log "
+            f"has other ones now ({count} messages)"
         )
         if _is_of_model(run):
-            say(f"{text}; its {run.stage} is not verified: ipsys replay makes it again")
+            say(f"{text}; its {run.stage} is not verified: ipsys replay computes it again")
             return False
-        raise IpsysError(f"{session}: {text}, or the log it was made from has to be given too")
+        raise IpsysError(f"{session}: {text}; run 'ipsys replay', or give the input log, too")
     return True
 
 

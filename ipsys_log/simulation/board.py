@@ -58,7 +58,7 @@ def _cells_per_square(board: Board) -> int:
     if abs(per_square * board.marker_scale - cells) > 1e-6 or (per_square - cells) % 2:
         fitting = cells / (cells + 2)
         raise IpsysError(
-            f"the simulated lab has no board of {board.dictionary} with --marker-scale "
+            f"the simulated lab has no {board.dictionary} board with --marker-scale "
             f"{board.marker_scale:g}; give {fitting:.6g}"
         )
     return per_square

@@ -180,8 +180,8 @@ def _tape(where: SimulatedPose, sigma_m: float, rng: np.random.Generator) -> Arr
         if (read_m > 0).all() and abs(read_m[0] - read_m[1]) < base_m < read_m.sum():
             return read_m
     raise IpsysError(
-        f"simulator: tape_sigma_m = {sigma_m:g} m closes no triangle at "
-        f"({where.x_m:.2f}, {where.y_m:.2f}) m; set a smaller one or a larger tape_angle_deg"
+        f"simulator: tape_sigma_m = {sigma_m:g} m is too large for a point at "
+        f"({where.x_m:.2f}, {where.y_m:.2f}) m; set a smaller tape_sigma_m or a larger tape_angle_deg"
     )
 
 
@@ -213,7 +213,7 @@ def choose_place(
             break
     if not candidates:
         raise IpsysError(
-            f"simulator: no room for marker {marker_id} beside {len(taken)} others in the view of "
+            f"simulator: marker {marker_id} has no room beside {len(taken)} others in the view of "
             f"{camera.name!r}; set fewer or smaller markers"
         )
     return max(candidates, key=lambda where: _distance(where, before))

@@ -141,8 +141,8 @@ def _check_left(settings: LabSettings, number: int) -> None:
     size = dictionary_size(settings.dictionary)
     if size is not None and number >= size:
         raise IpsysError(
-            f"simulator: {settings.dictionary} has {size} markers: too few for {settings.markers} that drive "
-            f"and {settings.stations} that lie before each camera; set fewer stations"
+            f"simulator: {settings.dictionary} has {size} markers, too few for {settings.markers} robots and "
+            f"{settings.stations} calibration points before each camera; set fewer stations"
         )
 
 

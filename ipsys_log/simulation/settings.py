@@ -158,7 +158,7 @@ def _check_tilt(tilt_deg: tuple[float, float]) -> None:
     if not (0.0 <= low <= high <= 45.0):
         raise IpsysError(
             f"simulator setting tilt_deg is {tilt_deg!r}; give the least and the most tilt, "
-            "both between 0 and 45 degrees"
+            "each between 0 and 45 degrees"
         )
 
 
@@ -168,7 +168,9 @@ def _check_cameras(cameras: tuple[str, ...]) -> None:
     for camera in cameras:
         check_name(camera, "simulator: camera name")
     if len(set(cameras)) < len(cameras):
-        raise IpsysError(f"simulator: two cameras of one name in {', '.join(cameras)}; give each its own")
+        raise IpsysError(
+            f"simulator: two cameras have the same name in {', '.join(cameras)}; give each its own"
+        )
 
 
 def _check_dictionary(name: str, markers: int) -> None:
@@ -177,4 +179,4 @@ def _check_dictionary(name: str, markers: int) -> None:
         raise IpsysError(f"simulator: OpenCV has no marker dictionary {name!r}; use one such as DICT_4X4_100")
     size = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
     if markers > size:
-        raise IpsysError(f"simulator: {name} has {size} markers, {markers} are wanted; set fewer markers")
+        raise IpsysError(f"simulator: {name} has {size} markers, but markers = {markers}; set fewer markers")

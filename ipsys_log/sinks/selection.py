@@ -53,7 +53,7 @@ def choose_runs(session: Session, names: Sequence[str] = ()) -> Shown:
     known = list(dict.fromkeys(record.run for record in records))
     for name in names:
         if name not in known:
-            raise IpsysError(f"{session}: there is no run {name!r} (there are: {', '.join(known) or 'none'})")
+            raise IpsysError(f"{session}: has no run {name!r}; it has {', '.join(known) or 'none'}")
     located = [run for run in known if session.topics(TRACKS, run) or session.topics(POSITIONS, run)]
     marked = [run for run in known if session.topics(MARKERS, run)]
     if names:

@@ -153,7 +153,7 @@ class LiveSinks:
         except Exception as fault:  # any error: the frames are more important
             self._fault = self._fault or fault
             waiting.close()
-            self._warn("sink_stopped", f"{sink.name} stopped ({_text_of(fault)}); the recording goes on")
+            self._warn("sink_stopped", f"{sink.name} stopped ({_text_of(fault)}); the recording continues")
 
 
 class Consumers:
@@ -192,7 +192,9 @@ class Consumers:
             except Exception as fault:  # any error: the frames are more important
                 self._fault = self._fault or fault
                 self._consumers.remove(consumer)
-                self._warn("sink_stopped", f"the display stopped ({_text_of(fault)}); the recording goes on")
+                self._warn(
+                    "sink_stopped", f"the display stopped ({_text_of(fault)}); the recording continues"
+                )
 
     def check(self) -> None:
         """Raise the error of the first consumer or sink that failed, if one did."""

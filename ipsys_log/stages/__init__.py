@@ -59,40 +59,40 @@ class Entry:
 
 CORNERS = Parameter(
     name="corners",
-    help="Find corners by the edges of the print (edges; the default if all cameras have a calibration), or "
-    "as the paper does (stock).",
+    help="Method for corners: edges of the print (edges, the default if all cameras have a calibration), "
+    "or the method of the paper (stock).",
     metavar="NAME",
 )
 AS_LIVE = Parameter(
     name="as_live",
-    help="Pass over the frames that were skipped when the log was recorded.",
+    help="Exclude the frames that were skipped during the recording.",
     kind=bool,
     default=False,
 )
 SKIP_AMBIGUOUS = Parameter(
     name="skip_ambiguous",
-    help="Leave out a marker in frames that show its id twice.",
+    help="Exclude a marker from frames that show its id twice.",
     kind=bool,
     default=False,
 )
 METHOD = Parameter(
     name="method",
-    help="How markers are placed: by their perimeter (eq. 3 to 5 of the paper; for level ones), or by their "
-    "pose (tilted ones too).",
+    help="Method for camera points: perimeter (eq. 3 to 5 of the paper, for level markers) or "
+    "pose (for tilted markers, too).",
     metavar="NAME",
     kind=str,
     default="perimeter",
 )
 MODEL = Parameter(
     name="model",
-    help="rigid, poly, ann, kriging, kriging-regression, rigid+ and the name of one of these, rayplane, "
-    "best; repeat it for several.",
+    help="Model: rigid, poly, ann, kriging, kriging-regression, rayplane, best, or a hybrid such as "
+    "rigid+poly; repeat it for several.",
     metavar="NAME",
     kind=list[str] | None,
 )
 MODEL_FROM = Parameter(
     name="model_from",
-    help="Apply the model of another log; copy it in.",
+    help="Copy the model of this log, and apply it.",
     metavar="LOG",
     kind=Path | None,
 )
@@ -105,7 +105,7 @@ TRAIN = Parameter(
 )
 SEED = Parameter(
     name="seed",
-    help="The seed of random splits, folds and subsets.",
+    help="Seed of random splits, folds and subsets.",
     metavar="N",
     kind=int,
     default=0,
@@ -116,28 +116,28 @@ SEED = Parameter(
 ENTRIES: tuple[Entry, ...] = (
     Entry(
         name="detect",
-        help="Find the markers in the frames.",
+        help="Detect the markers in the frames.",
         parameters=(CORNERS, AS_LIVE, SKIP_AMBIGUOUS),
     ),
     Entry(
         name="camera-frame",
-        help="Put the markers into the frame of their camera.",
+        help="Compute the position of each marker in camera coordinates.",
         parameters=(METHOD,),
     ),
     Entry(
         name="fit",
-        help="Fit models to the measured places (poly, unless you say which).",
+        help="Fit models to the calibration points (default: poly).",
         parameters=(MODEL, MODEL_FROM, TRAIN, SEED),
     ),
     Entry(
         name="evaluate",
-        help="Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
-        "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
-        "part of the places in turn.",
+        help="Evaluate models: their errors, the learning curve and outliers of the measurements.\n\n"
+        "The errors are on held-out calibration points and by cross-validation. Without --model, the command "
+        "evaluates all models.",
         prints=("plots", "details"),
     ),
-    Entry(name="locate", help="Apply a model: world positions for each camera."),
-    Entry(name="fuse", help="One pose per robot from all cameras that see it."),
+    Entry(name="locate", help="Apply a model: compute world positions from each camera."),
+    Entry(name="fuse", help="Combine the positions of all cameras into one pose per robot."),
 )
 
 

@@ -219,7 +219,7 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
     markers = view.run(MARKERS)
     if not markers:
         if method != PERIMETER:
-            raise IpsysError(f"--method {method}: cannot take effect, the log has no markers")
+            raise IpsysError(f"--method {method}: has no effect, because the log has no markers")
         return view.newest(CAMERA_POINTS)
     return Plan(
         run=points_run(markers, method),

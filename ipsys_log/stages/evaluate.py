@@ -110,7 +110,8 @@ def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) ->
     for camera, camera_pairs in pairs.items():
         if len(camera_pairs) - -(-len(camera_pairs) // FOLDS) < min_pairs(name):
             notes.append(
-                f"no cross-validation of {name}: camera {camera} has only {len(camera_pairs)} places"
+                f"no cross-validation of {name}: camera {camera} has only {len(camera_pairs)} "
+                "calibration points"
             )
             return False
     return True

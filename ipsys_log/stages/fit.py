@@ -29,6 +29,7 @@ from ipsys_log.models.table import (
     parameters,
 )
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
+from ipsys_log.units import CM_PER_M
 
 __all__ = ["BESIDE_LINE_M", "STAGE", "check_different", "check_pairs", "fit_model", "model_run"]
 
@@ -99,7 +100,7 @@ def check_pairs(name: str, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, Cal
     cameras = gather_points(pairs)
     if not cameras:
         raise FitError(
-            "no camera saw any of the measured places to fit on; measure places in the cameras' view"
+            "no camera saw a calibration point for the fit; measure points in the view of the cameras"
         )
     for camera, places in cameras.items():
         _check_count(name, camera, places)
@@ -112,8 +113,8 @@ def _check_count(name: str, camera: str, places: CalibrationPoints) -> None:
     if len(places.names) < needed:
         other = "" if name == "rigid" else ", or use --model rigid, which needs 3"
         raise FitError(
-            f"camera {camera}: {name} needs at least {needed} measured places, found {len(places.names)}; "
-            f"measure more{other}"
+            f"camera {camera}: {name} needs at least {needed} calibration points, found "
+            f"{len(places.names)}; measure more{other}"
         )
 
 
@@ -123,7 +124,7 @@ def _check_spread(name: str, camera: str, targets: Array) -> None:
     beside_m = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(targets))
     if beside_m < BESIDE_LINE_M:
         raise FitError(
-            f"camera {camera}: the {len(targets)} measured places lie on one line; measure some beside it"
+            f"camera {camera}: all {len(targets)} calibration points are on one line; measure some beside it"
         )
 
 
@@ -138,8 +139,8 @@ def check_different(name: str, where: str, targets: Array) -> None:
     different = len(np.unique(np.round(targets / _SAME_PLACE_M), axis=0))
     if different < min_pairs(name):
         raise FitError(
-            f"{where}: {name} needs at least {min_pairs(name)} different places, found {different} "
-            f"in {len(targets)} measurements; measure elsewhere too"
+            f"{where}: {name} needs at least {min_pairs(name)} different points, found {different} "
+            f"in {len(targets)} measurements; measure other points, too"
         )
 
 
@@ -218,8 +219,8 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
         fitted = fit_model(name, pairs, view.last_ns(RIG, CAMERA_POINTS, MEASUREMENTS), progress)
         notes.extend(_unused_points(pairs, train))
         notes.extend(
-            f"camera {camera}: all measured places are {height_m:.3f} m high, so heights cannot be learned: "
-            "its model is good in x and y, and says that height"
+            f"camera {camera}: all calibration points have the height {height_m * CM_PER_M:.1f} cm: the "
+            "model is valid for x and y, and returns only this height"
             for camera, height_m in level_cameras(fitted).items()
         )
         return fitted
@@ -238,13 +239,16 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str
     seen = {pair.measurement for camera_pairs in pairs.values() for pair in camera_pairs}
     unseen = sorted(train - seen)
     lines = [
-        f"camera {name} saw no measured place: it has no model"
+        f"camera {name} saw no calibration point: it has no model"
         for name, camera_pairs in pairs.items()
         if not camera_pairs
     ]
     if unseen:
         names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")
-        lines.append(f"{len(unseen)} of {len(train)} measured places were seen still by no camera: {names}")
+        lines.append(
+            f"{len(unseen)} of {len(train)} calibration points have no stationary interval in any "
+            f"camera: {names}"
+        )
     return lines
 
 

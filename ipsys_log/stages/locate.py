@@ -51,7 +51,7 @@ class Locate:
         height_m = self._rig.height_of(marker_id) if self._rig else None
         if height_m is None:
             raise IpsysError(
-                f"{self._name} needs the height at which marker {marker_id} is carried: write "
+                f"{self._name} needs the height of marker {marker_id} above the floor: write "
                 "marker_height_m, or height_m of that marker, into lab.toml and give it with --rig lab.toml"
             )
         return height_m

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.blunders import possible_blunders
+from ipsys_log.analysis.blunders import Blunder, possible_blunders
 from ipsys_log.analysis.tape import (
     RiggedMeasurement,
     TapePoint,
@@ -45,6 +45,8 @@ _OUTSIDE_M = 0.02
 # these points.
 _ASTRAY_M, _ASTRAY_OUTSIDE_M = 0.05, 0.15
 _SIGMAS = 4.0
+# A smaller correction is given in mm.
+_FINE_M = 0.02
 
 
 def with_tape(rig: Rig) -> Rig:
@@ -68,12 +70,12 @@ def warn_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | No
     outside_m = _outside_m(fixed.world_m, rig)
     if outside_m <= _OUTSIDE_M:
         return True, []
-    text = f"{_tapes(read)} put the point {outside_m * CM_PER_M:.0f} cm outside of the floor"
+    text = f"with {_tapes(read)}, the point is {outside_m * CM_PER_M:.0f} cm outside of the floor"
     if read.side is not None and are_collinear(reference_points(read, rig)):
         other = SIDES[1 - SIDES.index(read.side)]
         other_m = world_point(replace(read, side=other), rig).world_m
         if _outside_m(other_m, rig) <= _OUTSIDE_M:
-            text += f"; on the {other} it would lie on it"
+            text += f"; with side {other}, it is on the floor"
     return False, [text]
 
 
@@ -83,15 +85,16 @@ def warn_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
     worst = int(np.abs(fixed.residuals_m).argmax())
     off_m = float(abs(fixed.residuals_m[worst]))
     if len(read.distances) > 2 and off_m > max(_MISFIT_M, 3 * sigma_m):
-        return [f"{_tapes(read)} contradict one another by {off_m * CM_PER_M:.1f} cm: read them again"]
+        return [f"{_tapes(read)} contradict each other by {off_m * CM_PER_M:.1f} cm: read them again"]
     return []
 
 
 def warn_crossing(read: Measurement, rig: Rig) -> list[str]:
     """Return a warning if the tapes cross at an angle that is too flat."""
     return [
-        f"{_tapes(read)}: the tapes cross at {flat.angle_deg:.0f} degrees only, so that the point is known "
-        f"to {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; another place, or a third reference point, is better"
+        f"{_tapes(read)}: the tapes cross at only {flat.angle_deg:.0f} degrees, so the standard deviation of "
+        f"the point is {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; use another point or a third "
+        "reference point"
         for flat in find_weak_points([RiggedMeasurement(read, with_tape(rig))])
     ]
 
@@ -131,11 +134,32 @@ def warn_model(
                 corrected_m = world_point(slip.corrected, rig).world_m
             except IpsysError:
                 continue  # the corrected distances form no point
-            explanations.append((float(np.linalg.norm(corrected_m - predicted_m)), slip.text))
+            explanations.append((float(np.linalg.norm(corrected_m - predicted_m)), _explanation(read, slip)))
         if explanations and min(explanations)[0] <= bound_m:
-            explanation = min(explanations)[1]
-            return [f"{text}: {explanation}{'' if explanation.endswith('fit') else '?'}"]
+            return [f"{text}: {min(explanations)[1]}"]
     return [f"{text}: read {_tapes(read)}, the height and the marker again"]
+
+
+def _explanation(read: Measurement, blunder: Blunder) -> str:
+    """Return the text of a possible blunder in cm, the unit of the entry; its own text is in m."""
+    corrected = blunder.corrected
+    side = f"side {corrected.side} would fit" if corrected.side != read.side else ""
+    if blunder.kind == "side":
+        return f"{side}, not {read.side}"
+    if blunder.kind == "height":
+        return f"the height reads {_correction(read.height_m or 0.0, corrected.height_m or 0.0)}"
+    changed = [(old, new) for old, new in zip(read.distances, corrected.distances, strict=True) if old != new]
+    if blunder.kind == "distance":
+        ((old, new),) = changed
+        return f"the distance to {old.reference} reads {_correction(old.distance_m, new.distance_m)}"
+    tapes = [f"{new.distance_m * CM_PER_M:.1f} cm to {new.reference}" for _, new in changed]
+    names = " and ".join(new.reference for _, new in changed)
+    return f"the distances to {names} look exchanged: {' and '.join([*tapes, *([side] if side else [])])}"
+
+
+def _correction(read_m: float, right_m: float) -> str:
+    digits = 0 if abs(right_m - read_m) >= _FINE_M else 1
+    return f"{read_m * CM_PER_M:.1f} cm; {right_m * CM_PER_M:.{digits}f} cm would fit"
 
 
 def _tapes(read: Measurement) -> str:

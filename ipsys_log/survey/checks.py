@@ -86,7 +86,7 @@ def withdrawal_of(history: Sequence[Measurement], name: str) -> Measurement:
     for measurement in active_measurements(history):
         if measurement.id == name:
             return Measurement(measurement.timestamp, f"{name}_withdrawn", withdraws=name)
-    raise IpsysError(f"there is no measurement {name} to withdraw; it is withdrawn already, or never was")
+    raise IpsysError(f"measurement {name} cannot be withdrawn: it is withdrawn already, or does not exist")
 
 
 def check_entry(
@@ -179,8 +179,8 @@ def _apart(read: Measurement, rig: Rig) -> str | None:
         return None
     tapes = (f"distance to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (first, second))
     return (
-        f"no triangle has the sides {first.reference} to {second.reference} = {base_m * CM_PER_M:.1f} cm, "
-        f"{' and '.join(tapes)}; read both again"
+        f"{' and '.join(tapes)} do not meet, because {first.reference} to {second.reference} is "
+        f"{base_m * CM_PER_M:.1f} cm; read both again"
     )
 
 
@@ -193,7 +193,7 @@ def _identity_faults(
 ) -> list[Fault]:
     faults = []
     if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
-        faults.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
+        faults.append(Fault("id", f"id {entry.id} is already used; leave it out to get the next free id"))
     if observations is not None and observations.still is None:
         faults.append(Fault("marker", observations.text))
     return faults
@@ -213,7 +213,7 @@ def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Faul
     for other in earlier:
         same = (other.side, other.height_m) == (read.side, read.height_m)
         if same and _tapes(other) == _tapes(read):
-            return [Fault("", f"this is {other.id} once more, with the very same numbers")]
+            return [Fault("", f"this point is saved already as {other.id}, with the same numbers")]
     return []
 
 
@@ -223,7 +223,10 @@ def _repeat_warnings(
     if not earlier:
         return []
     names = ", ".join(f"{m.id}{_apart_from(m, fixed, rig)}" for m in earlier)
-    return [f"marker {read.marker_id} is measured here already, as {names}; if this is better, undo that one"]
+    return [
+        f"marker {read.marker_id} is already measured here, as {names}; if the new one is better, undo "
+        "the old one"
+    ]
 
 
 def _apart_from(other: Measurement, fixed: TapePoint, rig: Rig) -> str:
@@ -232,7 +235,7 @@ def _apart_from(other: Measurement, fixed: TapePoint, rig: Rig) -> str:
         other_m = world_point(other, rig).world_m
     except IpsysError:
         return ""
-    return f" ({float(np.linalg.norm(other_m - fixed.world_m)) * CM_PER_M:.1f} cm away)"
+    return f" ({float(np.linalg.norm(other_m - fixed.world_m)) * CM_PER_M:.1f} cm from here)"
 
 
 def _tapes(measurement: Measurement) -> list[tuple[str, float]]:

@@ -80,7 +80,7 @@ def check_references(rig: Rig) -> None:
             f"only the reference point {rig.reference_points[0].name}" if count else "no reference points"
         )
         raise IpsysError(
-            f"the rig has {present} to lay the tape from: write two or more as [[reference_points]] into "
+            f"the rig has {present}, but a tape needs two; write two or more as [[reference_points]] into "
             "lab.toml and give it with --rig"
         )
 
@@ -134,7 +134,7 @@ def _line(rig: Rig, distances: tuple[Distance, ...]) -> str:
 def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
     text = text.strip()
     if not re.fullmatch(r"\d{1,6}", text):
-        message = f"{text!r} is no marker id; type a whole number" if text else "which marker?"
+        message = f"{text!r} is not a marker id; type a whole number" if text else "which marker?"
         faults.append(Fault("marker", message))
         return None
     if not rig.knows(int(text)):
@@ -157,14 +157,14 @@ def _distances(typed: TypedEntry, rig: Rig, faults: list[Fault], doubts: list[st
             elif value_cm is not None:
                 if value_cm < _NEAR_CM:
                     doubts.append(
-                        f"distance to {point.name}: {text} cm is very near to {point.name}: in metres? "
-                        f"Then type {_times(value_cm)}"
+                        f"distance to {point.name}: {text} cm is very short; if it is in metres, "
+                        f"type {_times(value_cm)}"
                     )
                 yield Distance(point.name, value_cm / CM_PER_M)
         elif count == 2:  # with more reference points, any two distances are enough
             faults.append(Fault(f"d_{point.name}", f"distance to {point.name}?"))
     for name in texts:
-        faults.append(Fault(f"d_{name}", f"{name} is no reference point of the rig"))
+        faults.append(Fault(f"d_{name}", f"{name} is not a reference point of the rig"))
     if count > 2 and sum(bool(text.strip()) for text in typed.distances.values()) < 2:
         faults.append(Fault("", "give two distances or more"))
 
@@ -173,12 +173,12 @@ def _distance_fault(text: str, value_cm: float, point: ReferencePoint, rig: Rig)
     """Return a fault if a number cannot be a distance in cm, else None."""
     longest_cm = _reach_m(rig, point.x_m, point.y_m) * CM_PER_M
     if value_cm == 0:
-        reason = "a distance is above 0"
+        reason = "0 is not a distance; type a number above 0"
     elif value_cm < _NEAR_CM and _METRES.fullmatch(text):
         reason = f"{text} cm looks like metres; type {_times(value_cm)}"
     elif value_cm > longest_cm:
-        in_mm = f"; in mm? Then type {value_cm / 10:g}" if value_cm / 10 <= longest_cm else ""
-        reason = f"{text} cm is further than the floor reaches{in_mm}"
+        in_mm = f"; if it is in mm, type {value_cm / 10:g}" if value_cm / 10 <= longest_cm else ""
+        reason = f"{text} cm is longer than the floor{in_mm}"
     else:
         return None
     return Fault(f"d_{point.name}", f"distance to {point.name}: {reason}")
@@ -195,21 +195,23 @@ def _reach_m(rig: Rig, x_m: float, y_m: float) -> float:
 def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
     text = _bare(text)
     if not text:
-        faults.append(Fault("height", "height? 0 where the marker lies on the floor"))
+        faults.append(Fault("height", "height? 0 if the marker is on the floor"))
         return None
     value_cm = _number(text, "height", "height", faults)
     if value_cm is None:
         return None
     if value_cm > _HIGHEST_M * CM_PER_M:
-        faults.append(Fault("height", f"height: {text} cm is too high; in mm? Then type {value_cm / 10:g}"))
+        faults.append(
+            Fault("height", f"height: {text} cm is too high; if it is in mm, type {value_cm / 10:g}")
+        )
         return None
     if 0 < value_cm < _LOWEST_CM and len(text.replace(",", ".").partition(".")[2]) > 1:
         faults.append(Fault("height", f"height: {text} cm looks like metres; type {_times(value_cm)}"))
         return None
     if 0 < value_cm < _LOWEST_CM:
-        doubts.append(f"height: {text} cm is very low: in metres? Then type {_times(value_cm)}")
+        doubts.append(f"height: {text} cm is very low; if it is in metres, type {_times(value_cm)}")
     if value_cm > CM_PER_M:
-        doubts.append(f"height: {text} cm is high for a marker: is it in mm?")
+        doubts.append(f"height: {text} cm is high for a marker; if it is in mm, type {value_cm / 10:g}")
     return value_cm / CM_PER_M
 
 
@@ -224,6 +226,6 @@ def _times(value_cm: float) -> str:
 
 def _number(text: str, item_name: str, name: str, faults: list[Fault]) -> float | None:
     if not _NUMBER.fullmatch(text):
-        faults.append(Fault(name, f"{item_name}: {text!r} is no number; type centimetres, such as 123.4"))
+        faults.append(Fault(name, f"{item_name}: {text!r} is not a number; type centimetres, such as 123.4"))
         return None
     return float(text.replace(",", "."))

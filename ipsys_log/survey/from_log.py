@@ -77,7 +77,7 @@ def open_finished_log(
             check_references(rigs[-1])
         if len({rig.reference_points for rig in rigs}) > 1:
             raise IpsysError(
-                f"{path}: its reference points change on the way; give those that hold with --rig"
+                f"{path}: its reference points change during the log; give the valid ones with --rig"
             )
     replay([path], request, "camera-frame", progress=progress, say=say)
     with Session([path]) as session:
@@ -105,7 +105,7 @@ class FinishedLog:
         self.intervals = _find_intervals(gather_sightings(session.messages(self._topics[CAMERA_POINTS])), rig)
         if not self.intervals:
             raise IpsysError(
-                f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
+                f"{path}: no marker of the rig is stationary for two frames or longer: there is nothing "
                 "to measure; lay markers down while recording"
             )
 
@@ -138,8 +138,7 @@ class FinishedLog:
                 self._history += others
                 names = ", ".join(message.payload.id for message in others)
                 raise LogError(
-                    f"somebody else measured in this log meanwhile ({names}), so this is not written yet: "
-                    "look again, and repeat it"
+                    f"another program wrote measurements into this log ({names}); check them, and save again"
                 )
             added: list[Message] = []
             for measurement in measurements:

@@ -180,10 +180,10 @@ class MarkerObservations:
         """The state as a sentence."""
         name = f"marker {self.marker_id}"
         if self.moving:
-            return f"{name} moves, as seen by {', '.join(self.moving)}: wait until it lies still"
+            return f"{name} moves, as seen by {', '.join(self.moving)}: wait until it stops"
         if self.still is None:
-            return f"no camera sees {name}: step back, turn it face up"
-        return f"{name} lies still, seen by {', '.join(self.points_m)}"
+            return f"no camera sees {name}: step out of the view, and check that the marker faces up"
+        return f"{name} is stationary, seen by {', '.join(self.points_m)}"
 
 
 def observe_marker(views: Sequence[CameraView], marker_id: int) -> MarkerObservations:
@@ -194,7 +194,7 @@ def observe_marker(views: Sequence[CameraView], marker_id: int) -> MarkerObserva
     >>> from ipsys_log.messages import CameraPoint
     >>> seen = tuple(CameraPoints(n, (CameraPoint(7, 0.1, 0.2, 2.0),)) for n in (100, 200, 300))
     >>> sight = observe_marker([CameraView("red", 300, points=seen), CameraView("white", 300)], 7)
-    >>> sight.text == "marker 7 lies still, seen by red"
+    >>> sight.text == "marker 7 is stationary, seen by red"
     True
     """
     seen: dict[str, tuple[int, int, Array]] = {}

@@ -69,7 +69,10 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
             if not any(cell.strip() for cell in cells):
                 continue
             if len(cells) > len(columns):
-                reason = f"{len(cells)} cells, but {len(columns)} columns{_comma_advice(delimiter)}"
+                reason = (
+                    f"the row has {len(cells)} cells, but the header has "
+                    f"{len(columns)}{_comma_advice(delimiter)}"
+                )
                 faults.append((reader.line_num, reason))
                 continue
             cell = dict(zip(columns, (text.strip() for text in cells), strict=False))
@@ -88,13 +91,13 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
         faults += [(row.line, name_columns(fault.text, rig)) for fault in checked.faults]
     raise_for_rows(path, faults)
     if not rows:
-        raise IpsysError(f"{path}: holds no measurements below its header")
+        raise IpsysError(f"{path}: has no measurements below its header; add rows")
     return rows
 
 
 def _comma_advice(delimiter: str) -> str:
     """Return a hint that a decimal comma may have split a cell."""
-    return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
+    return "; if it has a decimal comma, write a point: 212.7" if delimiter == "," else ""
 
 
 def raise_for_rows(
@@ -109,7 +112,7 @@ def raise_for_rows(
     """
     if faults or doubts:
         lines = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
-        force_advice = "" if faults else ", or write it as it is with --force"
+        force_advice = "" if faults else ", or write it unchanged with --force"
         raise IpsysError(f"{path}: nothing was written; correct the sheet{force_advice}:{lines}")
 
 
@@ -131,7 +134,7 @@ def name_columns(text: str, rig: Rig) -> str:
         text,
     )
     text = re.sub(rf"\b(?:the )?distance to ({names_pattern})\b", r"d_\1_cm", text)
-    text = re.sub(r"\bit lies (left|right) of the line\b", r"side: it lies \1 of the line", text)
+
     return re.sub(r"\b(?:the )?height(?=:|\?| reads| and)", "height_cm", text)
 
 
@@ -160,15 +163,16 @@ def assign_intervals(
         own = [n for n, interval in enumerate(intervals) if interval.marker_id == marker_id]
         if not own:
             seen = ", ".join(map(str, sorted({interval.marker_id for interval in intervals}))) or "none"
-            yield f"marker {marker_id} lies still before no camera (those that do: {seen})"
+            yield f"marker {marker_id} is never stationary in view of a camera (stationary markers: {seen})"
         elif row.place is not None:
             yield _numbered(row.place, marker_id, intervals)
         elif row.time_ns is not None:
             yield _timed(row.time_ns, marker_id, intervals)
         elif len(own) != len(in_order[marker_id]):
             yield (
-                f"marker {marker_id} lies still {len(own)} times, but {len(in_order[marker_id])} rows name "
-                "no place or time: fill in place, as ipsys measure LOG --places numbers them"
+                f"marker {marker_id} has {len(own)} stationary intervals, but "
+                f"{len(in_order[marker_id])} rows "
+                "without place and time: fill in place with the numbers of ipsys measure LOG --places"
             )
         else:
             yield own[in_order[marker_id].index(row.line)]
@@ -176,9 +180,9 @@ def assign_intervals(
 
 def _numbered(place: int, marker_id: int, intervals: Sequence[StationaryInterval]) -> int | str:
     if not 1 <= place <= len(intervals):
-        return f"place {place} is none of 1 to {len(intervals)}"
+        return f"place {place} is not between 1 and {len(intervals)}"
     other = intervals[place - 1].marker_id
-    return place - 1 if other == marker_id else f"place {place} is one of marker {other}, not {marker_id}"
+    return place - 1 if other == marker_id else f"place {place} is of marker {other}, not {marker_id}"
 
 
 def _timed(time_ns: int, marker_id: int, intervals: Sequence[StationaryInterval]) -> int | str:
@@ -187,14 +191,16 @@ def _timed(time_ns: int, marker_id: int, intervals: Sequence[StationaryInterval]
 
     nearest = min((n for n, interval in enumerate(intervals) if interval.marker_id == marker_id), key=away_ns)
     if away_ns(nearest) > _NEAR_NS:
-        return f"marker {marker_id} does not lie still then; nearest is place {nearest + 1}"
+        return (
+            f"marker {marker_id} is not stationary at this time; its nearest interval is place {nearest + 1}"
+        )
     return nearest
 
 
 def _read_lines(path: Path) -> list[str]:
     try:
         if path.stat().st_size > _LARGEST:
-            raise IpsysError(f"{path}: is too large for a sheet of measurements")
+            raise IpsysError(f"{path}: is too large for a sheet of measurements; give another file")
         return path.read_text(encoding="utf-8-sig").splitlines(keepends=True)
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
@@ -229,7 +235,9 @@ def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
     )
     place, time = cell.get("place", ""), cell.get("time", "")
     if place and not (place.isascii() and place.isdecimal() and len(place) < _MOST_DIGITS):
-        raise IpsysError(f"place {place[:_MOST_DIGITS]!r} is no whole number of places")
+        raise IpsysError(
+            f"place {place[:_MOST_DIGITS]!r} is not a whole number; give the number of a stationary interval"
+        )
     return SheetRow(line, typed, int(place) if place else None, _time_ns(time, start_ns) if time else None)
 
 
@@ -247,5 +255,5 @@ def _time_ns(text: str, start_ns: int) -> int:
         return int((moment - datetime.fromtimestamp(0, UTC)).total_seconds() * 1e6) * 1000
     except (ValueError, OverflowError):
         raise IpsysError(
-            f"time {text!r} is neither seconds from the start of the log nor like 2026-05-04 10:15:30"
+            f"time {text!r} is not valid; write seconds from the start of the log, or 2026-05-04 10:15:30"
         ) from None

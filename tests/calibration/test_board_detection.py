@@ -140,7 +140,7 @@ def test_a_board_as_opencv_printed_it_before_4_6() -> None:
 def test_mirrored_images_are_reported() -> None:
     """Markers are not found in a mirrored image. A chessboard is found, because it looks the same."""
     pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
-    said = "it is seen mirrored in 2 of 2 tried"
+    said = "it is mirrored in 2 of 2 checked"
     with pytest.raises(IpsysError, match=said):
         search_images([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
 
@@ -169,8 +169,8 @@ def test_blurred_images_and_few_corners_are_dropped_with_a_reason() -> None:
     chosen = select_images(seen, CHESSBOARD, (640, 480))
     assert len(chosen.used) == 10
     reasons = dict(chosen.bad)
-    assert reasons["shaken"] == "blurred: edges are 3.5 px wide, in the sharp pictures 0.8"
-    assert reasons["half"] == "only 4 corners are seen"
+    assert reasons["shaken"] == "blurred: edges are 3.5 px wide, but 0.8 px in sharp pictures"
+    assert reasons["half"] == "only 4 corners are found"
     assert reasons["row"] == "its corners lie on one line"
 
 
@@ -184,7 +184,7 @@ def test_selection_takes_some_different_frames_of_many() -> None:
     corners = np.concatenate([s.pixels for s in chosen.used])
     assert corners.min(axis=0).tolist() == [0, 0]
     assert corners.max(axis=0).tolist() == [620, 460]
-    assert "nearly as" in chosen.spare[0].reason
+    assert "nearly the same pose as" in chosen.spare[0].reason
 
 
 def test_selection_takes_the_sharper_of_two_equal_views() -> None:
@@ -199,7 +199,7 @@ def test_selection_takes_the_sharper_of_two_equal_views() -> None:
         ("6", "write the inner corners of a chessboard as 6x4"),
         ("charuco:5", "charuco:4x5"),
         ("2x9", "3 to 100 inner corners"),
-        ("charuco:50x50", "has 50 markers, the board 1250"),
+        ("charuco:50x50", "has 50 markers, but the board has 1250"),
     ],
 )
 def test_impossible_boards_are_refused(text: str, said: str) -> None:
@@ -210,7 +210,9 @@ def test_impossible_boards_are_refused(text: str, said: str) -> None:
 def test_chessboard_instead_of_charuco_is_reported() -> None:
     pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
     tried: list[tuple[int, int]] = []
-    with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):
+    with pytest.raises(
+        IpsysError, match="but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures"
+    ):
         search_images(
             pictures,
             Board(7, 5, 0.03, 0.75),

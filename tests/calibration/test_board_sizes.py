@@ -126,8 +126,8 @@ def test_images_without_the_board_are_named_with_a_reason() -> None:
     pictures = [*plain(8, 6), np.full((400, 640), 90, np.uint8), plain(6, 5)[0]]
     looked = seen(pictures, "8x6")
     assert looked.unseen == (
-        ("4.png", "the board is not seen"),
-        ("5.png", "only 6 x 5 of its corners are seen"),
+        ("4.png", "the board is not found"),
+        ("5.png", "only 6 x 5 of its corners are found"),
     )
 
 

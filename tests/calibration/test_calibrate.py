@@ -60,7 +60,7 @@ def test_good_images_give_no_advice() -> None:
 
 def test_image_side_without_a_board_is_named() -> None:
     found = calibrated(sightings(everywhere(x=(-0.03, 0.13)), 0.5))
-    assert "no board near the left edge of the image: hold it there too" in found.notes
+    assert "no board near the left edge of the image: move it there, too" in found.notes
     assert found.coverage.empty_sides == ("left",)
 
 
@@ -109,14 +109,16 @@ def through_fisheye() -> SearchResult:
 
 
 def test_pinhole_on_a_fisheye_is_refused() -> None:
-    with pytest.raises(IpsysError, match=r"error is .*--lens fisheye leaves 0\.1\d px: use it; or give"):
+    with pytest.raises(
+        IpsysError, match=r"error is .*use --lens fisheye, with an error of 0\.1\d px; or use"
+    ):
         calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"])
 
 
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     result = calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"], force=True)
     assert result.rms_px > 2
-    assert "written only for --force: the RMS reprojection error is" in result.notes[0]
+    assert "written only because of --force: the RMS reprojection error is" in result.notes[0]
 
 
 def test_too_few_images_name_the_missing_poses() -> None:

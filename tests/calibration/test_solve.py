@@ -111,7 +111,7 @@ def spoiled(corners: Corners) -> Corners:
 def test_foreign_images_are_excluded_and_reported(name: str) -> None:
     found = solve(LENS_MODELS[name], spoiled(seen(name, np.random.default_rng(5))), SIZE_PX)
     assert [left.number for left in found.excluded] == [12]
-    assert "does not fit" in found.excluded[0].reason or "far off" in found.excluded[0].reason
+    assert "does not fit" in found.excluded[0].reason or "wrong corners" in found.excluded[0].reason
     assert found.outlier_corners == 10
     assert within(found, name)
 

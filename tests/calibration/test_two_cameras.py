@@ -93,9 +93,11 @@ def test_two_cameras_are_refused_with_their_pictures() -> None:
         calibrated(mixed(1))
     for letter, numbers in (("a", range(12)), ("b", range(12, 24))):
         assert ", ".join(f"{letter}{n}.png" for n in numbers) in str(caught.value)
-    assert "into a separate folder; or give --force" in str(caught.value)
+    assert "into a separate folder; or use --force" in str(caught.value)
 
 
 def test_two_cameras_insisted_on_are_one() -> None:
     result = calibrated(mixed(1), insist=True)
-    assert any("written only for --force: the pictures are of two cameras" in note for note in result.notes)
+    assert any(
+        "written only because of --force: the pictures are of two cameras" in note for note in result.notes
+    )

@@ -91,13 +91,13 @@ def test_small_disk_is_warned_of_before_the_start(
         with opening(rig, disk / "a.mcap", None):
             said = capsys.readouterr().err
         assert re.search(rf"a minute; 10.5 MB free in {disk}: full after 2 s", said)
-        assert "to make it smaller: a lower rate_hz in lab.toml (15 halves it)" in said
+        assert "to use less disk space: a lower rate_hz in lab.toml (15 halves it)" in said
         with opening(rig, disk / "b.mcap", 1.0):
             assert re.search(r"MB in 1 s; .*: enough for 2 s", capsys.readouterr().err)
         # The cameras are only previewed: a message appears only if the disk is too small even for that.
-        with opening(rig, disk / "c.mcap", 1.0, "looking for 1 s"):
+        with opening(rig, disk / "c.mcap", 1.0, "recording for 1 s"):
             assert "free in" not in capsys.readouterr().err
-        with opening(rig, disk / "d.mcap", 60.0, "looking for 60 s"):
+        with opening(rig, disk / "d.mcap", 60.0, "recording for 60 s"):
             assert "full after 2 s" in capsys.readouterr().err
 
 

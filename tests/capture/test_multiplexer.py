@@ -101,7 +101,9 @@ def test_frames_lost_before_arrival_are_counted_and_named() -> None:
     # The first event comes at once, later ones within a second come together.
     assert [(event.kind, event.camera) for event in events(found)] == [("frames_missed", "red")] * 2
     assert [event.text for event in events(found)] == said
-    assert said == [f"{n} frames of camera red were lost before they came" for n in (2, 4)]
+    assert said == [
+        f"{n} frames of camera red are missing: the camera or its driver lost them" for n in (2, 4)
+    ]
 
 
 def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
@@ -157,7 +159,7 @@ def test_lost_camera_is_retried_while_others_continue() -> None:
     said = [event for event in events(found) if event.camera == "red"]
     # The camera was open at the first loss, and closed when the second attempt failed.
     assert [event.kind for event in said] == ["camera_lost", "camera_back"]
-    assert "has gone; trying again" in said[0].text
+    assert "has gone; ipsys tries again" in said[0].text
     assert len(data_of(found, "red")) == 10
     assert len(data_of(found, "white")) == 45
     assert tries[2] - gone[1] > tries[1] - gone[0]
@@ -188,9 +190,9 @@ def test_camera_with_a_changed_codec_is_not_recorded(monkeypatch: pytest.MonkeyP
     assert [m.payload.data for m in found if m.camera] == [b"a"] * 3
     kinds = [event.kind for event in events(found)]
     assert kinds == ["camera_lost", "camera_lost", "camera_back", "camera_lost", "camera_back"]
-    assert "sends h264 now, and jpeg before" in said[1]
+    assert "its format changed from jpeg to h264" in said[1]
     assert said[1] == said[3]
-    assert said[1].endswith("set it back to jpeg, or begin a new recording; trying again")
+    assert said[1].endswith("set the camera to jpeg, or start a new recording; ipsys tries again")
 
 
 def test_frame_size_change_is_reported_once() -> None:
@@ -204,7 +206,7 @@ def test_frame_size_change_is_reported_once() -> None:
     )
     found = messages(attached)
     assert [event.kind for event in events(found)] == ["camera_size"] * 2
-    assert "are 32 x 24 px now, and were 64 x 48 px" in events(found)[0].text
+    assert "its image size changed from 64 x 48 px to 32 x 24 px" in events(found)[0].text
     assert attached.states["red"].size_px == (64, 48)
     assert len(data_of(found, "red")) == 7
 
@@ -399,7 +401,7 @@ def test_frames_before_an_error_are_delivered() -> None:
     # The event does not wait for the end: the other camera might continue for hours.
     ((number, event),) = [(n, m.payload) for n, m in enumerate(found) if isinstance(m.payload, Event)]
     assert (event.kind, event.camera, event.text) == ("camera_failed", "red", said[0])
-    assert "camera red: the program failed (ZeroDivisionError('a bug'))" in event.text
+    assert "camera red: internal error (ZeroDivisionError('a bug'))" in event.text
     assert number < len(found) - 5
 
 

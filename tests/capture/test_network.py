@@ -109,7 +109,7 @@ def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
     steps = [after - before for before, after in pairwise(stamps)]
     assert all(abs(step - NS_PER_S / 30) < 2e6 for step in steps)
     assert len(said) == 1
-    assert "own stamps (RTCP)" in said[0]
+    assert "the stamps of the camera (RTCP)" in said[0]
 
 
 @pytest.mark.parametrize(("shift_s", "what"), [(3600.0, "ahead of"), (-5.0, "behind")])
@@ -148,7 +148,7 @@ def web(tmp_path: Path) -> Iterator[str]:
     [
         ("/", "is not video; give the address of the stream, not of a web page"),
         ("/nothing", "has no such path"),
-        ("/000.jpg", "is a single picture"),
+        ("/000.jpg", "is a single image"),
         ("/sound.wav", "is not video"),
         ("/old.avi", "is mpeg4 video; set the camera to MJPEG, H.264 or H.265"),
     ],
@@ -170,7 +170,7 @@ def test_missing_server_is_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "said"), [(socket.EAI_NONAME, "there is no host"), (socket.EAI_AGAIN, "check the network")]
+    ("code", "said"), [(socket.EAI_NONAME, "does not exist"), (socket.EAI_AGAIN, "check the network")]
 )
 def test_name_that_leads_nowhere_says_why(code: int, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:

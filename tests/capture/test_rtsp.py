@@ -99,7 +99,7 @@ def test_every_frame_comes_with_the_cameras_stamp(videos: dict[str, Path], name:
     assert np.median(np.abs(steps)) < 1e5
     assert np.abs(steps).max() < 25e6
     assert len(said) == 1
-    assert "own stamps (RTCP)" in said[0]
+    assert "the stamps of the camera (RTCP)" in said[0]
 
 
 @pytest.mark.parametrize("authentication", ["basic", "digest"])
@@ -109,7 +109,7 @@ def test_a_password(videos: dict[str, Path], authentication: str) -> None:
     for user in ("", "admin:wrong@"):
         with (
             served(videos["h264"], "tcp", authentication, user) as address,
-            pytest.raises(SourceError, match="asks for a password, or another;") as error,
+            pytest.raises(SourceError, match="the password is missing or not accepted;") as error,
         ):
             take(address, 1, [])
         assert "wrong" not in str(error.value)

@@ -163,9 +163,12 @@ def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None
     [
         ("sim:green", "has no camera 'green'; write one of sim:red, sim:white, sim:black"),
         ("sim:red?colour=3", "has no setting 'colour'"),
-        ("sim:red?seed=three", "seed=three is no number"),
+        ("sim:red?seed=three", "seed=three is not a number"),
         ("sim:red?markers=0", "simulator setting markers is 0"),
-        ("sim:red?board=6", "camera red: board=6: write the inner corners of a chessboard as 6x4"),
+        (
+            "sim:red?board=6",
+            "camera red: board=6: is not a board; write the inner corners of a chessboard as 6x4",
+        ),
         ("sim:red?board=charuco:2x2", "a board has 3 to 100 squares in each direction"),
     ],
 )

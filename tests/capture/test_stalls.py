@@ -65,7 +65,7 @@ def test_late_frames_are_between_two_events() -> None:
     messages = recorded([*before, *burst, *after])
     begins, ends = late_events(messages)
     assert (begins.camera, begins.start, begins.end) == ("red", stopped_ns, None)
-    assert "stood still for 2.0 s" in begins.text
+    assert "was suspended for 2.0 s" in begins.text
     assert ends.start == stopped_ns
     assert ends.end is not None
     assert burst[-1] <= ends.end <= after[6]

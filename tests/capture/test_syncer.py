@@ -154,7 +154,7 @@ def test_sync_error_is_reported_once_and_at_the_end(tmp_path: Path) -> None:
     assert [kind for kind, _ in sent.warned] == ["disk_fault"]
     assert "the disk has failed (Input/output error)" in sent.warned[0][1]
     assert sent.confirmed[0][1] is not None
-    with pytest.raises(IpsysError, match=r"Input/output error.*may be lost.*ipsys repair") as caught:
+    with pytest.raises(IpsysError, match=r"Input/output error.*may be missing.*ipsys repair") as caught:
         log.check_disk()
     assert "space" not in str(caught.value)
 
@@ -170,5 +170,7 @@ def test_point_on_a_failing_disk_is_not_called_saved(tmp_path: Path) -> None:
             for _ in write_each(attached, log):
                 pass
         disk.error = None
-        with pytest.raises(SourceError, match=r"maybe not saved: the disk has failed \(Input/output error\)"):
+        with pytest.raises(
+            SourceError, match=r"perhaps not saved: the disk has failed \(Input/output error\)"
+        ):
             saved.result(LIMIT_S)

@@ -90,7 +90,7 @@ def test_camera_poses_are_recovered(tmp_path: Path, plug_in: Callable[[int, str]
     first, second = find_cameras(tmp_path)
     assert (first.device, first.name) == (str(tmp_path / "dev/video2"), "Lab Camera 2")
     assert first.stable == str(tmp_path / "dev/v4l/by-id/usb-Acme_2-video-index0")
-    assert first.plug == UsbConnection(1, "4", 480.0, "the machine's own, controller 0000:00:14.0", 3060)
+    assert first.plug == UsbConnection(1, "4", 480.0, "built in, controller 0000:00:14.0", 3060)
     assert second.plug == UsbConnection(1, "2.3", 480.0, "Acme USB2.0 Hub at port 2", 3060)
     assert first.modes == (
         Mode("YUYV", 640, 480, 30),
@@ -154,7 +154,8 @@ def test_overloaded_bus_is_explained() -> None:
     (line,) = advise([*cameras(4), *cameras(1, bus=2)])
     assert line == (
         "cameras black, blue, red and white share USB bus 1 (Acme Hub at port 2) and need "
-        "64.6 MB/s of its 48: plug one into another bus, or ask for 20 frames/s of each, or for 1280 x 960 px"
+        "64.6 MB/s of its 48: plug one camera into another bus, or set 20 frames/s for each, or set "
+        "1280 x 960 px"
     )
     # The advised settings fit.
     assert advise(cameras(4, rate_hz=20.0)) == []
@@ -166,7 +167,7 @@ def test_single_camera_can_overload_a_bus() -> None:
     (line,) = advise(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "
-        "ask for 10 frames/s, or for 800 x 600 px, or take a camera that gives MJPG"
+        "set 10 frames/s, or set 800 x 600 px, or use a camera with MJPG"
     )
 
 
@@ -180,7 +181,7 @@ def test_cameras_command_lists_the_bus_load(
 ) -> None:
     monkeypatch.setattr(usb_bus, "find_cameras", lambda: find_cameras(tmp_path))
     done = ipsys("cameras")
-    assert (done.code, done.out.splitlines()[0]) == (0, "no cameras are attached by USB")
+    assert (done.code, done.out.splitlines()[0]) == (0, "no USB camera is attached")
     assert "rtsp://" in done.out
     assert "sim:red" in done.out
     for number in (0, 1, 2, 3):

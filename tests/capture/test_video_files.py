@@ -81,7 +81,7 @@ def test_invalid_video_leaves_no_log(tmp_path: Path, ipsys: Ipsys) -> None:
         assert done.err.count("\n") == 1
     assert not (tmp_path / "log.mcap").exists()
     done = ipsys("import", "videos", "red.mp4", "-o", tmp_path / "log.mcap")
-    assert "red.mp4: write it as camera=file.mp4" in done.err
+    assert "red.mp4: has no camera name; write camera=file.mp4" in done.err
 
 
 def folder(tmp_path: Path, names: list[str]) -> dict[str, list[Path]]:
@@ -119,10 +119,10 @@ def test_times_are_in_a_table(tmp_path: Path, ipsys: Ipsys) -> None:
     ("text", "said"),
     [
         ("file,time\nred/a.jpg,1700000000\n", "times.csv: has no row for red/b.jpg; add it"),
-        ("file,time\nred/a.jpg,noon\n", "times.csv: line 2: 'noon' is no time; write s, ms"),
-        ("file,time\nred/c.jpg,1700000000\n", "times.csv: line 2: no picture is called 'red/c.jpg'"),
-        ("file,time\nred/a.jpg,1700000000\nred/b.jpg,1700000000\n", "b.jpg: has the time of a.jpg"),
-        ("picture,time\n", "its first line must name the columns file and time"),
+        ("file,time\nred/a.jpg,noon\n", "times.csv: line 2: 'noon' is not a time; write s, ms"),
+        ("file,time\nred/c.jpg,1700000000\n", "times.csv: line 2: picture 'red/c.jpg' does not exist"),
+        ("file,time\nred/a.jpg,1700000000\nred/b.jpg,1700000000\n", "b.jpg: has the same time as a.jpg"),
+        ("picture,time\n", "the first line must name the columns file and time"),
     ],
 )
 def test_a_table_that_does_not_fit_is_named(tmp_path: Path, text: str, said: str) -> None:
@@ -166,15 +166,18 @@ def test_a_file_is_played_in_real_time(tmp_path: Path, ipsys: Ipsys) -> None:
         assert np.median([late_ns for late_ns, _ in came]) < 5e6
         steps = np.diff([frame.time_ns or 0 for _, frame in came])
         assert np.abs(steps - 50e6).max() < 1e6
-    with pytest.raises(SourceError, match=r"has no such camera; it has: .*log.mcap\?red"):
+    with pytest.raises(SourceError, match=r"does not have this camera; it has .*log.mcap\?red"):
         play(f"file:{log}", "left")
-    with pytest.raises(SourceError, match="there is no such file"):
+    with pytest.raises(SourceError, match="does not exist"):
         play("file:nowhere.mp4")
 
 
 @pytest.mark.parametrize(
     ("source", "said"),
-    [(None, "the rig gives no source"), ("firewire:0", "source 'firewire:0' is none of http:, https:")],
+    [
+        (None, "has no source in the rig"),
+        ("firewire:0", "source 'firewire:0' has an unknown type; use one of http:, https:"),
+    ],
 )
 def test_a_source_that_nothing_opens(source: str | None, said: str) -> None:
     with pytest.raises(IpsysError, match=said):

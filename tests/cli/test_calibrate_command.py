@@ -151,16 +151,19 @@ def test_a_log_gives_a_file_for_each_camera_that_saw_the_board(ipsys: Ipsys, log
     assert done.code == 0, done.err
     assert (log.parent / "red.yaml").is_file()
     assert not (log.parent / "white.yaml").exists()
-    assert "camera white: a chessboard of 6 x 4 inner corners is not seen in any of 12" in done.err
+    assert "camera white: a chessboard of 6 x 4 inner corners is not found in any of the 12" in done.err
     # All other commands accept the file.
-    assert "no such camera" not in ipsys("detect", log, "--calibration", f"red={log.parent}/red.yaml").err
+    assert (
+        "does not have this camera"
+        not in ipsys("detect", log, "--calibration", f"red={log.parent}/red.yaml").err
+    )
 
 
 def test_one_camera_of_a_log(ipsys: Ipsys, log: Path) -> None:
     line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "white", "-o", log.parent)
     assert "camera white" in line
     line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "blue", "-o", log.parent)
-    assert "--camera blue: there are no frames of such a camera (only of red, white)" in line
+    assert "--camera blue: this camera has no frames; the cameras are red, white" in line
 
 
 def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
@@ -178,15 +181,21 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("board", "said"),
     [
-        ("7x5", "a chessboard of 6 x 4 inner corners is seen in"),
+        ("7x5", "a chessboard of 6 x 4 inner corners is in"),
         (
             "5x3",
-            "a part of a chessboard of 6 x 4 inner corners, which 3 of 3 pictures of a board show: give "
+            "only a part of the board: 3 of 3 pictures show a chessboard of 6 x 4 inner corners; give "
             "--board 6x4; if the size is right, give --force",
         ),
-        ("9x9", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
-        ("charuco:7x5", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
-        ("charuco:6x4", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
+        ("9x9", "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4"),
+        (
+            "charuco:7x5",
+            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+        ),
+        (
+            "charuco:6x4",
+            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+        ),
     ],
 )
 def test_wrong_board_size_is_reported(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
@@ -269,12 +278,14 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
     cv2.imwrite(str(red / "98.png"), np.full(SIZE_PX[::-1], 90, np.uint8))
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
     assert done.code == 0, done.err
-    assert "board not found: 98.png: the board is not seen" in done.out
+    assert "board not found: 98.png: the board is not found" in done.out
 
 
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     done = calibrate(ipsys, red, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
-    assert re.search(r"error is 0\.\d+ px; --lens (fisheye|pinhole8) leaves 0\.0\d px: use it", done.err)
+    assert re.search(
+        r"error is 0\.\d+ px; with --lens (fisheye|pinhole8) it is 0\.0\d px: use this lens model", done.err
+    )
 
 
 def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
@@ -282,7 +293,7 @@ def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: 
     done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
     assert done.code == 1
     assert "the RMS reprojection error is 3.7 px" in done.err
-    assert "--lens fisheye leaves 0.22 px: use it; or give --force" in done.err
+    assert "use --lens fisheye, with an error of 0.22 px; or use --force" in done.err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -291,19 +302,19 @@ def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path
         path.unlink()
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path, "--force")
     assert done.code == 0, done.err
-    assert "written only for --force: only 4 of 4 pictures can be used" in done.err
+    assert "written only because of --force: only 4 of 4 pictures can be used" in done.err
 
 
 def test_invalid_sources_are_refused(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     board = ("--board", "6x4", "-o", tmp_path)
-    assert "there is no such" in refused(ipsys, tmp_path, tmp_path / "nowhere", *board)
+    assert "nowhere: does not exist" in refused(ipsys, tmp_path, tmp_path / "nowhere", *board)
     (tmp_path / "empty").mkdir()
     assert "has no pictures" in refused(ipsys, tmp_path, tmp_path / "empty", *board)
     (tmp_path / "a.txt").write_text("a")
-    assert "is neither a log" in refused(ipsys, tmp_path, tmp_path / "a.txt", *board)
+    assert "is not a log" in refused(ipsys, tmp_path, tmp_path / "a.txt", *board)
     (tmp_path / "a.mp4").write_bytes(b"no video at all")
-    assert "is no video" in refused(ipsys, tmp_path, tmp_path / "a.mp4", *board)
-    assert "no such lens" in refused(ipsys, tmp_path, red, *board, "--lens", "round")
+    assert "cannot be read as a video" in refused(ipsys, tmp_path, tmp_path / "a.mp4", *board)
+    assert "--lens round: is not known" in refused(ipsys, tmp_path, red, *board, "--lens", "round")
     assert "four coefficients" in refused(
         ipsys, tmp_path, red, *board, "--lens", "pinhole", "--format", "kalibr"
     )

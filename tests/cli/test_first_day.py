@@ -54,14 +54,20 @@ def played(lab: Path, camera: str = "red", more: str = "") -> str:
 
 # Use this camera beside another one that reports if it is opened.
 FAULTS = {
-    "source": ('[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n', "is none of http:"),
+    "source": (
+        '[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n',
+        "has an unknown type; use one of http:",
+    ),
     "simulated camera": ('[[cameras]]\nname = "white"\nsource = "sim:blue"\n', "has no camera 'blue'"),
-    "device": ('[[cameras]]\nname = "white"\nsource = "usb:/dev/none"\n', "there is no device '/dev/none'"),
-    "address": ('[[cameras]]\nname = "white"\nsource = "http:/cam/1"\n', "names no host; write it as"),
-    "file": ('[[cameras]]\nname = "white"\nsource = "file:none.mp4"\n', "none.mp4: there is no such file"),
+    "device": (
+        '[[cameras]]\nname = "white"\nsource = "usb:/dev/none"\n',
+        "device '/dev/none' does not exist",
+    ),
+    "address": ('[[cameras]]\nname = "white"\nsource = "http:/cam/1"\n', "has no host; write it as"),
+    "file": ('[[cameras]]\nname = "white"\nsource = "file:none.mp4"\n', "none.mp4: does not exist"),
     "lens": (
         '[[cameras]]\nname = "white"\nsource = "sim:white"\ncalibration = "none.yaml"\n',
-        "none.yaml: there is no such calibration file",
+        "none.yaml: does not exist",
     ),
 }
 COMMANDS = {
@@ -136,7 +142,9 @@ def test_portrait_image_gives_a_remark(ipsys: Ipsys, tmp_path: Path) -> None:
         size = f"width = {width}\nheight = {height}"
         rig = write_rig(tmp_path, f'[[cameras]]\nname = "red"\nsource = "http://127.0.0.1:9/"\n{size}')
         done = ipsys("record", "--rig", rig, "-o", tmp_path / "none" / "a.mcap")
-        assert ("camera red: 180 x 320 px is upright: are width and height exchanged?" in done.err) == said
+        assert (
+            "camera red: 180 x 320 px is upright: check that width and height are not exchanged" in done.err
+        ) == said
 
 
 def test_model_of_other_cameras_is_refused_before_cameras_open(
@@ -147,7 +155,7 @@ def test_model_of_other_cameras_is_refused_before_cameras_open(
         given = ("-o", tmp_path / "a.mcap", "--rig", rig, "--model-from", fitted, "--seconds", "1")
         done = ipsys(*command, *given)
         assert done.code == 1
-        assert "is of the cameras black, red, white, and none of them is here, but blue" in done.err
+        assert "is for the cameras black, red, white, but the rig has only blue" in done.err
         assert OPENED not in done.err
 
 
@@ -169,7 +177,7 @@ def test_calibration_is_read_from_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path)
         assert (held.D.tolist(), held.K.tolist(), held.width) == (meant.D.tolist(), meant.K.tolist(), 960)
     stranger = write_rig(tmp_path, played(lab).replace('name = "red"', 'name = "green"'))
     done = ipsys("record", "--rig", stranger, "-o", tmp_path / "green.mcap")
-    assert "holds no calibration of camera green; it has those of: black, red, white" in done.err
+    assert "has no calibration of camera green, only of black, red, white" in done.err
 
 
 def test_file_name_gets_a_missing_suffix_and_a_message(
@@ -177,10 +185,10 @@ def test_file_name_gets_a_missing_suffix_and_a_message(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     done = ipsys("record", "--rig", write_rig(tmp_path, played(lab)), "--seconds", "0.5", "-o", "monday")
-    assert "-o monday: the log is called monday.mcap" in done.err
+    assert "-o monday: the log gets the name monday.mcap" in done.err
     assert "monday.mcap written" in done.out
     done = ipsys("detect", "monday.mcap", "-o", "results.v2")
-    assert "the log is called results.v2.mcap" in done.err
+    assert "the log gets the name results.v2.mcap" in done.err
     assert ipsys("info", "monday.mcap", "results.v2.mcap").code == 0
     assert not (tmp_path / "monday").exists()
 
@@ -189,7 +197,7 @@ def test_live_align_names_the_kept_log(ipsys: Ipsys, tmp_path: Path, lab: Path) 
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("align", "--rig", rig, "--seconds", "1")
     assert done.code == 0, done.err
-    assert "nothing is kept" in done.err
+    assert "no frames or results are kept" in done.err
     assert "now.mcap" not in done.out + done.err
     kept = tmp_path / "kept.mcap"
     done = ipsys("align", "--rig", rig, "--seconds", "1", "-o", kept)
@@ -203,7 +211,7 @@ def test_error_in_live_frames_names_no_deleted_file(ipsys: Ipsys, tmp_path: Path
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("calibrate", "--rig", rig, "--board", "6x4", "--seconds", "1")
     assert done.code == 1
-    assert "what the cameras sent" in done.err
+    assert "the camera images" in done.err
     assert "now.mcap" not in done.err
 
 
@@ -214,8 +222,8 @@ def test_unknown_marker_is_shown_with_the_next_step(ipsys: Ipsys, tmp_path: Path
     markers = "".join(f"[[markers]]\nid = {n}\n" for n in known)
     rig_file = write_rig(tmp_path, markers + played(lab))
     done = ipsys("record", "--rig", rig_file, "--seconds", "2.5", "-o", tmp_path / "a.mcap")
-    assert "camera red: marker 0 is seen, but not in the rig; to track it add" in done.out
-    assert "add the line [[markers]] to it, and below id = 0" in done.out
+    assert "camera red: marker 0 is seen, but not in the rig; to track it, add" in done.out
+    assert "add [[markers]] with id = 0 to lab.toml" in done.out
     assert f"marker {known[0]} is seen" not in done.out
 
 
@@ -223,10 +231,10 @@ def test_a_camera_without_a_lens_is_recorded_and_named(ipsys: Ipsys, tmp_path: P
     bare = played(lab).replace("calibration =", "# calibration =")
     done = ipsys("record", "--rig", write_rig(tmp_path, bare), "--seconds", "0.5", "-o", tmp_path / "a.mcap")
     assert done.code == 0, done.err
-    assert "camera red has no lens; a replay needs one" in done.err
+    assert "camera red has no calibration, but a replay needs one" in done.err
     lensed = write_rig(tmp_path, played(lab))
     done = ipsys("record", "--rig", lensed, "--seconds", "0.5", "-o", tmp_path / "b.mcap")
-    assert "no lens" not in done.err
+    assert "has no calibration" not in done.err
 
 
 @pytest.mark.parametrize(
@@ -284,9 +292,9 @@ def test_info_has_one_line_per_channel_and_no_event_rates(
 
 def test_the_help_lists_the_commands_in_the_order_of_a_first_day(ipsys: Ipsys) -> None:
     out = ipsys("--help").out
-    panel = out[out.index("The first day, in this order") : out.index("How good it is")]
+    panel = out[out.index("First day, in this order") : out.index("Accuracy, and the next")]
     listed = [line.split()[1] for line in panel.splitlines()[1:] if line[2:3].isalpha()]
-    assert tuple(listed) == PANELS["The first day, in this order"]
+    assert tuple(listed) == PANELS["First day, in this order"]
 
 
 @pytest.mark.parametrize("command", EXAMPLES)

@@ -66,7 +66,7 @@ def test_report_tells_the_page_from_a_log(ipsys: Ipsys, lab: Path, tmp_path: Pat
     done = ipsys("report", lab, option, link)
     assert done.code == 1
     if option == "-o":
-        assert "-o is for a new log, which ends in .mcap; ipsys report --html" in done.err
+        assert "the name of a new log ends in .mcap; ipsys report --html" in done.err
     else:
         assert "is a link to gone.html, which does not exist" in done.err
     assert not list(tmp_path.glob("*.partial"))
@@ -76,5 +76,5 @@ def test_report_tells_the_page_from_a_log(ipsys: Ipsys, lab: Path, tmp_path: Pat
 def test_name_of_another_file_is_no_log(ipsys: Ipsys, lab: Path, tmp_path: Path, name: str) -> None:
     done = ipsys("replay", lab, "-o", tmp_path / name)
     assert done.code == 1
-    assert f"-o {tmp_path / name}: -o is for a new log, which ends in .mcap" in done.err
+    assert f"-o {tmp_path / name}: the name of a new log ends in .mcap" in done.err
     assert not (tmp_path / f"{name}.mcap").exists()

@@ -98,8 +98,8 @@ def test_the_plan_is_a_table_and_a_headline(
     assert max(map(len, lines)) <= 80, done.out
     rows = [line for line in lines if line[:1].isdigit()]
     assert [row.split()[0] for row in rows] == ["1", "2", "3", "4", "5"]
-    assert lines[-1].startswith("predicted mean error over the floor now 0.")
-    assert "with these 5 places 0." in lines[-1]
+    assert lines[-1].startswith("predicted mean error over the floor: 0.")
+    assert "cm with these 5 points" in lines[-1]
     # The missing model was fitted and appended; the recorded data are unchanged.
     assert "fit           run best  1 message\n" in done.err
     assert data_section(paper).startswith(section)
@@ -199,18 +199,18 @@ def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -
 def test_plan_without_calibration_points_names_the_first_step(ipsys: Ipsys, paper: Path) -> None:
     log = rewrite(paper, drop_measured)
     line = refused(ipsys, log)
-    assert "no place is measured yet" in line
-    assert "measure about 10 places, spread over the view of each camera out to its edges" in line
+    assert "has no calibration points" in line
+    assert "measure about 10 points over the whole view of each camera" in line
 
 
 def test_impossible_plan_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "does not exist" in refused(ipsys, paper, paper.with_name("none.mcap"))
     for count in (0, -1, 51):
-        assert f"--places {count}: plan 1 to 50 places at a time" in refused(ipsys, paper, "--places", count)
+        assert f"--places {count}: is not between 1 and 50" in refused(ipsys, paper, "--places", count)
     assert "model 'spline' is not known; use one of" in refused(ipsys, paper, "--model", "spline")
     for height in ("-0.1", "15", "nan", "inf"):
         assert f"--height-m {height}: " in refused(ipsys, paper, "--height-m", height)
-    assert "no measurement is labelled 'half'" in refused(ipsys, paper, "--train", "half")
+    assert "no measurement has the label 'half'" in refused(ipsys, paper, "--train", "half")
     assert "this is the log itself" in refused(ipsys, paper, "--plot", paper)
     assert "there is no folder" in refused(ipsys, paper, "--plot", paper.parent / "nowhere" / "plan.png")
     assert ipsys("fit", paper, "--model", "best").code == 0
@@ -223,7 +223,7 @@ def test_too_few_points_are_reported(ipsys: Ipsys, paper: Path) -> None:
         payload = message.payload
         return None if isinstance(payload, Measurement) and payload.id > "s003" else message
 
-    assert "best needs at least 5 measured places" in refused(ipsys, rewrite(paper, few))
+    assert "best needs at least 5 calibration points" in refused(ipsys, rewrite(paper, few))
 
 
 def test_missing_data_of_the_log_give_notes(ipsys: Ipsys, authors: Path) -> None:
@@ -258,7 +258,7 @@ def test_plan_with_three_reference_points_gives_no_side(ipsys: Ipsys, fitted: Pa
     assert place["side"] is None
     assert place["distances_m"]["corner"] == pytest.approx(np.hypot(place["x_m"], place["y_m"]))
     done = ipsys("plan", fitted, "--rig", rig, "--places", 1)
-    assert "with this place" in done.out
+    assert "with this point" in done.out
     assert "corner" in done.out
 
 

@@ -94,7 +94,7 @@ def test_simulated_lab_gives_its_rig_and_its_tape(
     assert (done.code, (tmp_path / "lab.toml").exists()) == (1, False)
     assert "lab_tape.csv: exists already" in done.err
     assert (tmp_path / "lab_tape.csv").read_bytes() == before
-    assert "exclude each other" in ipsys("init", "x.toml", "--simulated", "--from", "a.mcap").err
+    assert "cannot be used together" in ipsys("init", "x.toml", "--simulated", "--from", "a.mcap").err
 
 
 def test_simulated_lab_is_measured_and_fitted(
@@ -106,7 +106,7 @@ def test_simulated_lab_is_measured_and_fitted(
     write_log(tmp_path / "day.mcap", seen_by_all(load_rig(tmp_path / "lab.toml")))
     done = ipsys("measure", "day.mcap", "--csv", "lab_tape.csv")
     assert done.code == 0, done.err
-    assert f"{len(sheet_rows(tmp_path / 'lab_tape.csv'))} places measured" in done.out
+    assert f"{len(sheet_rows(tmp_path / 'lab_tape.csv'))} points measured" in done.out
     assert ipsys("replay", "day.mcap").code == 0
     errors = errors_m(tmp_path / "day.mcap")
     assert len(errors) > 150
@@ -185,7 +185,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     assert np.median(errors) < 0.01
     assert np.percentile(errors, 95) < 0.05
 
-    assert "a replay equals the log" in day("verify", "a.mcap")
+    assert "the replay is identical to the log" in day("verify", "a.mcap")
     day("latency", "a.mcap", "--plot", "latency.png")
     day("diff", "a.mcap", "a.mcap")
     day("repair", "a.mcap")

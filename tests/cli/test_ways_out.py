@@ -35,7 +35,7 @@ PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
 def test_view_saved_under_another_ending_is_refused(ipsys: Ipsys, lab: Path) -> None:
     line = refused(ipsys, lab, "view", lab, "--save", lab.with_name("out.txt"))
     assert "--save" in line
-    assert "name it out.rrd" in line
+    assert "use out.rrd" in line
     assert "there is no folder" in refused(ipsys, lab, "view", lab, "--save", lab.with_name("no") / "out.rrd")
 
 
@@ -45,7 +45,7 @@ def test_import_of_a_log_names_what_to_run(ipsys: Ipsys, lab: Path, command: tup
     log = Path(shutil.copy(lab, lab.with_name("recorded.bin")))
     source = f"red={log}" if command == ("videos",) else log
     line = refused(ipsys, lab, "import", *command, source, "-o", lab.with_name("new.mcap"))
-    assert f"{log}: is a log already and needs no import" in line
+    assert f"{log}: is already a log and needs no import" in line
     assert f"ipsys replay {log}" in line
 
 
@@ -114,7 +114,7 @@ def test_rig_of_other_cameras_is_refused(ipsys: Ipsys, lab: Path) -> None:
     rig = rig_file(lab, "left", "right")
     for command in (("detect", lab), ("measure", lab, "--places")):
         line = refused(ipsys, lab, *command, "--rig", rig)
-        assert "describes the cameras left, right, but there are only black, red, white" in line
+        assert "describes the cameras left, right, but the log has only black, red, white" in line
         assert "rename its cameras, or remove its [[cameras]]" in line
 
 
@@ -134,7 +134,7 @@ def test_rig_of_other_cameras_is_refused_for_pictures(ipsys: Ipsys, lab: Path) -
         (folder / "1.jpg").write_bytes(session.payloads(["/cameras/red/image"])[0].data)
     rig, new = rig_file(lab, "left", "right"), lab.with_name("new.mcap")
     line = refused(ipsys, lab, "import", "images", folder.parent, "-o", new, "--rig", rig)
-    assert "describes the cameras left, right, but there are only front" in line
+    assert "describes the cameras left, right, but the log has only front" in line
 
 
 def changed(lab: Path, name: str, change: Callable[[Message], Message | None]) -> Path:
@@ -206,7 +206,7 @@ def test_diff_of_runs_without_frames_says_which_side(ipsys: Ipsys, detected: Pat
     bare = changed(detected, "bare.mcap", lambda m: None if isinstance(m.payload, Markers) else m)
     done = ipsys("diff", detected, bare)
     assert done.code == 1
-    assert "the second has no markers, points, positions or tracks" in " ".join(done.out.split())
+    assert "the second has no markers, camera points, positions or tracks" in " ".join(done.out.split())
 
 
 def test_adjacent_extents_give_no_explanation() -> None:
@@ -258,7 +258,7 @@ def test_evaluate_interrupted_names_the_runs_that_are_complete(detected: Path) -
     assert code == 130
     assert f"ipsys: interrupted; complete in {detected}: " in err
     assert "rigid (fit" in err
-    assert "The same command continues there" in err
+    assert "To continue, repeat the command" in err
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ def test_heading_is_minus_the_angle_from_corner_3_to_0(
 
 
 def test_corners_that_fall_together() -> None:
-    with pytest.raises(ValueError, match="fall together"):
+    with pytest.raises(ValueError, match="are at one point"):
         camera_point(np.zeros((4, 2)), 0.2)
 
 

@@ -117,7 +117,7 @@ def test_circles_that_just_miss_one_another() -> None:
     point = np.array([0.5, 2.4384])  # beyond A on the line AB: a slightly shorter distance gives no triangle
     two, three = np.array([A, B]), np.array([A, B, C])
     short = ranges(point, three) + np.array([-0.002, 0.002, 0])
-    with pytest.raises(IpsysError, match="no triangle"):
+    with pytest.raises(IpsysError, match="do not meet"):
         multilaterate(two, short[:2], side="left")
     assert np.hypot(*(multilaterate(three, short).point_m - point)) < 0.05
 
@@ -129,7 +129,7 @@ def test_three_reference_points_on_one_line_need_the_side(side: str) -> None:
     right = left[::-1]
     distances = ranges(left, references) + np.array([0.001, -0.001, 0.001])
     assert are_collinear(references)
-    with pytest.raises(IpsysError, match=r"3 reference points lie on one line.*'left' or 'right'"):
+    with pytest.raises(IpsysError, match=r"3 reference points are on one line.*'left' or 'right'"):
         multilaterate(references, distances)
     found = multilaterate(references, distances, side=side)
     np.testing.assert_allclose(found.point_m, left if side == "left" else right, atol=0.005)
@@ -264,15 +264,15 @@ def test_both_sides_fit_nearly_collinear_reference_points() -> None:
     [
         ([A], [1.0], None, "left", "1 reference points and 1 distances"),
         ([A, B], [1.0, 2.0, 3.0], None, "left", "2 reference points and 3 distances"),
-        ([A, A, A], [1.0, 1.0, 1.0], None, "left", "one and the same"),
-        ([A, A], [1.0, 1.0], None, "left", "one and the same"),
-        ([A, B], [1.7, 1.9], None, None, "2 reference points lie on one line"),
-        ([A, B], [1.7, 1.9], None, "above", "neither 'left' nor 'right'"),
-        ([A, B, C], [1.7, 1.9, 1.9], None, "above", "neither 'left' nor 'right'"),
+        ([A, A, A], [1.0, 1.0, 1.0], None, "left", "identical"),
+        ([A, A], [1.0, 1.0], None, "left", "identical"),
+        ([A, B], [1.7, 1.9], None, None, "2 reference points are on one line"),
+        ([A, B], [1.7, 1.9], None, "above", "write 'left' or 'right'"),
+        ([A, B, C], [1.7, 1.9, 1.9], None, "above", "write 'left' or 'right'"),
         ([A, B, C], [1.7, 0.0, 1.9], None, None, "not all above 0"),
         ([A, B, C], [1.7, np.nan, 1.9], None, None, "not all above 0"),
         ([A, B, C], [1.7, np.inf, 1.9], None, None, "not all above 0"),
-        ([A, B], [np.nan, 1.9], None, "left", "no triangle"),
+        ([A, B], [np.nan, 1.9], None, "left", "do not meet"),
         ([A, B], [1.7, 1.9], [0.003, 0.0], "left", "sigmas"),
         ([A, B], [1.7, 1.9], [0.003, np.nan], "left", "sigmas"),
     ],

@@ -96,8 +96,8 @@ def test_reading_command_names_repair_for_an_append_cut_short(ipsys: Ipsys, path
         done = ipsys("info", path)
         assert done.code == 0
         lines = done.err.splitlines()
-        assert lines in ([], [f"{path}: an append to it was interrupted; ipsys reads the old log. "
-                              f"Repair it with: ipsys repair {path}"])  # fmt: skip
+        assert lines in ([], [f"{path}: an append was interrupted; ipsys reads the old log. "
+                              f"To repair it: ipsys repair {path}"])  # fmt: skip
         said.append(bool(lines))
         if lines:
             with LogWriter.append(path) as other:  # another process appends, and rolls back itself

@@ -119,7 +119,7 @@ def test_disk_without_locks_is_named_and_keeps_no_file(
         lambda: repair(log),
         lambda: check_locks(new),
     ):
-        with pytest.raises(LogError, match=r"gives no locks \(No locks available\).*local disk"):
+        with pytest.raises(LogError, match=r"has no locks \(No locks available\).*local disk"):
             write()
     assert list(new.iterdir()) == []
     assert log.read_bytes() == before
@@ -138,7 +138,7 @@ def test_link_to_nowhere_is_named(tmp_path: Path) -> None:
 def test_a_journal_without_its_log(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     journal_path(path).write_bytes(b"journal")
-    with pytest.raises(LogError, match="belongs to a log that is gone"):
+    with pytest.raises(LogError, match="belongs to a log that does not exist"):
         LogWriter.create(path)
 
 

@@ -180,20 +180,20 @@ def test_outlines_enclose_the_black_cells(rows: list[list[bool]]) -> None:
     ("arguments", "said"),
     [
         ((), "nothing to print: give --rig lab.toml"),
-        (("--ids", "1"), "give the side of the markers too"),
+        (("--ids", "1"), "the side of the markers is missing"),
         (("--ids", "1", "--length", "0.2", "--page", "a4"), "holds markers of up to 142 mm: --length 0.142"),
         (("--ids", "1", "--length", "0.3"), "too much for A3, which holds markers of up to 207 mm"),
         (("--ids", "1", "--length", "20"), "cm"),
-        (("--ids", "1;2", "--length", "0.1"), "write ids as 1,2,3 or as 0-9"),
+        (("--ids", "1;2", "--length", "0.1"), "is not a list of ids; write 1,2,3 or 0-9"),
         (("--ids", "100", "--length", "0.1"), "DICT_4X4_100 has the ids 0 to 99"),
-        (("--ids", "1", "--length", "0.1", "--dictionary", "DICT_9X9"), "is none of OpenCV's"),
+        (("--ids", "1", "--length", "0.1", "--dictionary", "DICT_9X9"), "is unknown to OpenCV"),
         (
             ("--ids", "1", "--length", "0.1", "--page", "a5"),
             "--page a5: is not known; give one of a4, letter, a3",
         ),
         (("--board", "20x10"), "make its squares smaller, with --square"),
         (("--board", "6"), "write the inner corners of a chessboard as 6x4"),
-        (("--ids", "1", "--length", "0.1", "-o", "m.png"), "only PDF keeps the true size"),
+        (("--ids", "1", "--length", "0.1", "-o", "m.png"), "only a PDF keeps the true size"),
     ],
 )
 def test_impossible_prints_are_refused(

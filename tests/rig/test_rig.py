@@ -69,7 +69,7 @@ def test_commented_examples_of_init_are_valid(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"tape_sigma_m": 0.0}, "tape_sigma_m = 0.0 m is no standard deviation"),
+        ({"tape_sigma_m": 0.0}, "tape_sigma_m = 0.0 m is not a standard deviation"),
         ({"tape_sigma_m": -0.003}, "tape_sigma_m = -0.003"),
         ({"tape_sigma_m": float("nan")}, "tape_sigma_m = nan"),
         ({"tape_sigma_m": float("inf")}, "tape_sigma_m = inf"),
@@ -107,22 +107,22 @@ def test_impossible_rig_is_refused(change: dict[str, object], said: str) -> None
     [
         (
             {"marker_length_m": 20.0},
-            "marker_length_m = 20 is too much for m; write 0.2 if that is cm or 0.02",
+            "marker_length_m = 20 is too large for m; write 0.2 if it is in cm or 0.02",
         ),
         (
             {"markers": (RigMarker(3, length_m=150.0),)},
-            "marker 3: length_m = 150 .* write 1.5 if that is cm or",
+            "marker 3: length_m = 150 .* write 1.5 if it is in cm or",
         ),
-        ({"markers": (RigMarker(100),)}, "marker id 100: DICT_4X4_100 has only 0 to 99"),
+        ({"markers": (RigMarker(100),)}, "marker id 100: DICT_4X4_100 has only the ids 0 to 99"),
         (
             {"floor": Floor(488.0, 4.88)},
-            r"\[floor\] width_m = 488 is too much for m; write 4.88 if that is cm",
+            r"\[floor\] width_m = 488 is too large for m; write 4.88 if it is in cm",
         ),
         ({"reference_points": (ReferencePoint("A", 122.0, 0.0),)}, "reference point A: x_m = 122"),
-        ({"tape_sigma_m": 1.0}, "tape_sigma_m = 1 .* write 0.01 if that is cm or 0.001 if that is mm"),
+        ({"tape_sigma_m": 1.0}, "tape_sigma_m = 1 .* write 0.01 if it is in cm or 0.001 if it is in mm"),
         ({"cameras": (RigCamera("red", rate_hz=3000.0),)}, "camera red: rate_hz = 3000 .*; write 0 to 1000"),
-        ({"cameras": (RigCamera("red", exposure_s=8.0),)}, "exposure_s = 8 .* write 0.008 if that is ms"),
-        ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too little for ns; write 31000 if that is us"),
+        ({"cameras": (RigCamera("red", exposure_s=8.0),)}, "exposure_s = 8 .* write 0.008 if it is in ms"),
+        ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too small for ns; write 31000 if it is in us"),
     ],
 )
 def test_rig_file_with_a_wrong_unit_is_refused(tmp_path: Path, change: dict[str, object], said: str) -> None:

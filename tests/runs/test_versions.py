@@ -198,7 +198,7 @@ def test_verify_names_results_of_other_versions(
         monkeypatch.setitem(VERSIONS, name, 2)
     done = ipsys("verify", log)
     assert done.code == 1
-    assert "nothing of its runs can be verified" in done.err
+    assert "has no run that can be verified" in done.err
 
 
 def test_package_versions_do_not_outdate_runs(
@@ -221,7 +221,7 @@ def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, 
     assert rows["poly", "fit"]["state"] == "out of date: measurements changed"
     assert rows["poly", "fuse"]["state"] == "out of date: input poly is"
     done = ipsys("view", log, "--save", tmp_path / "a.rrd")
-    assert "run poly: fit is out of date: measurements changed; ipsys replay makes it again" in done.err
+    assert "run poly: fit is out of date: measurements changed; ipsys replay computes it again" in done.err
     assert "fit is computed again; run poly is out of date: measurements changed" in ipsys("replay", log).err
 
 
@@ -233,7 +233,7 @@ def test_run_without_its_inputs_is_not_repeatable(ipsys: Ipsys, tmp_path: Path) 
     assert made(ipsys, log)["fuse"] == ("poly", True)
     assert states(ipsys, log)["poly", "fuse"]["state"] == "current"
     done = ipsys("verify", log)
-    assert (done.code, "detect is not verified: /cameras/" in done.err) == (0, True)
+    assert (done.code, "detect is not verified: its input /cameras/" in done.err) == (0, True)
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
 
 

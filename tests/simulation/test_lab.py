@@ -205,7 +205,7 @@ def test_robots_stay_in_view_and_within_their_speed(markers: int) -> None:
         ({"exposure_s": 2.0}, "exposure_s is 2.0; give a value between 0 and 1"),
         ({"noise_sigma": float("nan")}, "noise_sigma is nan"),
         ({"black": 210.0}, r"black \(210\) must be below white"),
-        ({"cameras": ("red", "red")}, "two cameras of one name"),
+        ({"cameras": ("red", "red")}, "two cameras have the same name"),
         ({"cameras": ("Red",)}, "camera name 'Red'"),
         ({"cameras": ()}, "name at least one camera"),
         ({"heights_m": ()}, "heights_m is empty"),
@@ -223,7 +223,7 @@ def test_a_lab_that_cannot_be_built_says_why() -> None:
     with pytest.raises(IpsysError, match="'red' cannot see its part of the floor"):
         mount_cameras(LabSettings(mount_height_m=1.5))
     crowded = LabSettings(markers=60, marker_length_m=0.5)
-    with pytest.raises(IpsysError, match="no room for marker"):
+    with pytest.raises(IpsysError, match="has no room beside"):
         plan_points(crowded, mount_cameras(LabSettings()))
 
 

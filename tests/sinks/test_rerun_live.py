@@ -51,16 +51,16 @@ def test_missing_screen_is_reported_before_the_recording(lab: Path, monkeypatch:
         monkeypatch.delenv(name, raising=False)
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
-        with pytest.raises(IpsysError, match="no screen"):
+        with pytest.raises(IpsysError, match="needs a screen"):
             LiveView(rig, session.images, None, print)
 
 
 def test_viewer_failure_is_reported_with_its_reason(lab: Path) -> None:
     def broken(feed: Callable[[Write], None]) -> None:
-        raise IpsysError("the viewer could not be shown")
+        raise IpsysError("the viewer cannot be shown")
 
     said: list[str] = []
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
         LiveView(rig, session.images, None, said.append, broken).consume(iter([]))
-    assert said == ["the viewer could not be shown"]
+    assert said == ["the viewer cannot be shown"]

@@ -210,4 +210,4 @@ def test_a_method_needs_markers(ipsys: Ipsys, tmp_path: Path) -> None:
         write_log(less, session.messages(topics))
     done = ipsys("replay", less, "--method", "pose")
     assert done.code == 1
-    assert "--method pose: cannot take effect, the log has no markers" in done.err
+    assert "--method pose: has no effect, because the log has no markers" in done.err

@@ -74,20 +74,20 @@ def test_three_distances_need_no_side_and_check_one_another(world_m: tuple[float
     read = tape(world_m, THREE)
     wrong = replace(read, distances={**read.distances, "C": f"{float(read.distances['C']) + 30:.1f}"})
     said = check(wrong, THREE)
-    assert any("contradict one another" in text for text in said.warnings) or said.faults
+    assert any("contradict each other" in text for text in said.warnings) or said.faults
 
 
 def test_two_tapes_that_cannot_meet() -> None:
     checked = check(TypedEntry("0", {"A": "40", "B": "50"}, "left", "0"))
     assert checked.measurement is None
-    said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm"
+    said = "distance to A = 40 cm and distance to B = 50 cm do not meet, because A to B is 243.8 cm"
     assert checked.faults[0].text == f"{said}; read both again"
     # The fault is not the side, so it is reported before the question for the side.
     unsided = check(TypedEntry("0", {"A": "40", "B": "50"}, "", "0"))
-    assert any("no triangle" in fault.text for fault in unsided.faults)
+    assert any("do not meet" in fault.text for fault in unsided.faults)
     # The height is not needed either.
     alone = check(TypedEntry("0", {"A": "40", "B": "50"}))
-    assert any("no triangle" in fault.text for fault in alone.faults)
+    assert any("do not meet" in fault.text for fault in alone.faults)
 
 
 def test_missing_side_gives_both_points() -> None:
@@ -102,7 +102,7 @@ def test_point_outside_the_floor_names_the_side_inside() -> None:
     narrow = replace(RIG, floor=replace(labs.RIG.floor, depth_m=3.0))  # type: ignore[type-var]
     checked = check(tape((1.0, 1.0, 0.0), side="left"), narrow)
     assert checked.on_floor is False
-    assert "outside of the floor; on the right it would lie on it" in checked.warnings[0]
+    assert "outside of the floor; with side right, it is on the floor" in checked.warnings[0]
     assert checked.measurement is not None
 
 
@@ -118,7 +118,7 @@ def test_a_marker_that_no_camera_sees_or_that_moves() -> None:
     assert unseen.point_m is not None
     moving = MarkerObservations(0, None, {}, ("red",))
     checked = check_entry(*parse_entry(tape((1.0, 4.0, 0.0)), RIG), RIG, moving, [])
-    assert checked.faults[0].text == "marker 0 moves, as seen by red: wait until it lies still"
+    assert checked.faults[0].text == "marker 0 moves, as seen by red: wait until it stops"
 
 
 def test_ids_count_up_and_undo_withdraws() -> None:
@@ -129,7 +129,7 @@ def test_ids_count_up_and_undo_withdraws() -> None:
     assert (gone.withdraws, gone.timestamp) == ("p001", first.timestamp)
     assert next_id([first, gone]) == "p002"
     for history in ([first, gone], []):
-        with pytest.raises(IpsysError, match="no measurement p001 to withdraw"):
+        with pytest.raises(IpsysError, match="measurement p001 cannot be withdrawn"):
             withdrawal_of(history, "p001")
     assert check(tape((1.0, 4.0, 0.0), id="p001"), history=[first, gone]).faults[0].field == "id"
 
@@ -138,10 +138,10 @@ def test_repeated_point_gives_a_warning() -> None:
     first = check(tape((1.0, 4.0, 0.0))).measurement
     assert first is not None
     again = check(tape((1.0, 4.0, 0.0)), history=[first])
-    assert "p001 once more" in again.faults[0].text
+    assert "saved already as p001" in again.faults[0].text
     other = check(tape((1.0, 4.01, 0.0)), history=[first])
     assert len(other.warnings) == 1
-    assert other.warnings[0].startswith("marker 0 is measured here already, as p001")
+    assert other.warnings[0].startswith("marker 0 is already measured here, as p001")
     assert check(tape((1.0, 4.0, 0.0)), history=[first, withdrawal_of([first], "p001")]).warnings == ()
 
 
@@ -160,10 +160,10 @@ def known() -> tuple[labs.Camera, Model]:
     ("changed", "said"),
     [
         ({}, None),
-        ({"side": "left"}, "it lies right of the line from A to B, not left?"),
+        ({"side": "left"}, "side right would fit, not left"),
         ({"distances": "swapped"}, "the distances to A and B look exchanged"),
         ({"distances": "A"}, "the distance to A reads"),
-        ({"height": "65"}, "the height reads 0.650 m"),
+        ({"height": "65"}, "the height reads 65.0 cm; 10 cm would fit"),
     ],
 )
 def test_model_finds_the_gross_error(

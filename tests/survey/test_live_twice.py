@@ -51,13 +51,13 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     assert lab.check(PLACE).warnings == ()
     lab.save(PLACE)
     lab.show(4, 0.1)  # so that the two intervals have no common second
-    assert "this is p001 once more" in lab.check(PLACE).faults[0].text
+    assert "saved already as p001" in lab.check(PLACE).faults[0].text
     (text,) = lab.check(BETTER).warnings
-    assert "marker 0 is measured here already, as p001" in text
+    assert "marker 0 is already measured here, as p001" in text
     lab.save(BETTER)
     lab.show(2, 0.1)
     (text,) = lab.check(TypedEntry("0", {"A": "172", "B": "190"}, "left", "10")).warnings
-    assert "as p001 (2.0 cm away), p002 (1.0 cm away)" in text
+    assert "as p001 (2.0 cm from here), p002 (1.0 cm from here)" in text
     for name in ("p001", "p002"):
         lab.scene.add([withdrawal_of(lab.scene.history(), name)])
     assert lab.check(BETTER).warnings == ()
@@ -71,4 +71,4 @@ def test_slightly_moved_marker_is_a_new_point() -> None:
     assert lab.check(BETTER).warnings == ()
     # The marker is back at its point, so the point is the same.
     lab.show(2, 0.1)
-    assert "measured here already" in lab.check(BETTER).warnings[0]
+    assert "already measured here" in lab.check(BETTER).warnings[0]

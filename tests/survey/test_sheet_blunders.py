@@ -95,7 +95,7 @@ def test_sheet_row_that_looks_wrong_is_written_with_force(ipsys: Ipsys, with_mod
         ipsys, log, "measure", log, "--csv", sheet(path, again, time=times(again, log))
     ).splitlines()
     assert "line 2: marker" in lines[1]
-    assert "is measured here already, as p001 (1.0 cm away)" in lines[1]
+    assert "is already measured here, as p001 (1.0 cm from here)" in lines[1]
 
 
 def test_sheet_with_bad_and_doubtful_rows_names_both(ipsys: Ipsys, with_model: Unmeasured) -> None:
@@ -103,7 +103,7 @@ def test_sheet_with_bad_and_doubtful_rows_names_both(ipsys: Ipsys, with_model: U
     rows = [tape[0], swap_distances(tape[1])]
     path = sheet(log.with_name("sheet.csv"), rows, time=["900", *times(rows[1:], log)])
     text = refused(ipsys, log, "measure", log, "--csv", path)
-    assert text.index("line 2: marker 0 does not lie still") < text.index("line 3: the point")
+    assert text.index("line 2: marker 0 is not stationary") < text.index("line 3: the point")
     assert "--force" not in text
     # An impossible row is refused even on request.
     assert "line 2: marker 0" in refused(ipsys, log, "measure", log, "--csv", path, "--force")
@@ -142,7 +142,7 @@ def test_sheet_with_two_rows_swapped_names_both_rows(
         (
             tape((1.0, 4.0, 0.0), THREE, distances={"A": "157.7", "B": "308.1", "C": "400"}),
             THREE,
-            "d_A_cm, d_B_cm and d_C_cm contradict one another by",
+            "d_A_cm, d_B_cm and d_C_cm contradict each other by",
         ),
     ],
 )
@@ -171,8 +171,8 @@ def test_undo_in_the_terminal_asks_for_older_points(
             return [m.id for m in active_measurements(log_now.payloads(log_now.topics(MEASUREMENTS)))]
 
     said = session("u", "", "q")
-    assert "is of an earlier session. Withdraw it? [y/N]" in said
-    assert "nothing is withdrawn" in said
+    assert "is of an earlier one. Withdraw it? [y/N]" in said
+    assert "no measurement is withdrawn" in said
     session("u", "q", "q")
     assert left() == ["p001", "p002"]
     session("u", "y", "q")

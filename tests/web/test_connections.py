@@ -243,7 +243,7 @@ def test_faults_are_printed_when_the_command_ends(capsys: pytest.CaptureFixture[
         faults.add(ExceptionGroup("tasks", [ZeroDivisionError(text)]))
     say_faults(page)
     said = capsys.readouterr().err
-    assert "faults of ipsys in the measuring page: 2" in said
+    assert "internal errors of the measuring page: 2" in said
     assert said.rstrip().endswith("ZeroDivisionError: [first]")
 
 

@@ -70,7 +70,7 @@ def test_every_state_of_the_page_fits_the_screen(
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         browser.open(page.url, size)
-        says(browser, "#sight", "lies still")
+        says(browser, "#sight", "is stationary")
         check_screen(browser)
         browser.type("#d-A", a)
         browser.type("#d-B", "1.234")
@@ -78,7 +78,7 @@ def test_every_state_of_the_page_fits_the_screen(
         check_screen(browser)
         browser.run("document.querySelector('#d-B').value = ''")
         browser.type("#d-B", "0.5")
-        says(browser, "#verdict", "No triangle has the sides")
+        says(browser, "#verdict", "do not meet, because")
         check_screen(browser)
         browser.run("document.querySelector('#d-B').value = ''")
         browser.type("#d-B", b)
@@ -111,7 +111,7 @@ def test_every_state_of_the_page_fits_the_screen(
 def test_desktop_shows_cameras_and_entry_side_by_side(browser: Phone) -> None:
     with serve(Recording(), port=0) as page:
         browser.open(page.url, DESKTOP)
-        says(browser, "#sight", "lies still")
+        says(browser, "#sight", "is stationary")
         seen, entry = browser.run(
             "['#floor', '#form'].map(part => document.querySelector(part).getBoundingClientRect())"
             ".map(box => [box.left, box.right])"
@@ -148,4 +148,4 @@ def test_cookie_of_another_program_does_not_block_a_phone(browser: Phone) -> Non
         browser.open(other)
         browser.open(page.url)
         assert browser.run("location.pathname + location.search") == "/"
-        says(browser, "#sight", "lies still")
+        says(browser, "#sight", "is stationary")

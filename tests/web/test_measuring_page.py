@@ -71,7 +71,7 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still, seen by")
+        says(hand, "#sight", "is stationary, seen by")
         assert hand.run("document.querySelector('#sight').className") == "chip still"
         hand.wait("document.querySelector('#cameras .still polygon.chosen')")
         hand.wait(f"{FETCHED}.filter(name => name.includes('/picture/')).length === 3")
@@ -81,7 +81,7 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         assert hand.run("document.querySelector('#save').disabled")
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", "0.5")
-        says(hand, "#verdict", "No triangle has the sides")
+        says(hand, "#verdict", "do not meet, because")
         assert foreign_read(log) == []
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", b)
@@ -115,7 +115,7 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
         assert scene.model is not None
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still")
+        says(hand, "#sight", "is stationary")
         other = "right" if side == "left" else "left"
         for selector, text in (("#d-A", a), ("#d-B", b), ("#height", height)):
             hand.type(selector, text)
@@ -135,7 +135,7 @@ def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still")
+        says(hand, "#sight", "is stationary")
         fill(hand, a, b, side, height)
         with log.open("r+b") as other:
             fcntl.flock(other, fcntl.LOCK_EX)
@@ -159,11 +159,11 @@ def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeas
     ):
         texts = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still")
+        says(hand, "#sight", "is stationary")
         fill(hand, *texts)
         other.add([Measurement(tape[-1].timestamp, "p001", marker_id=1)])
         save(hand, "p001")
-        says(hand, "#notice", "somebody else measured in this log meanwhile (p001)")
+        says(hand, "#notice", "another program wrote measurements into this log (p001)")
         says(hand, "#places", "p001")
         assert hand.run("document.querySelector('#d-A').value") == texts[0]
         # Without further action, the typed values are checked again, with the other process's entry.
@@ -174,7 +174,7 @@ def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeas
             other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
         other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
         hand.tap("#places li:first-child button")
-        says(hand, "#notice", "somebody else measured in this log meanwhile (p003)")
+        says(hand, "#notice", "another program wrote measurements into this log (p003)")
         hand.wait("document.querySelector('#places button[aria-label=\"Undo p002\"]')")
         hand.tap("#places button[aria-label='Undo p002']")
         says(hand, "#notice", "p002 is withdrawn")
@@ -220,7 +220,7 @@ def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
         scene.seen = False
         says(hand, "#sight", "No camera sees a marker")
         scene.speed_m, scene.seen = 0.0, True
-        says(hand, "#sight", "Marker 0 lies still, seen by red")
+        says(hand, "#sight", "Marker 0 is stationary, seen by red")
         save(hand, "p001")
         says(hand, "#places", "p001 marker 0")
     (saved,) = scene.done
@@ -239,17 +239,17 @@ def test_save_button_shows_the_point_to_save(hand: Phone) -> None:
     scene = Recording()
     with serve(scene, port=0) as page:
         hand.open(page.url)
-        says(hand, "#sight", "Marker 0 lies still")
+        says(hand, "#sight", "Marker 0 is stationary")
         hand.type("#d-A", "152 cm")
         hand.type("#d-B", "40")
         # The side and the height are not needed.
-        says(hand, "#verdict", "No triangle has the sides")
+        says(hand, "#verdict", "do not meet, because")
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", "190")
         hand.wait("document.querySelectorAll('#floor .tape').length === 2")
         hand.tap("#sides label")
         hand.type("#height", "0.1")
-        says(hand, "#verdict", "in metres? Then type 10")
+        says(hand, "#verdict", "if it is in metres, type 10")
         hand.type("#height", "5")
         says(hand, "#fault-height", "looks like metres")
         hand.run("document.querySelector('#height').value = ''")
@@ -295,7 +295,7 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
     scene.rig = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, third))
     with serve(scene, port=0) as page:
         hand.open(page.url)
-        says(hand, "#sight", "Marker 0 lies still, seen by red")
+        says(hand, "#sight", "Marker 0 is stationary, seen by red")
         assert hand.run("document.querySelector('#sides').hidden")
         for selector, text in (("#d-A", "170"), ("#d-C", "348"), ("#height", "10")):
             hand.type(selector, text)
@@ -317,7 +317,7 @@ def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmea
         assert hand.run("location.pathname + location.search") == "/"
         for number in range(5):
             says(hand, "#stop", f"interval {number + 1} of")
-            says(hand, "#sight", "lies still")
+            says(hand, "#sight", "is stationary")
             fill(hand, *texts_at(scene, tape, number))
             save(hand, f"p00{number + 1}")
             says(hand, "#places", f"p00{number + 1}")

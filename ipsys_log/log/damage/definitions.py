@@ -45,7 +45,7 @@ class Definitions:
     known: ChunkContents = field(default_factory=ChunkContents)
     _schema_at: dict[int, int] = field(default_factory=dict)  # offset of the definition of each schema
     _sure: Contents | None = None
-    _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels with a right CRC
+    _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels with a valid CRC
     _places: dict[tuple[bool, int], RecordAt] = field(default_factory=dict)  # definitions in no chunk
     _full: int = 0  # number of the first rooms that are full
     _misread: list[mcap.Channel] = field(default_factory=list)
@@ -188,7 +188,7 @@ class Definitions:
             self.schemas.setdefault(schema.id, schema)
 
     def _confirm(self, records: Sequence[mcap.Schema | mcap.Channel]) -> None:
-        """Replace definitions without CRC by definitions with a right CRC; blank the replaced records."""
+        """Replace definitions without CRC by definitions with a valid CRC; blank the replaced records."""
         for record in records:
             key = (isinstance(record, mcap.Schema), record.id)
             defined: dict[int, Any] = self.schemas if key[0] else self.channels
@@ -206,7 +206,7 @@ class Definitions:
             self.free_ranges.append(DamagedRange(record_at.offset, record_at.length))
 
     def is_foreign(self, offset: int, inside: ChunkContents) -> bool:
-        """Return whether a chunk with a right CRC defines an id of this log differently."""
+        """Return whether a chunk with a valid CRC defines an id of this log differently."""
         if offset in self._strange:
             return True
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]

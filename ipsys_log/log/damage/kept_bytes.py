@@ -77,8 +77,8 @@ def check_room(path: Path, change: Change) -> None:
     free = shutil.disk_usage(_beside(path, "").parent).free
     if free < needed:
         raise LogError(
-            f"{path} cannot be repaired: a file beside it must keep the {format_bytes(old)} taken out. "
-            f"That needs {format_bytes(needed)}, but {format_bytes(free)} are free: free some space"
+            f"{path} cannot be repaired: a second file must keep the removed {format_bytes(old)}. "
+            f"This needs {format_bytes(needed)}, but only {format_bytes(free)} are free: free some space"
         )
 
 

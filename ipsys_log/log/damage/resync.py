@@ -264,7 +264,7 @@ class Resync:
         view = self.view
         self.budget -= record.length
         if self.budget < 0:
-            raise view.fault(record.offset, "too many of its bytes look like chunks and are none")
+            raise view.fault(record.offset, "too many of its bytes look like chunks, but are not chunks")
         parse_chunk_contents(
             view, record.offset, unpack(view, record.offset, parse_chunk_head(view, record.offset)[1])
         )

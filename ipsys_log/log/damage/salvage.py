@@ -41,7 +41,7 @@ Rows = Mapping[int, list[tuple[int, int]]]  # by channel id: log time in ns, off
 class _Records(NamedTuple):
     """The records of a damaged chunk, as far as they can be decoded.
 
-    `checked` says that all records are present with a right CRC, `is_wrong` that all are present with a
+    `checked` says that all records are present with a valid CRC, `is_wrong` that all are present with a
     wrong CRC. `ends_early` says that the rest is missing, or cannot be decoded. `size` is the stated size
     of the chunk in bytes.
     """
@@ -183,14 +183,15 @@ def _note(damaged_range: DamagedRange, records: _Records, count: int, *, complet
     chunk_text = f"the chunk at byte {damaged_range.offset} ({records.span})"
     if records.checked:
         return (
-            f"all {count} messages of {chunk_text} were copied: its CRC is right, but it cannot stay in place"
+            f"all {count} messages of {chunk_text} were copied: the chunk has a valid CRC, but "
+            "cannot stay in place"
         )
     if count:
         count_text = "all" if complete else "the first"
         return f"{count_text} {count} messages of {chunk_text} were saved; their CRC cannot be checked"
     if records.ends_early or not records.data:
-        return f"{chunk_text} holds no message that can be read"
-    return f"{chunk_text}: an unknown one of its messages is damaged, so that none was saved"
+        return f"{chunk_text} has no readable message"
+    return f"{chunk_text}: one of its messages is damaged, but it is unknown which, so none was saved"
 
 
 def _records_of(view: View, damaged_range: DamagedRange) -> _Records | None:

@@ -163,7 +163,7 @@ def _take(findings: Survey, record: RecordAt) -> None:
     indexed = findings.indexed
     is_among = indexed is not None and indexed.inside is not None and not indexed.is_complete
     if record.opcode == Opcode.MESSAGE and is_among and findings.resync.chunked:
-        raise view.fault(record.offset, "a message lies among the message indexes of a chunk")
+        raise view.fault(record.offset, "a message is among the message indexes of a chunk")
     if indexed is not None:
         close_indexes(findings, record.offset)
     if record.opcode == Opcode.DATA_END and record.length == DATA_END.size:
@@ -176,7 +176,7 @@ def _take(findings: Survey, record: RecordAt) -> None:
     elif record.opcode in UNCHUNKED:
         _take_unchunked(findings, record)
     elif record.opcode < PRIVATE:
-        raise view.fault(record.offset, f"a record of type {record.opcode} has no place there")
+        raise view.fault(record.offset, f"a record of type {record.opcode} is not allowed there")
     else:
         _check_length(findings, record)
 
@@ -256,7 +256,7 @@ def _has_lost_chunk_heads(findings: Survey) -> bool:
 def _take_chunk(findings: Survey, record: RecordAt) -> None:
     view = findings.view
     if findings.resync.chunked is False:
-        raise view.fault(record.offset, "a chunk lies in a log that has its messages outside of chunks")
+        raise view.fault(record.offset, "a chunk is in a log that has its messages outside of chunks")
     head = parse_chunk_head(view, record.offset)[1]
     data = unpack(view, record.offset, head)
     inside = parse_chunk_contents(view, record.offset, data)
@@ -321,7 +321,7 @@ def _take_index(findings: Survey, record: RecordAt) -> None:
     """Add a MessageIndex record to the chunk, or to the damaged range, before it."""
     indexed = findings.indexed
     if findings.resync.chunked is False:
-        raise findings.view.fault(record.offset, "a MessageIndex record lies in a log without chunks")
+        raise findings.view.fault(record.offset, "a MessageIndex record is in a log without chunks")
     if indexed is None:
         channel, rows = _index_rows(findings.view, record)
         for time_ns, _ in rows:

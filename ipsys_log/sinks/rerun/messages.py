@@ -55,20 +55,18 @@ def rerun_image(
         return _raw_image(frame)
     if isinstance(frame, CompressedVideo):
         if frame.format not in _CODECS:
-            raise ValueError(f"video format {frame.format!r} is not drawn (only {', '.join(_CODECS)})")
+            raise ValueError(f"video format {frame.format!r} cannot be drawn (only {', '.join(_CODECS)})")
         return rr.VideoStream(_CODECS[frame.format], sample=frame.data)
     if frame.data[:3] == b"\xff\xd8\xff":
         return rr.EncodedImage(contents=frame.data, media_type="image/jpeg")
     if frame.data[:8] == b"\x89PNG\r\n\x1a\n":
         return rr.EncodedImage(contents=frame.data, media_type="image/png")
-    raise ValueError(
-        f"{len(frame.data)} bytes that are neither JPEG nor PNG ({frame.format or 'no format given'})"
-    )
+    raise ValueError(f"{len(frame.data)} bytes are not a JPEG or PNG ({frame.format or 'no format given'})")
 
 
 def _raw_image(frame: RawImage) -> rr.Image:
     if frame.encoding not in _RAW:
-        raise ValueError(f"pixel encoding {frame.encoding!r} is not drawn (only {', '.join(_RAW)})")
+        raise ValueError(f"pixel encoding {frame.encoding!r} cannot be drawn (only {', '.join(_RAW)})")
     model, channels = _RAW[frame.encoding]
     used = frame.width * channels
     if min(frame.width, frame.height) < 1 or frame.step < used or len(frame.data) < frame.step * frame.height:
@@ -301,7 +299,9 @@ class RerunSink:
     def _robot_colour(self, run: str | None, robot: str) -> tuple[int, int, int]:
         if (run, robot) not in self._robots:
             if len(self._robots) == _MOST_ROBOTS:
-                raise IpsysError(f"the tracks name more than {_MOST_ROBOTS} robots, which cannot be drawn")
+                raise IpsysError(
+                    f"the tracks have more than {_MOST_ROBOTS} robots; the viewer cannot draw so many"
+                )
             self._robots[run, robot] = sum(of_run is not None for of_run, _ in self._robots)
         return TRUTH_COLOUR if run is None else robot_colour(self._robots[run, robot])
 

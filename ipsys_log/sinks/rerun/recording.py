@@ -28,7 +28,7 @@ from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 
 __all__ = ["check_screen", "show_in_viewer", "viewer_command", "write_recording"]
 
-_INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open that where there is a screen"
+_INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open it on a machine with a screen"
 
 
 def viewer_command() -> list[str]:
@@ -51,7 +51,7 @@ def check_screen(environment: Mapping[str, str]) -> None:
     """
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
     if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
-        raise IpsysError(f"there is no screen to open the viewer on; {_INSTEAD}")
+        raise IpsysError(f"the viewer needs a screen, but this machine has none; {_INSTEAD}")
 
 
 def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
@@ -86,7 +86,7 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
             _abandon(viewer.stdin)
             raise
         if viewer.wait() != 0:
-            raise IpsysError(f"the viewer could not be shown ({_last_line(complaints)}); {_INSTEAD}")
+            raise IpsysError(f"the viewer cannot be shown ({_last_line(complaints)}); {_INSTEAD}")
 
 
 def _stop(viewer: subprocess.Popen[bytes]) -> None:
@@ -109,7 +109,7 @@ def _last_line(complaints: IO[bytes]) -> str:
     complaints.seek(0)
     text = re.sub(r"\x1b\[[0-9;]*m", "", complaints.read().decode(errors="replace"))
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "it gave no reason"
+    return lines[-1] if lines else "no reason given"
 
 
 # Frames stay longer than positions: between two calibration points the log may have a gap.
@@ -139,8 +139,8 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
     shown = choose_runs(session, runs)
     if not (shown.frames or shown.moving or session.count(MEASUREMENTS_TOPIC)):
         raise IpsysError(
-            f"{session}: nothing to show: no frames, markers, positions or measured places; "
-            "ipsys info says what it holds"
+            f"{session}: has nothing to show: no frames, markers, positions or calibration points; "
+            "to list its contents: ipsys info"
         )
     if save is None:
         show_in_viewer(lambda write: _stream(session, shown, write))

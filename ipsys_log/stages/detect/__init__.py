@@ -181,8 +181,8 @@ class Detect:
         lens = self._lenses.get(message.camera)
         if lens is None:
             raise IpsysError(
-                f"camera {message.camera} has no calibration in the log, through which edges are fitted: "
-                f"give one with --calibration {message.camera}=calibration.yaml, or use --corners stock"
+                f"camera {message.camera} has no calibration in the log, but the corner method edges needs "
+                f"one: give it with --calibration {message.camera}=calibration.yaml, or use --corners stock"
             )
         row_time_s = (camera.row_time_ns or 0) / NS_PER_S
         number = rig.cameras.index(camera) if camera in rig.cameras else 0
@@ -217,7 +217,7 @@ def check_corners(name: str) -> str:
         There is no such method.
     """
     if name not in CORNERS:
-        raise IpsysError(f"--corners {name}: there is no such method; use one of {', '.join(CORNERS)}")
+        raise IpsysError(f"--corners {name}: is not known; use one of {', '.join(CORNERS)}")
     return name
 
 
@@ -291,8 +291,8 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
     notes = [] if options.get("corners") else [_why_stock(name) for name in without]
     if skipped and not as_live:
         notes.append(
-            f"{len(skipped)} frames that were skipped live are looked at too, which makes another run; "
-            "--as-live passes over them"
+            f"the new run includes {len(skipped)} frames that live processing skipped; --as-live excludes "
+            "them"
         )
     return Plan(
         run=corners,
@@ -310,8 +310,8 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
 
 def _why_stock(camera: str) -> str:
     return (
-        f"camera {camera} has no calibration: corners are found as with --corners stock, ten times less "
-        f"exact than with --calibration {camera}=calibration.yaml"
+        f"camera {camera} has no calibration, so its corners are from --corners stock, ten times less "
+        f"accurate than with --calibration {camera}=calibration.yaml"
     )
 
 

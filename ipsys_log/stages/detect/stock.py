@@ -25,7 +25,8 @@ def marker_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
     index = getattr(cv2.aruco, dictionary, None) if dictionary.startswith("DICT_") else None
     if not isinstance(index, int):
         raise IpsysError(
-            f"the rig's marker dictionary {dictionary!r} is none of OpenCV's, such as DICT_4X4_100"
+            f"the marker dictionary {dictionary!r} of the rig is unknown to OpenCV; use one such as "
+            "DICT_4X4_100"
         )
     parameters = cv2.aruco.DetectorParameters()
     # Bits are read from 8 px per cell instead of 4: this finds more small and tilted markers.

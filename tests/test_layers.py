@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 LAYERS = (
     ("errors",), ("units", "plain_text"), ("messages",), ("geometry", "rig"), ("images",), ("models", "log"),
     ("calibration",), ("analysis",), ("stages",), ("runs",), ("simulation",), ("capture",),
-    ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",), ("api",), ("report",),
+    ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",), ("tracker",), ("api",), ("report",),
     ("web",), ("cli",),
     ("__main__", "__init__"),
 )  # fmt: skip

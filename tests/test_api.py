@@ -22,6 +22,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Position, Positions, RigCamera, Track, Tracks
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS, TRACKS, Channel
 from ipsys_log.rig.file import rig_toml
+from ipsys_log.runs.output import write_log
 from tests.conftest import ROOT
 from tests.test_live import lenses
 
@@ -49,7 +50,7 @@ def test_package_has_the_names_of_the_api() -> None:
 
 
 def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
-    from ipsys_log.api import Tracker
+    from ipsys_log.tracker import Tracker
 
     tracker = Tracker(lambda _: [])
     tracks = [Message("/runs/poly/tracks", n, n, Tracks(n, ())) for n in range(1000)]
@@ -290,3 +291,15 @@ def test_table_of_an_impossible_time_is_one_line(tmp_path: Path) -> None:
         writer.write("/runs/poly/tracks", 2**63 + 1, 5, encode(Tracks(5, ())))
     with ipsys.open(path) as log, pytest.raises(IpsysError, match="later than the year 2262"):
         log.table("tracks", run="poly")
+
+
+def test_table_of_a_small_log_with_many_parts_is_refused(tmp_path: Path) -> None:
+    log = tmp_path / "many.mcap"
+    tracks = Tracks(1, (Track("a", 1, 0.0, 0.0, 0.0),) * 70_000)
+    write_log(log, [Message("/truth/tracks", 1, 1, tracks)])
+    assert log.stat().st_size < 70_000
+    with (
+        ipsys.open(log) as opened,
+        pytest.raises(ipsys.IpsysError, match="more parts than a log of this size"),
+    ):
+        opened.table("truth")

@@ -95,7 +95,7 @@ def add_commands(app: typer.Typer) -> None:
     as_json = everything.pop("as_json")
     app.command(
         "replay",
-        help="Run whatever a log lacks, from detect to fuse, append it, and print how accurate it is.",
+        help="Run the missing stages from detect to fuse, append their results, and print the accuracy.",
     )(build_command({**everything, **_PRINTS, "as_json": as_json}, partial(_derive, None)))
     for number, entry in enumerate(ENTRIES):
         options = {**options_until(entry.name), **{name: _PRINTS[name] for name in entry.prints}}
@@ -136,13 +136,14 @@ def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
     from ipsys_log.runs.options import Request
 
     rig, run = given.pop("rig"), given.pop("run")
+    models, calibration = given.pop("model", None) or (), given.pop("calibration", None)
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
-    further = {name: given.pop(name) for name in [*given] if name not in {*known, "model"}}
+    further = {name: given.pop(name) for name in [*given] if name not in known}
     return {
-        "models": given.pop("model", None) or (),
+        "models": models,
         "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
-        "calibrations": load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
+        "calibrations": load_calibrations(calibration, lambda: cameras_of(logs)),
         "run": check_name(run, "--run") if run else None,
         "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import Column, Columns, read_columns
@@ -113,6 +113,7 @@ def _item_table(
     pd: Any, session: Session, table: _Table, run: str | None, start_ns: int | None, end_ns: int | None
 ) -> pd.DataFrame:
     topics = session.topics(table.channel, run)
+    items = session.part_counter()
     parts: list[dict[str, Any]] = []
     times: list[tuple[int, int]] = []
     cameras: list[str | None] = []
@@ -120,7 +121,10 @@ def _item_table(
 
     def flush() -> None:
         if encoded or not parts:
-            columns = read_columns(schema_name(table.payload), encoded, table.fields)
+            try:
+                columns = read_columns(schema_name(table.payload), encoded, table.fields, items)
+            except LogError as error:
+                raise LogError(f"{session}: {table.channel.name}: {error}") from error
             parts.append(_part(columns, np.array(times, np.int64).reshape(-1, 2), cameras, table))
         times.clear()
         cameras.clear()

@@ -21,6 +21,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import PartCounter
 from ipsys_log.log.codec import proto_class
 
 __all__ = ["Column", "Columns", "read_columns"]
@@ -50,7 +51,9 @@ class Columns:
     fields: dict[str, Column]
 
 
-def read_columns(schema: str, messages: Sequence[bytes], fields: Sequence[str]) -> Columns:
+def read_columns(
+    schema: str, messages: Sequence[bytes], fields: Sequence[str], parts: PartCounter | None = None
+) -> Columns:
     """Read fields of the items in messages.
 
     Parameters
@@ -58,11 +61,12 @@ def read_columns(schema: str, messages: Sequence[bytes], fields: Sequence[str]) 
     schema : name of a schema with one repeated field of messages, such as ``ipsys.v1.Tracks``.
     messages : encoded.
     fields : names of fields of an item: numbers, texts, and lists of these.
+    parts : counts the items, and the texts in their lists.
 
     Raises
     ------
     LogError
-        A message is not valid.
+        A message is not valid, or the messages have more parts than ``parts`` allows.
     """
     kind = _kind_of(schema)
     lengths = np.fromiter(map(len, messages), np.int64, len(messages))
@@ -79,9 +83,11 @@ def read_columns(schema: str, messages: Sequence[bytes], fields: Sequence[str]) 
             if shape is None:
                 break
             fits = shape.fits(data)
+            if parts is not None:
+                parts.take(shape.parts(kind) * int(fits.sum()))
             pieces += shape.read(data[fits], numbers[fits], kind, fields)
             numbers, data = numbers[~fits], data[~fits]
-        pieces += _one_by_one(schema, messages, numbers, kind, fields)
+        pieces += _one_by_one(schema, messages, numbers, kind, fields, parts)
     return _joined(pieces, kind, fields)
 
 
@@ -108,6 +114,10 @@ def _is_list(described: FieldDescriptor) -> bool:
     return bool(
         getattr(described, "label", 0) == FieldDescriptor.LABEL_REPEATED if repeated is None else repeated
     )
+
+
+def _is_list_of_texts(described: FieldDescriptor) -> bool:
+    return described.type == FieldDescriptor.TYPE_STRING and _is_list(described)
 
 
 class _Value(NamedTuple):
@@ -138,6 +148,10 @@ class _Shape:
         # The highest bit of a byte tells whether the number continues.
         lengths = ((data[:, varints] ^ first[varints]) & 0x80 == 0).all(axis=1)
         return np.asarray(same & lengths, dtype=np.bool_)
+
+    def parts(self, kind: _Kind) -> int:
+        """Return the number of items of a message, and of texts in their lists."""
+        return self.items + sum(_is_list_of_texts(kind.by_name[value.field]) for value in self.values)
 
     def read(
         self, data: Bytes, numbers: NDArray[np.int64], kind: _Kind, fields: Sequence[str]
@@ -261,7 +275,12 @@ def _column(described: FieldDescriptor, parts: list[NDArray[Any]] | None) -> NDA
 
 
 def _one_by_one(
-    schema: str, messages: Sequence[bytes], numbers: NDArray[np.int64], kind: _Kind, fields: Sequence[str]
+    schema: str,
+    messages: Sequence[bytes],
+    numbers: NDArray[np.int64],
+    kind: _Kind,
+    fields: Sequence[str],
+    parts: PartCounter | None,
 ) -> list[_Piece]:
     """Read messages of rare shapes with the library of protobuf."""
     pieces = []
@@ -270,6 +289,9 @@ def _one_by_one(
             items = getattr(proto_class(schema).FromString(messages[number]), kind.items)
         except DecodeError as error:
             raise LogError(f"a message is not a valid {schema}: {error}") from error
+        if parts is not None:
+            lists = [name for name in fields if _is_list_of_texts(kind.by_name[name])]
+            parts.take(len(items) + sum(len(getattr(item, name)) for item in items for name in lists))
         for place, item in enumerate(items):
             columns = {name: _value(item, kind.by_name[name]) for name in fields}
             pieces.append(_Piece(np.array([number]), place, columns))

@@ -218,13 +218,13 @@ class Session:
         Raises
         ------
         LogError
-            A channel is not encoded with protobuf.
+            A channel is not encoded with protobuf, or a message is too large.
         """
         for reader in self.readers:
             for topic in topics:
                 if topic in reader.channels and reader.channels[topic].message_encoding != "protobuf":
                     raise LogError(f"{reader.path}: {topic} is not encoded with protobuf")
-        streams = [self._raw(reader, topics, start_ns, end_ns) for reader in self.readers]
+        streams = [self._bounded(reader, topics, start_ns, end_ns) for reader in self.readers]
         raw = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda one: one.log_time_ns)
         for message in raw:
             if max(message.log_time_ns, message.publish_time_ns) >= _LATEST_NS:
@@ -245,6 +245,21 @@ class Session:
     ) -> Iterator[RawMessage]:
         present = [topic for topic in topics if topic in reader.channels]
         return reader.messages(present, start_ns, end_ns) if present else iter(())
+
+    def _bounded(
+        self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[RawMessage]:
+        """Yield messages that are not images, as stored."""
+        most = reader.read_limits.max_structured
+        for raw in self._raw(reader, topics, start_ns, end_ns):
+            if len(raw.data) > most:
+                where = f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns"
+                raise BoundError(f"{where}: {_too_large(raw.data)}")
+            yield raw
+
+    def part_counter(self) -> PartCounter:
+        """Return the counter of the message parts in one reading of all logs."""
+        return PartCounter(sum(reader.read_limits.max_items for reader in self.readers))
 
     def _items(self) -> list[tuple[LogReader, PartCounter]]:
         """Return the logs, each with the limits for one reading."""
@@ -405,9 +420,13 @@ def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: PartC
     if image:
         items.take(_ITEMS_OF_IMAGE)
     elif len(data) > reader.read_limits.max_structured:
-        raise BoundError(f"a message of {len(data)} bytes is refused: only images may be so large")
+        raise BoundError(_too_large(data))
     definition = schema.data if schema.encoding == "ros2msg" else b""
     return decode(schema.name, data, channel.message_encoding, definition, items)
+
+
+def _too_large(data: bytes | memoryview) -> str:
+    return f"a message of {len(data)} bytes is refused: only images may be so large"
 
 
 def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:

@@ -6,11 +6,11 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from ipsys_log.messages.channels import Channel
+from ipsys_log.messages.channels import MODEL, Channel
 from ipsys_log.messages.message import Message
 from ipsys_log.messages.rig import Rig
 
-__all__ = ["Plan", "Progress", "Stage", "Step", "View"]
+__all__ = ["Plan", "Progress", "Stage", "Step", "View", "model_read"]
 
 # A step turns a message into payloads; it is called with the messages in log order.
 Step = Callable[[Message], Iterable[Any]]
@@ -113,3 +113,9 @@ class Stage:
     def channel_for(self, payload: type) -> Channel:
         """Return the channel that the stage writes payloads of a type to."""
         return next(channel for channel in self.writes if payload in channel.payloads)
+
+
+def model_read(_parameters: Mapping[str, str], view: View) -> str:
+    """Return the method of a stage that reads a model: the name of the model, "" without one."""
+    models = view.payloads(MODEL)
+    return models[-1].name if models else ""

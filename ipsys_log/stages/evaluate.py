@@ -32,7 +32,7 @@ from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
-from ipsys_log.messages.stage import Plan, Progress, Stage, View
+from ipsys_log.messages.stage import Plan, Progress, Stage, View, model_read
 from ipsys_log.models.table import CalibrationPoints, min_pairs
 
 __all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
@@ -176,11 +176,6 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
     )
 
 
-def _method(_parameters: Mapping[str, str], view: View) -> str:
-    models = view.payloads(MODEL)
-    return models[-1].name if models else ""
-
-
 STAGE = Stage(
     name="evaluate",
     versions={"evaluate": 1},
@@ -188,6 +183,6 @@ STAGE = Stage(
     writes=(EVALUATION,),
     plan=_plan,
     rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
-    method=_method,
+    method=model_read,
     causal=False,
 )

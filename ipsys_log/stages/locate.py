@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, POSITIONS, RIG
-from ipsys_log.messages.stage import Plan, Stage, View
+from ipsys_log.messages.stage import Plan, Stage, View, model_read
 from ipsys_log.models.table import AppliedModel, reads_height
 
 __all__ = ["STAGE", "Locate"]
@@ -97,11 +97,6 @@ def _plan(view: View, _options: Mapping[str, str]) -> Plan:
     )
 
 
-def _method(_parameters: Mapping[str, str], view: View) -> str:
-    models = view.payloads(MODEL)
-    return models[-1].name if models else ""
-
-
 STAGE = Stage(
     name="locate",
     versions={"locate": 1},
@@ -109,5 +104,5 @@ STAGE = Stage(
     writes=(POSITIONS,),
     plan=_plan,
     rig_part=lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),
-    method=_method,
+    method=model_read,
 )

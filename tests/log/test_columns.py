@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.codec import encode
+from ipsys_log.log.bounds import BoundError, PartCounter
+from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.columns import read_columns
 from ipsys_log.messages import Track, Tracks
 
@@ -77,3 +80,19 @@ def test_more_shapes_than_are_read_together() -> None:
     columns = read_columns("ipsys.v1.Tracks", [encode(one) for one in payloads], ("robot", "id"))
     assert len(columns.message) == 1600
     assert columns.fields["robot"].values.tolist() == [t.robot for one in payloads for t in one.tracks]
+
+
+@pytest.mark.parametrize("cameras", [("red",), ("red", "white")])
+@pytest.mark.parametrize("number", [1, 90])
+def test_parts_are_counted_as_the_codec_counts_them(number: int, cameras: tuple[str, ...]) -> None:
+    """For messages of one shape, and for more shapes than are read together."""
+    track = Track("a", 3, 1.0, 2.0, 3.0, cameras=cameras)
+    names = [("a" * n, "b" * (100 - n)) for n in range(1, number + 1)]
+    data = [encode(Tracks(7, tuple(replace(track, robot=name) for name in pair))) for pair in names]
+    counter, columnar = PartCounter(10_000), PartCounter(10_000)
+    for one in data:
+        decode("ipsys.v1.Tracks", one, items=counter)
+    read_columns("ipsys.v1.Tracks", data, FIELDS, columnar)
+    assert columnar == counter
+    with pytest.raises(BoundError, match="more parts"):
+        read_columns("ipsys.v1.Tracks", data, FIELDS, PartCounter(10_000 - counter.left - 1))

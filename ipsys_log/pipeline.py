@@ -98,7 +98,7 @@ def replay(
     unchecked = list(models) if len(models) > 1 else []
 
     def make(task: Task, session: Session, name: str) -> Iterable[Message]:
-        """Compute a run. Of several models, check that all can be fitted, before the first one is."""
+        """Compute a run. Before the first fit, check that all models can be fitted."""
         if MODEL in task.stage.writes and task.foreign == () and unchecked:
             check_fits(session, request, task.inputs, unchecked)
             unchecked.clear()

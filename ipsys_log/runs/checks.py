@@ -286,7 +286,7 @@ def _check_line(session: Session, train_m: NDArray[np.float64]) -> None:
     beside_m = np.linalg.norm(offsets_m - np.outer(offsets_m @ along, along), axis=1)
     if beside_m.max() < BESIDE_LINE_M:
         raise FitError(
-            f"{session}: the {len(train_m)} measured places lie on one line; measure some beside it"
+            f"{session}: all {len(train_m)} calibration points are on one line; measure some beside it"
         )
 
 
@@ -336,8 +336,7 @@ def _check_models(
                 raise IpsysError(
                     f"--model-from {request.model_from}: its model is for the cameras "
                     f"{', '.join(sorted(fitted))}, but the log has {', '.join(sorted(cameras))}; give a "
-                    "model "
-                    "of these cameras"
+                    "model of these cameras"
                 )
 
 
@@ -352,8 +351,7 @@ def _check_heights(session: Session, request: Request, models: Sequence[str]) ->
                 raise IpsysError(
                     f"{session}: {name} needs the height of {which} above the floor: write marker_height_m "
                     "into lab.toml ('ipsys init lab.toml --from LOG' writes the rig of the log), and "
-                    "give the "
-                    "file with --rig"
+                    "give the file with --rig"
                 )
 
 

@@ -157,3 +157,15 @@ def test_help_imports_no_heavy_library() -> None:
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_pipeline_imports_no_library_that_only_models_need() -> None:
+    """A command without a model, such as record, starts in less than half the time without scikit-learn."""
+    program = (
+        "import sys, ipsys_log.pipeline, ipsys_log.restore, ipsys_log.runs.verify\n"
+        "print(sorted({'sklearn', 'scipy', 'pandas', 'matplotlib'} & sys.modules.keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stdout.strip() == "[]"

@@ -11,8 +11,6 @@ import typer.main
 
 from ipsys_log.cli.app import EXAMPLES, PANELS, app
 from ipsys_log.log.dataset import Session
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
 from tests.conftest import Ipsys
 
 RIG = """name = "lab"
@@ -31,12 +29,10 @@ SIMULATED = '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 320\nheight 
 OPENED = "shows the simulated lab"
 
 
-@pytest.fixture(scope="module")
-def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def fitted(calibration: Path) -> Path:
     """A log with a model of the cameras red, white and black."""
-    path = tmp_path_factory.mktemp("fitted") / "calibration.mcap"
-    replay([lab_log], Request(), output=path)
-    return path
+    return calibration
 
 
 def write_rig(folder: Path, cameras: str) -> Path:

@@ -169,6 +169,23 @@ def detected_lab(detected_log: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
+def replayed_log(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small simulated session with all stages, to be copied before it is changed."""
+
+    def write(folder: Path) -> None:
+        shutil.copy(detected_log, folder / "lab.mcap")
+        replay([folder / "lab.mcap"], Request())
+
+    return make_once(tmp_path_factory, "replayed", write) / "lab.mcap"
+
+
+@pytest.fixture
+def replayed_lab(replayed_log: Path, tmp_path: Path) -> Path:
+    """A copy of the session with all stages."""
+    return Path(shutil.copy(replayed_log, tmp_path / "lab.mcap"))
+
+
+@pytest.fixture(scope="session")
 def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with a model that is fitted to the small simulated session."""
 

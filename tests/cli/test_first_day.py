@@ -244,26 +244,26 @@ def test_a_picture_of_no_kind_is_refused_before_any_work(
     assert not (lab.parent / "floor").exists()
 
 
-def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
+def test_a_picture_is_what_its_name_says(ipsys: Ipsys, detected_lab: Path) -> None:
     begins = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml", "jpg": b"\xff\xd8", "webp": b"RIFF"}
     for kind, magic in begins.items():
-        drawn = [lab.parent / f"{number}.{kind}" for number in (1, 2)]
+        drawn = [detected_lab.parent / f"{number}.{kind}" for number in (1, 2)]
         for path in drawn:
-            done = ipsys("replay", lab, "--model", "rigid", "--plot", path)
+            done = ipsys("replay", detected_lab, "--model", "rigid", "--plot", path)
             assert done.code == 0, done.err
         assert drawn[0].read_bytes().startswith(magic)
         assert drawn[0].read_bytes() == drawn[1].read_bytes()
 
 
 def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
-    ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
+    ipsys: Ipsys, tmp_path: Path, detected_lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The log has three runs. The window has 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
     for model in ("poly", "rigid"):
-        ipsys("replay", lab.name, "--model", model)
-    rows = ipsys("info", lab.name).out.splitlines()
+        ipsys("replay", detected_lab.name, "--model", model)
+    rows = ipsys("info", detected_lab.name).out.splitlines()
     assert max(map(len, rows)) <= 80
     assert [row.strip() for row in rows if row.startswith("/runs/")] == [
         "/runs/edges/",
@@ -272,7 +272,7 @@ def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
     ]
     for name in ("annotations", "camera_points", "markers"):
         assert sum(row.startswith(f"  cameras/black/{name} ") for row in rows) == 1
-    found = json.loads(ipsys("info", lab.name, "--json").out)
+    found = json.loads(ipsys("info", detected_lab.name, "--json").out)
     rates = {topic: row["rate_hz"] for topic, row in found["channels"].items()}
     assert rates["/cameras/red/image"] == pytest.approx(5.0)
     # Of three cameras, each with two frames at a place: 5 steps in 0.22 s.

@@ -19,6 +19,9 @@ from hypothesis import HealthCheck, settings
 # As in the pipeline, and before the import of numpy: small matrices, and one process per core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# A program under test compiles the package once, as after an installation, and not in each process.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 from ipsys_log.capture.video_files import open_video
 from ipsys_log.cli import main
 from ipsys_log.log.dataset import Session
@@ -30,6 +33,7 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 from tests.capture.streams import encode
+from tests.shared_files import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
 # The command line installs handlers for these signals; a test restores them.
@@ -100,12 +104,14 @@ def ipsys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 @pytest.fixture(scope="session")
 def lab_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a small simulated session; tests copy it before a change."""
-    path = tmp_path_factory.mktemp("lab") / "lab.mcap"
     settings = LabSettings(
         width=960, height=540, markers=8, stations=26, frames_per_station=2, rate_hz=5.0, drive_s=1.0
     )
-    write_log(path, simulate(settings))
-    return path
+
+    def write(folder: Path) -> None:
+        write_log(folder / "lab.mcap", simulate(settings))
+
+    return make_once(tmp_path_factory, "lab", write) / "lab.mcap"
 
 
 @pytest.fixture(scope="session")
@@ -114,10 +120,12 @@ def video_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     Tests copy it before a change.
     """
-    folder = tmp_path_factory.mktemp("video")
-    with Session([lab_log]) as session:
-        write_log(folder / "lab.mcap", _with_video(session, folder))
-    return folder / "lab.mcap"
+
+    def write(folder: Path) -> None:
+        with Session([lab_log]) as session:
+            write_log(folder / "lab.mcap", _with_video(session, folder))
+
+    return make_once(tmp_path_factory, "video", write) / "lab.mcap"
 
 
 def _with_video(session: Session, folder: Path) -> Iterator[Message]:
@@ -145,6 +153,50 @@ def lab(lab_log: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
 
 
+@pytest.fixture(scope="session")
+def detected_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small simulated session with its markers and camera points, to be copied before it is changed."""
+
+    def write(folder: Path) -> None:
+        shutil.copy(lab_log, folder / "lab.mcap")
+        replay([folder / "lab.mcap"], Request(), "camera-frame")
+
+    return make_once(tmp_path_factory, "detected", write) / "lab.mcap"
+
+
+@pytest.fixture
+def detected_lab(detected_log: Path, tmp_path: Path) -> Path:
+    """A copy of the session with its markers, for tests of later stages."""
+    return Path(shutil.copy(detected_log, tmp_path / "lab.mcap"))
+
+
+@pytest.fixture(scope="session")
+def replayed_log(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small simulated session with all stages, to be copied before it is changed."""
+
+    def write(folder: Path) -> None:
+        shutil.copy(detected_log, folder / "lab.mcap")
+        replay([folder / "lab.mcap"], Request())
+
+    return make_once(tmp_path_factory, "replayed", write) / "lab.mcap"
+
+
+@pytest.fixture
+def replayed_lab(replayed_log: Path, tmp_path: Path) -> Path:
+    """A copy of the session with all stages."""
+    return Path(shutil.copy(replayed_log, tmp_path / "lab.mcap"))
+
+
+@pytest.fixture(scope="session")
+def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with a model that is fitted to the small simulated session."""
+
+    def write(folder: Path) -> None:
+        replay([lab_log], Request(), output=folder / "calibration.mcap")
+
+    return make_once(tmp_path_factory, "calibration", write) / "calibration.mcap"
+
+
 def data_section(path: Path) -> bytes:
     """Return the bytes before the DataEnd record, which no command may rewrite."""
     whole = path.read_bytes()
@@ -162,14 +214,17 @@ class Unmeasured(NamedTuple):
 @pytest.fixture(scope="session")
 def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Unmeasured:
     """Return the small simulated session without its measurements; tests copy it before a change."""
-    path = tmp_path_factory.mktemp("unmeasured") / "lab.mcap"
+
+    def write(folder: Path) -> None:
+        with Session([lab_log]) as session:
+            topics = [topic for reader in session.readers for topic in reader.channels]
+            messages = session.messages(topics)
+            write_log(folder / "lab.mcap", (m for m in messages if not isinstance(m.payload, Measurement)))
+        replay([folder / "lab.mcap"], Request(), "camera-frame")
+
     with Session([lab_log]) as session:
         tape = session.payloads(session.topics(MEASUREMENTS))
-        topics = [topic for reader in session.readers for topic in reader.channels]
-        messages = session.messages(topics)
-        write_log(path, (m for m in messages if not isinstance(m.payload, Measurement)))
-    replay([path], Request(), "camera-frame")
-    return Unmeasured(path, tape)
+    return Unmeasured(make_once(tmp_path_factory, "unmeasured", write) / "lab.mcap", tape)
 
 
 @pytest.fixture

@@ -30,8 +30,8 @@ RUNS = ("poly", "rigid")
 
 
 @pytest.fixture(scope="module")
-def replayed(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = Path(shutil.copy(lab_log, tmp_path_factory.mktemp("api") / "lab.mcap"))
+def replayed(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = Path(shutil.copy(detected_log, tmp_path_factory.mktemp("api") / "lab.mcap"))
     ipsys.replay(path, models=RUNS)
     return path
 

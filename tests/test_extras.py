@@ -17,7 +17,6 @@ import pytest
 from ipsys_log.extras import LIBRARIES
 from tests.conftest import ROOT
 from tests.test_dependencies import normalize
-from tests.test_live import calibration  # noqa: F401
 
 # Run commands of ipsys where the optional libraries cannot be found, as in the base installation; the
 # libraries that only these need are hidden too.
@@ -74,7 +73,7 @@ def run_without(
 
 
 @pytest.fixture
-def folder(tmp_path: Path, lab_log: Path, calibration: Path) -> Path:  # noqa: F811
+def folder(tmp_path: Path, lab_log: Path, calibration: Path) -> Path:
     """A folder with a rig of simulated cameras, a recording, and the model of another log."""
     (tmp_path / "lab.toml").write_text(RIG + "".join(CAMERA.format(name) for name in ("red", "white")))
     shutil.copy(lab_log, tmp_path / "lab.mcap")

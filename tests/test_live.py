@@ -57,14 +57,6 @@ from tests.playing import SteppedClock, cameras, playing
 RATE_HZ = 6.0
 
 
-@pytest.fixture(scope="session")
-def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log with a fitted model."""
-    path = tmp_path_factory.mktemp("live") / "calibration.mcap"
-    pipeline.replay([lab_log], Request(), output=path)
-    return path
-
-
 def sent(lab: Path) -> dict[str, list[bytes]]:
     """Return the frames of a log by camera."""
     with Session([lab]) as session:

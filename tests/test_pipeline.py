@@ -286,22 +286,21 @@ def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) 
     assert {track.cameras for message in tracks for track in message.tracks} == {(camera,)}
 
 
-def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) -> None:
+def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, replayed_lab: Path) -> None:
     from ipsys_log.log.writer import LogWriter
     from ipsys_log.messages import Measurement
     from ipsys_log.runs.output import write_messages
 
-    ipsys("replay", lab)
-    with Session([lab]) as session:
+    with Session([replayed_lab]) as session:
         withdrawn = next(m for m in session.payloads(["/measurements"]) if "train" in m.splits)
         end_ns = session.end_ns
     withdrawal = Measurement(end_ns, "w1", withdraws=withdrawn.id)
-    with LogWriter.append(lab) as writer:
+    with LogWriter.append(replayed_lab) as writer:
         write_messages(writer, [Message("/measurements", end_ns + 1, end_ns, withdrawal)])
-    stages = stages_of(ipsys, "replay", lab)
+    stages = stages_of(ipsys, "replay", replayed_lab)
     assert stages["camera-frame"] == ("edges", False)
     assert stages["fit"] == ("poly_2", True)
-    with Session([lab]) as session:
+    with Session([replayed_lab]) as session:
         old, new = (session.payloads(session.topics(MODEL, run))[0] for run in ("poly", "poly_2"))
     used = [{pair.measurement for camera in model.cameras for pair in camera.pairs} for model in (old, new)]
     assert used[0] - used[1] == {withdrawn.id}
@@ -358,8 +357,8 @@ def test_an_unlabelled_log_is_split_by_a_recorded_seed(ipsys: Ipsys, lab: Path, 
     assert {run["parameters"]["seed"] for run in runs if run["stage"] == "fit"} == {"0", "1"}
 
 
-def test_errors_against_the_truth_and_against_the_tape(ipsys: Ipsys, lab: Path) -> None:
-    model = json.loads(ipsys("replay", lab, "--model", "rigid", "--json").out)["models"]["rigid"]
+def test_errors_against_the_truth_and_against_the_tape(ipsys: Ipsys, detected_lab: Path) -> None:
+    model = json.loads(ipsys("replay", detected_lab, "--model", "rigid", "--json").out)["models"]["rigid"]
     for errors in model["cameras"].values():
         assert 0 < errors["truth"]["3d"]["mean_cm"] < 4
         assert 0 < errors["3d"]["mean_cm"] < 4

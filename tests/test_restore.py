@@ -27,7 +27,7 @@ from ipsys_log.runs.output import write_message
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from tests.conftest import Ipsys, small_disk
-from tests.test_live import calibration, go_live, recorded, slow  # noqa: F401
+from tests.test_live import go_live, recorded, slow  # noqa: F401
 
 # a limit far above any duration on a busy machine
 LIMIT_S = 240
@@ -102,7 +102,7 @@ LIVE = [("detect", "edges"), ("camera-frame", "edges"), ("locate", "poly"), ("fu
 def test_killed_live_run_is_completed_by_repair(
     ipsys: Ipsys,
     rig: Path,
-    calibration: Path,  # noqa: F811
+    calibration: Path,
     tmp_path: Path,
 ) -> None:
     log = tmp_path / "monday.mcap"
@@ -221,7 +221,7 @@ def _moved(message: Message, end_ns: int) -> Message:
 
 def test_frames_that_were_skipped_stay_skipped(
     lab_log: Path,
-    calibration: Path,  # noqa: F811
+    calibration: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -246,7 +246,7 @@ def test_frames_that_were_skipped_stay_skipped(
 def test_a_full_disk_ends_live_with_runs_that_are_signed(
     ipsys: Ipsys,
     rig: Path,
-    calibration: Path,  # noqa: F811
+    calibration: Path,
     tmp_path: Path,
 ) -> None:
     with small_disk(tmp_path / "disk", 12) as disk:

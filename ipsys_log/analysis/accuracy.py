@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ipsys_log.analysis.cross_validation import cross_validate, gather_points
 from ipsys_log.analysis.pairs import level_cameras
@@ -260,5 +259,7 @@ def _squares(
     size = 2 if level or reads_height(name) else 3
     inverse = np.linalg.inv(covariances[:, :size, :size])
     squares = np.einsum("rni,nij,rnj->rn", offsets_m[:, :, :size], inverse, offsets_m[:, :, :size])
+    from scipy.stats import chi2  # late: most commands evaluate nothing, and it takes 1 s
+
     shares: Array = chi2.cdf(squares, size)
     return shares

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi, norm
-
-from ipsys_log.models.poly import regressors
 
 __all__ = ["FEWEST_POINTS", "score", "usual_covariances"]
 
@@ -16,8 +13,9 @@ Array = NDArray[np.float64]
 # alone bends the model.
 FEWEST_POINTS = 15
 # Medians of |x| and of the length of (x, y, z), if x, y and z are normal with a sigma of 1.
-_MEDIAN_1D = float(norm.ppf(0.75))
-_MEDIAN_3D = float(chi.median(3))
+# They are norm.ppf(0.75) and chi.median(3) of scipy.stats, whose import takes 1 s.
+_MEDIAN_1D = 0.6744897501960817
+_MEDIAN_3D = 1.5381722544550522
 # Assumed height of a camera above the middle of its calibration points. Results for 1.5 m or 5 m are nearly
 # the same, because the height only rotates the axes of the usual errors and scales the powers below.
 _EYE_M = 2.0
@@ -136,6 +134,8 @@ def _growth(predicted_m: Array, fitted: NDArray[np.bool_]) -> tuple[Array, int]:
 
     The redundancy is the number of fitted points minus the number of terms.
     """
+    from ipsys_log.models.poly import regressors  # late: scikit-learn takes 1.5 s
+
     centred = predicted_m - predicted_m[fitted].mean(axis=0)
     terms = regressors(centred / np.maximum(np.abs(centred[fitted]).max(axis=0), _LEAST_SPREAD_M))
     _, sizes, axes = np.linalg.svd(terms[fitted], full_matrices=False)

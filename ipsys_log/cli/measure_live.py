@@ -69,6 +69,7 @@ def measure_now(
 
 def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Model | None:
     """Check that these cameras can measure points; return the newest model of the other log, if named."""
+    import ipsys_log.models.poly  # noqa: F401 - the outliers need it, and no frame must wait for it
     from ipsys_log.capture.live_plan import check_model, check_start
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.select import fitted_in

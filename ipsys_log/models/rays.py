@@ -11,12 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import intersect_height
-from ipsys_log.models.rigid import rigid_transform
 
 __all__ = ["CalibrationPoints", "CameraRays", "directions", "fit_rays", "group_cameras"]
 
@@ -110,6 +107,12 @@ def group_cameras(cameras: Sequence[CalibrationPoints]) -> list[list[int]]:
 
 
 def _fit_group(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
+    # Late: most commands fit nothing, and scipy and scikit-learn take 1.5 s.
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    from ipsys_log.models.rigid import rigid_transform
+
     starts = [rigid_transform(places.points_m, places.world_m) for places in cameras]
     weights = _weights([name for places in cameras for name in places.names])
     first = np.concatenate([np.concatenate([np.zeros(3), t, np.zeros(3)]) for _, t in starts])

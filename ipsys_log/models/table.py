@@ -11,16 +11,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.pipeline import Pipeline
 
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraModel
-from ipsys_log.models.ann import NeuralNetwork
-from ipsys_log.models.kriging import Kriging
-from ipsys_log.models.poly import PolynomialRegression
-from ipsys_log.models.ray_models import RayDepth, RayPlane
 from ipsys_log.models.rays import CalibrationPoints, group_cameras
-from ipsys_log.models.rigid import RigidTransform
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 __all__ = [
@@ -39,20 +33,64 @@ __all__ = [
     "restore",
 ]
 
+
+def _rigid() -> Any:
+    from ipsys_log.models.rigid import RigidTransform
+
+    return RigidTransform()
+
+
+def _poly() -> Any:
+    from ipsys_log.models.poly import PolynomialRegression
+
+    return PolynomialRegression()
+
+
+def _ann() -> Any:
+    from ipsys_log.models.ann import NeuralNetwork
+
+    return NeuralNetwork()
+
+
+def _kriging(noisy: bool = False) -> Any:
+    from ipsys_log.models.kriging import Kriging
+
+    return Kriging(noisy=noisy)
+
+
+def _ray_plane() -> Any:
+    from ipsys_log.models.ray_models import RayPlane
+
+    return RayPlane()
+
+
+def _ray_depth() -> Any:
+    from ipsys_log.models.ray_models import RayDepth
+
+    return RayDepth()
+
+
+def _after_rigid(name: str, second: Any) -> Any:
+    from sklearn.pipeline import Pipeline
+
+    return Pipeline([("rigid", _rigid()), (name, second)])
+
+
+# Each function imports its model late: scikit-learn takes 1.5 s, and most commands use no model.
 # First the models of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR.
 # In a hybrid, the output of the first model is the input of the second.
 MODELS: dict[str, Callable[[], Any]] = {
-    "rigid": RigidTransform,
-    "poly": PolynomialRegression,
-    "rigid+poly": lambda: _after_rigid("poly", PolynomialRegression()),
-    "ann": NeuralNetwork,
-    "rigid+ann": lambda: _after_rigid("ann", NeuralNetwork()),
-    "kriging": Kriging,
-    "rigid+kriging": lambda: _after_rigid("kriging", Kriging()),
-    "kriging-regression": lambda: Kriging(noisy=True),
-    "rigid+kriging-regression": lambda: _after_rigid("kriging-regression", Kriging(noisy=True)),
-    "rayplane": RayPlane,
-    "best": RayDepth,
+    "rigid": _rigid,
+    "poly": _poly,
+    "rigid+poly": lambda: _after_rigid("poly", _poly()),
+    "ann": _ann,
+    "rigid+ann": lambda: _after_rigid("ann", _ann()),
+    "kriging": _kriging,
+    "rigid+kriging": lambda: _after_rigid("kriging", _kriging()),
+    "kriging-regression": lambda: _kriging(noisy=True),
+    "rigid+kriging-regression": lambda: _after_rigid("kriging-regression", _kriging(noisy=True)),
+    "rayplane": _ray_plane,
+    "best": _ray_depth,
 }
 
 # The versions of the parts of models; one rises by one with each change of the fitted parameters.
@@ -65,10 +103,6 @@ MODEL_VERSIONS = {
     "rayplane": 1,
     "best": 1,
 }
-
-
-def _after_rigid(name: str, second: Any) -> Pipeline:
-    return Pipeline([("rigid", RigidTransform()), (name, second)])
 
 
 def create(name: str) -> Any:
@@ -122,7 +156,7 @@ def fit_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> dict[str
         The calibration points do not determine a model. The text names the camera.
     """
     models = {camera: create(name) for camera in cameras}
-    if (fit_jointly := getattr(MODELS[name], "fit_jointly", None)) is not None:
+    if (fit_jointly := getattr(create(name), "fit_jointly", None)) is not None:
         return dict(zip(models, fit_jointly([*models.values()], [*cameras.values()]), strict=True))
     for camera, places in cameras.items():
         try:
@@ -135,7 +169,7 @@ def fit_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> dict[str
 def group_dependent_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> list[list[str]]:
     """Return groups of cameras whose models depend on common calibration points."""
     names = list(cameras)
-    if not hasattr(MODELS[name], "fit_jointly"):
+    if not hasattr(create(name), "fit_jointly"):
         return [[camera] for camera in names]
     return [[names[i] for i in group] for group in group_cameras(list(cameras.values()))]
 
@@ -179,9 +213,8 @@ def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
 
 
 def _steps(estimator: Any) -> list[tuple[str, Any]]:
-    if isinstance(estimator, Pipeline):
-        return [(f"{name}.", step) for name, step in estimator.steps]
-    return [("", estimator)]
+    steps = getattr(estimator, "steps", None)  # of a scikit-learn Pipeline
+    return [("", estimator)] if steps is None else [(f"{name}.", step) for name, step in steps]
 
 
 Array = NDArray[np.float64]

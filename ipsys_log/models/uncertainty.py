@@ -15,8 +15,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.spatial import ConvexHull, QhullError
 
 __all__ = ["Predict", "Uncertainty", "Volume", "estimate_uncertainty", "leverage_terms"]
 
@@ -203,6 +201,8 @@ def _noise(residuals: Array, known: Array, slopes: Array, wide: Array) -> tuple[
         usual = ((logs - _USUAL_NOISE) / _NOISE_SPREAD) ** 2
         return float(np.linalg.slogdet(covariances)[1].sum() + squares.sum() + usual.sum()) / 2
 
+    from scipy.optimize import minimize  # late: most commands fit nothing, and it takes 0.5 s
+
     optimum = minimize(cost, _USUAL_NOISE, method="Nelder-Mead", options={"xatol": 1e-2, "fatol": 1e-2})
     return float(optimum.fun), *np.exp(optimum.x).tolist()
 
@@ -231,6 +231,8 @@ class Volume:
     """
 
     def __init__(self, points_m: Array, world_m: Array) -> None:
+        from scipy.spatial import ConvexHull, QhullError  # late: most commands need no hull
+
         try:
             self._edges: Array | None = ConvexHull(points_m[:, :2]).equations
         except (QhullError, ValueError):

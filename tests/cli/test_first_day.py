@@ -11,8 +11,6 @@ import typer.main
 
 from ipsys_log.cli.app import EXAMPLES, PANELS, app
 from ipsys_log.log.dataset import Session
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
 from tests.conftest import Ipsys
 
 RIG = """name = "lab"
@@ -31,12 +29,10 @@ SIMULATED = '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 320\nheight 
 OPENED = "shows the simulated lab"
 
 
-@pytest.fixture(scope="module")
-def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def fitted(calibration: Path) -> Path:
     """Return a log with a model of the cameras red, white and black."""
-    path = tmp_path_factory.mktemp("fitted") / "calibration.mcap"
-    replay([lab_log], Request(), output=path)
-    return path
+    return calibration
 
 
 def write_rig(folder: Path, cameras: str) -> Path:
@@ -252,26 +248,26 @@ def test_figure_without_a_valid_suffix_is_refused_first(
     assert not (lab.parent / "floor").exists()
 
 
-def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
+def test_a_picture_is_what_its_name_says(ipsys: Ipsys, detected_lab: Path) -> None:
     begins = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml", "jpg": b"\xff\xd8", "webp": b"RIFF"}
     for kind, magic in begins.items():
-        drawn = [lab.parent / f"{number}.{kind}" for number in (1, 2)]
+        drawn = [detected_lab.parent / f"{number}.{kind}" for number in (1, 2)]
         for path in drawn:
-            done = ipsys("replay", lab, "--model", "rigid", "--plot", path)
+            done = ipsys("replay", detected_lab, "--model", "rigid", "--plot", path)
             assert done.code == 0, done.err
         assert drawn[0].read_bytes().startswith(magic)
         assert drawn[0].read_bytes() == drawn[1].read_bytes()
 
 
 def test_info_has_one_line_per_channel_and_no_event_rates(
-    ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
+    ipsys: Ipsys, tmp_path: Path, detected_lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The log has three runs, and the window has 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
     for model in ("poly", "rigid"):
-        ipsys("replay", lab.name, "--model", model)
-    rows = ipsys("info", lab.name).out.splitlines()
+        ipsys("replay", detected_lab.name, "--model", model)
+    rows = ipsys("info", detected_lab.name).out.splitlines()
     assert max(map(len, rows)) <= 80
     assert [row.strip() for row in rows if row.startswith("/runs/")] == [
         "/runs/edges/",
@@ -280,7 +276,7 @@ def test_info_has_one_line_per_channel_and_no_event_rates(
     ]
     for name in ("annotations", "camera_points", "markers"):
         assert sum(row.startswith(f"  cameras/black/{name} ") for row in rows) == 1
-    found = json.loads(ipsys("info", lab.name, "--json").out)
+    found = json.loads(ipsys("info", detected_lab.name, "--json").out)
     rates = {topic: row["rate_hz"] for topic, row in found["channels"].items()}
     assert rates["/cameras/red/image"] == pytest.approx(5.0)
     # Three cameras with two frames at each point: 5 steps in 0.22 s.

@@ -33,8 +33,9 @@ def with_smoothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def log(lab_log: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
+def log(detected_lab: Path) -> Path:
+    """A log with its markers: the tests of later stages need not detect them again."""
+    return detected_lab
 
 
 def names(until: str | None) -> list[str]:
@@ -115,11 +116,11 @@ def test_parameter_of_an_added_stage_makes_another_run(log: Path, with_smoothing
 
 
 def test_row_of_an_added_stage_does_not_change_the_others(
-    log: Path, lab_log: Path, tmp_path: Path, with_smoothing: None, monkeypatch: pytest.MonkeyPatch
+    log: Path, detected_log: Path, tmp_path: Path, with_smoothing: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     replay([log], Request())
     monkeypatch.undo()
-    plain = Path(shutil.copy(lab_log, tmp_path / "plain.mcap"))
+    plain = Path(shutil.copy(detected_log, tmp_path / "plain.mcap"))
     replay([plain], Request())
     with Session([log]) as ours, Session([plain]) as theirs:
         topics = ["/runs/poly/tracks", "/runs/poly/poses", "/runs/edges/cameras/red/markers"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log import pipeline
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
@@ -25,8 +26,10 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, RIG, RUN_EVENTS
 from ipsys_log.rig.file import load_rig
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log, write_messages
 from tests.conftest import ROOT, Ipsys
+from tests.shared_files import make_once
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 
@@ -35,6 +38,23 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 def paper(tmp_path: Path) -> Path:
     """Write the paper's layout without frames: its markers are in run ``edges``."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
+
+
+@pytest.fixture(scope="session")
+def replayed_paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with all stages, to be copied before it is changed."""
+
+    def write(folder: Path) -> None:
+        shutil.copy(PAPER, folder / "paper.mcap")
+        pipeline.replay([folder / "paper.mcap"], Request())
+
+    return make_once(tmp_path_factory, "paper", write) / "paper.mcap"
+
+
+@pytest.fixture
+def replayed(replayed_paper: Path, tmp_path: Path) -> Path:
+    """A copy of the paper's layout with all stages."""
+    return Path(shutil.copy(replayed_paper, tmp_path / "paper.mcap"))
 
 
 def runs_of(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
@@ -93,11 +113,10 @@ def test_copied_models_are_used_without_measurements(ipsys: Ipsys, paper: Path, 
     assert runs_of(ipsys, "replay", bare)["fuse"] == ("rigid", False)
 
 
-def test_newest_run_is_found_again(ipsys: Ipsys, paper: Path) -> None:
-    ipsys("replay", paper)
-    made = runs_of(ipsys, "replay", paper, "--run", "again")
+def test_newest_run_is_found_again(ipsys: Ipsys, replayed: Path) -> None:
+    made = runs_of(ipsys, "replay", replayed, "--run", "again")
     assert made["fit"] == made["fuse"] == ("again", True)
-    found = runs_of(ipsys, "replay", paper)
+    found = runs_of(ipsys, "replay", replayed)
     assert {found[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("again", False)}
 
 
@@ -111,28 +130,26 @@ def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path
     assert runs_of(ipsys, "replay", paper, high, low)["fuse"] == ("low", False)
 
 
-def test_run_contains_only_consistent_results(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
-    ipsys("replay", paper)
-    renamed = runs_of(ipsys, "replay", paper, "--rig", robots(tmp_path, paper, "ada"))
+def test_run_contains_only_consistent_results(ipsys: Ipsys, replayed: Path, tmp_path: Path) -> None:
+    renamed = runs_of(ipsys, "replay", replayed, "--rig", robots(tmp_path, replayed, "ada"))
     # Other robots change only fuse, which gets a new run ...
     assert renamed["locate"] == ("poly", False)
     assert renamed["fuse"] == ("poly_2", True)
     # ... without the results of a new model.
-    fewer = runs_of(ipsys, "replay", paper, "--model", "rigid", "--rig", robots(tmp_path, paper, "ada"))
+    fewer = runs_of(ipsys, "replay", replayed, "--model", "rigid", "--rig", robots(tmp_path, replayed, "ada"))
     assert {fewer[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("rigid", True)}
-    with Session([paper]) as session:
+    with Session([replayed]) as session:
         end_ns = session.end_ns
         first = session.payloads(["/measurements"])[0]
         withdrawal = replace(first, timestamp=end_ns, id="w", withdraws=first.id, splits=())
-    with LogWriter.append(paper) as writer:
+    with LogWriter.append(replayed) as writer:
         write_messages(writer, [Message("/measurements", end_ns + 1, end_ns, withdrawal)])
-    again = runs_of(ipsys, "replay", paper)
+    again = runs_of(ipsys, "replay", replayed)
     assert {again[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_3", True)}
 
 
-def test_topics_without_a_record_are_ignored(ipsys: Ipsys, paper: Path) -> None:
-    ipsys("replay", paper)
-    log = without(paper, lambda m: isinstance(m.payload, Run) and m.payload.stage in ("fit", "locate"))
+def test_topics_without_a_record_are_ignored(ipsys: Ipsys, replayed: Path) -> None:
+    log = without(replayed, lambda m: isinstance(m.payload, Run) and m.payload.stage in ("fit", "locate"))
     with Session([log]) as session:
         topics = [t for r in session.readers for t in r.channels if run_of_topic(t) == "poly"]
         before = {t: session.count(t) for t in topics if not t.endswith("/record")}
@@ -142,9 +159,8 @@ def test_topics_without_a_record_are_ignored(ipsys: Ipsys, paper: Path) -> None:
         assert {t: session.count(t) for t in before} == before
 
 
-def test_a_run_that_lost_a_channel_is_not_complete(ipsys: Ipsys, paper: Path) -> None:
-    ipsys("replay", paper)
-    log = without(paper, lambda m: m.topic == "/runs/poly/cameras/red/positions")
+def test_a_run_that_lost_a_channel_is_not_complete(ipsys: Ipsys, replayed: Path) -> None:
+    log = without(replayed, lambda m: m.topic == "/runs/poly/cameras/red/positions")
     made = runs_of(ipsys, "replay", log)
     assert made["evaluate"] == ("poly", False)
     assert made["locate"] == ("poly_2", True)
@@ -170,31 +186,28 @@ def test_one_run_name_for_several_models_is_refused_first(ipsys: Ipsys, paper: P
     assert paper.read_bytes() == before
 
 
-def test_seed_changes_only_the_folds_of_labelled_points(ipsys: Ipsys, paper: Path) -> None:
-    ipsys("replay", paper)
-    made = runs_of(ipsys, "replay", paper, "--seed", 5)
+def test_seed_changes_only_the_folds_of_labelled_points(ipsys: Ipsys, replayed: Path) -> None:
+    made = runs_of(ipsys, "replay", replayed, "--seed", 5)
     assert {stage for stage, (_, new) in made.items() if new} == {"evaluate"}
-    assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--seed", 5).values())
+    assert all(not new for _, new in runs_of(ipsys, "replay", replayed, "--seed", 5).values())
     # The output has the new evaluation, once, with the tracks that are still correct.
-    done = ipsys("replay", paper, "--seed", 5, "--details")
+    done = ipsys("replay", replayed, "--seed", 5, "--details")
     assert done.out.count("(tracks)") == 1
     # The summary has one row, and so has each table of the details.
     assert sum(line.split()[:1] == ["red"] for line in done.out.splitlines()) == 1 + 4
 
 
-def test_model_is_identified_by_content_not_by_file(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
-    ipsys("replay", paper)
-    copy = Path(shutil.copy(paper, tmp_path / "copy.mcap"))
-    drive = without(paper, lambda m: m.topic.startswith("/runs/poly") or m.topic == "/measurements")
-    assert runs_of(ipsys, "replay", drive, "--model-from", paper)["fit"] == ("poly", True)
+def test_model_is_identified_by_content_not_by_file(ipsys: Ipsys, replayed: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copy(replayed, tmp_path / "copy.mcap"))
+    drive = without(replayed, lambda m: m.topic.startswith("/runs/poly") or m.topic == "/measurements")
+    assert runs_of(ipsys, "replay", drive, "--model-from", replayed)["fit"] == ("poly", True)
     assert runs_of(ipsys, "replay", drive, "--model-from", copy)["fit"] == ("poly", False)
     done = ipsys("replay", drive, "--model-from", drive)
     assert done.code == 1
     assert "is the same log" in done.err
 
 
-def test_a_model_of_other_cameras_is_refused(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
-    ipsys("replay", paper)
+def test_a_model_of_other_cameras_is_refused(ipsys: Ipsys, replayed: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     with Session([PAPER]) as session:
         topics = [t for r in session.readers for t in r.channels if "/cameras/" in t or t == "/rig"]
@@ -209,7 +222,7 @@ def test_a_model_of_other_cameras_is_refused(ipsys: Ipsys, paper: Path, tmp_path
         )
         last = [Message("/runs/stock/record", session.end_ns, 0, replace(record, outputs=outputs))]
         write_log(other, [*renamed, *last])
-    done = ipsys("replay", other, "--model-from", paper)
+    done = ipsys("replay", other, "--model-from", replayed)
     assert done.code == 1
     assert "its model is for the cameras black, red, white, but the log has lab2_black" in done.err
 
@@ -260,16 +273,15 @@ def test_the_rig_of_a_log_is_checked_too(ipsys: Ipsys, paper: Path) -> None:
     assert "/rig: 0.0 m is not a length" in done.err
 
 
-def test_later_rig_does_not_change_earlier_measurements(ipsys: Ipsys, paper: Path) -> None:
-    ipsys("replay", paper)
-    with Session([paper]) as session:
+def test_later_rig_does_not_change_earlier_measurements(ipsys: Ipsys, replayed: Path) -> None:
+    with Session([replayed]) as session:
         rig, end_ns = session.payloads(["/rig"])[0], session.end_ns
         old = session.payloads(session.topics(MODEL, "poly"))[0]
     moved = replace(rig, reference_points=tuple(replace(p, x_m=p.x_m + 0.1) for p in rig.reference_points))
-    with LogWriter.append(paper) as writer:
+    with LogWriter.append(replayed) as writer:
         write_messages(writer, [Message("/rig", end_ns + 1, end_ns + 1, moved)])
-    assert ipsys("replay", paper).code == 0
-    with Session([paper]) as session:
+    assert ipsys("replay", replayed).code == 0
+    with Session([replayed]) as session:
         new = session.payloads(session.topics(MODEL, "poly_2"))[0]
     for one, other in zip(old.cameras, new.cameras, strict=True):
         for p, q in zip(one.parameters, other.parameters, strict=True):
@@ -294,9 +306,8 @@ def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Pat
     assert all(np.isfinite([p.x_m, p.y_m, p.z_m]).all() and abs(p.z_m) < 10 for p in points)
 
 
-def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, lab: Path) -> None:
-    ipsys("replay", lab)
-    with Session([lab]) as session:
+def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, replayed_lab: Path) -> None:
+    with Session([replayed_lab]) as session:
         inputs = list(session.messages([*session.topics(CAMERA_POINTS, "edges"), "/measurements", "/rig"]))
         (model,) = session.messages(session.topics(MODEL, "poly"))
     assert (model.log_time_ns, model.publish_time_ns) == (inputs[-1].log_time_ns, inputs[-1].publish_time_ns)
@@ -336,15 +347,14 @@ def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path
     assert "no measurements" in ipsys("replay", drive, "--model", "rigid").err
 
 
-def test_rig_of_a_log_can_be_exported_edited_and_used(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+def test_rig_of_a_log_can_be_exported_edited_and_used(ipsys: Ipsys, replayed: Path, tmp_path: Path) -> None:
     path = tmp_path / "mended.toml"
-    ipsys("replay", paper)
-    assert ipsys("init", path, "--from", paper).code == 0
-    assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--rig", path).values())
+    assert ipsys("init", path, "--from", replayed).code == 0
+    assert all(not new for _, new in runs_of(ipsys, "replay", replayed, "--rig", path).values())
     path.write_text(path.read_text().replace("marker_length_m = 0.2", "marker_length_m = 0.19"))
-    assert runs_of(ipsys, "replay", paper, "--rig", path)["camera-frame"] == ("edges_2", True)
-    assert "0.19 m" in ipsys("runs", paper).out
-    runs = json.loads(ipsys("runs", paper, "--json").out)
+    assert runs_of(ipsys, "replay", replayed, "--rig", path)["camera-frame"] == ("edges_2", True)
+    assert "0.19 m" in ipsys("runs", replayed).out
+    runs = json.loads(ipsys("runs", replayed, "--json").out)
     lengths = [run["rig"]["marker_length_m"] for run in runs if run["rig"]]
     assert lengths == [0.19]
 

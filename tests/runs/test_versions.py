@@ -22,21 +22,10 @@ from tests.conftest import ROOT, Ipsys
 Rows = dict[tuple[str, str], dict[str, Any]]
 
 
-@pytest.fixture(scope="module")
-def replayed(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
-
-    path = tmp_path_factory.mktemp("versions") / "lab.mcap"
-    shutil.copy(lab_log, path)
-    replay([path], Request())
-    return path
-
-
 @pytest.fixture
-def log(replayed: Path, tmp_path: Path) -> Path:
+def log(replayed_lab: Path) -> Path:
     """A copy of a log with all stages up to fuse."""
-    return Path(shutil.copy(replayed, tmp_path / "lab.mcap"))
+    return replayed_lab
 
 
 def states(ipsys: Ipsys, log: Path) -> Rows:

@@ -13,28 +13,25 @@ from rerun.chunk import RrdReader
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
 from ipsys_log.sinks.rerun.live import LiveView
 
 Write = Callable[[bytes], object]
 
 
-def replayed(lab: Path) -> tuple[list[Message], Session]:
-    replay([lab], Request())
-    session = Session([lab])
+def replayed(log: Path) -> tuple[list[Message], Session]:
+    session = Session([log])
     topics = {t for reader in session.readers for t in reader.channels if "/truth" not in t}
     return [m for m in session.messages(topics) if isinstance(m.payload, CompressedImage | Tracks)], session
 
 
-def test_frames_and_robots_arrive_in_rerun(lab: Path, tmp_path: Path) -> None:
+def test_frames_and_robots_arrive_in_rerun(replayed_log: Path, tmp_path: Path) -> None:
     path = tmp_path / "live.rrd"
 
     def show(feed: Callable[[Write], None]) -> None:
         with path.open("wb") as file:
             feed(file.write)
 
-    messages, session = replayed(lab)
+    messages, session = replayed(replayed_log)
     (rig,) = session.payloads(["/rig"])
     LiveView(rig, session.images, "poly", print, show).consume(iter([*messages, None]))
     # The pipe to a viewer has a table of contents after every part; a file has one.

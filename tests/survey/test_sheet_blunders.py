@@ -48,10 +48,10 @@ def lies_far_from_b(one: Measurement) -> bool:
 
 
 @pytest.fixture
-def with_model(ipsys: Ipsys, unmeasured: Unmeasured, lab: Path) -> Unmeasured:
+def with_model(ipsys: Ipsys, unmeasured: Unmeasured, detected_lab: Path) -> Unmeasured:
     """Return a session without measurements, with the model of another log of the same cameras."""
-    assert ipsys("fit", lab, "--model", "rigid").code == 0
-    assert ipsys("fit", unmeasured.log, "--model-from", lab, "--model", "rigid").code == 0
+    assert ipsys("fit", detected_lab, "--model", "rigid").code == 0
+    assert ipsys("fit", unmeasured.log, "--model-from", detected_lab, "--model", "rigid").code == 0
     return unmeasured
 
 
@@ -111,12 +111,11 @@ def test_sheet_with_bad_and_doubtful_rows_names_both(ipsys: Ipsys, with_model: U
 
 @pytest.mark.parametrize("model", [True, False])
 def test_sheet_with_two_rows_swapped_names_both_rows(
-    ipsys: Ipsys, unmeasured: Unmeasured, lab: Path, model: bool
+    ipsys: Ipsys, unmeasured: Unmeasured, calibration: Path, model: bool
 ) -> None:
     log, tape = unmeasured
     if model:
-        assert ipsys("fit", lab).code == 0
-        assert ipsys("fit", log, "--model-from", lab).code == 0
+        assert ipsys("fit", log, "--model-from", calibration).code == 0
     with open_finished_log(log, Request()) as scene:
         stops = scene.intervals
     seen = [one for one in tape if lies_far_from_b(one) and any(stop.covers(one) for stop in stops)]

@@ -284,6 +284,8 @@ def skipped_frames(events: Iterable[Event]) -> set[int]:
 def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
     if not view.cameras:
         return view.newest(MARKERS)
+    import scipy.special  # noqa: F401 - before the first frame, which must not wait for it
+
     corners = options.get("corners") or usual_corners(view.cameras, view.lenses)
     skipped = skipped_frames(view.payloads(EVENTS))
     as_live = "as_live" in options and bool(skipped)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ipsys_log.messages.channels import Channel
-from ipsys_log.messages.stage import Plan, Stage, Step, View
+from ipsys_log.messages.stage import Plan, Stage, StageView, Step
 from ipsys_log.runs.stream import WiredStage, wire
 
 __all__ = ["wired"]
@@ -21,7 +21,7 @@ def wired(
 ) -> WiredStage:
     """Wire a step to channels; ``inputs`` are the runs of the derived ones."""
 
-    def plan(view: View, options: Mapping[str, str]) -> Plan:
+    def plan(view: StageView, options: Mapping[str, str]) -> Plan:
         raise AssertionError("a stage that is wired by hand is not planned")
 
     stage = Stage(

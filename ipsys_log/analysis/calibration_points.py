@@ -13,7 +13,7 @@ from ipsys_log.analysis.pairs import (
 )
 from ipsys_log.messages import Measurement, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, RIG
-from ipsys_log.messages.stage import View
+from ipsys_log.messages.stage import StageView
 
 __all__ = [
     "find_pairs",
@@ -25,17 +25,17 @@ __all__ = [
 ]
 
 
-def measured(view: View) -> list[RiggedMeasurement]:
+def measured(view: StageView) -> list[RiggedMeasurement]:
     """Return the valid measurements, each with the rig in force when it was measured, or with the view's."""
     return valid_measurements(view.messages(RIG, MEASUREMENTS), view.rig)
 
 
-def find_pairs(view: View, points: list[RiggedMeasurement]) -> dict[str, list[Pair]]:
+def find_pairs(view: StageView, points: list[RiggedMeasurement]) -> dict[str, list[Pair]]:
     """Return the observations of the calibration points by camera."""
     return build_pairs(gather_sightings(view.messages(CAMERA_POINTS)), points)
 
 
-def has_measurements(view: View) -> bool:
+def has_measurements(view: StageView) -> bool:
     """Return whether a measurement was entered and not withdrawn."""
     entered: list[Measurement] = view.payloads(MEASUREMENTS)
     withdrawn = {measurement.withdraws for measurement in entered}
@@ -57,7 +57,7 @@ def held_out_ids(measurements: Iterable[Measurement], options: Mapping[str, str]
     return {m.id for m in measurements if "test" in m.splits or not labelled}
 
 
-def split_parameters(view: View, options: Mapping[str, str]) -> dict[str, str]:
+def split_parameters(view: StageView, options: Mapping[str, str]) -> dict[str, str]:
     """Return the parameters of the split: the label, or the seed if nothing is labelled."""
     labelled = any(m.splits for m in view.payloads(MEASUREMENTS))
     return {"train": options.get("train", "train")} if labelled else {"seed": options.get("seed", "0")}

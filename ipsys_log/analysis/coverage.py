@@ -16,7 +16,7 @@ from ipsys_log.geometry.lenses import in_image
 from ipsys_log.geometry.poses import invert_pose, transform
 from ipsys_log.messages import CameraCalibration, Floor
 
-__all__ = ["Coverage", "MountedCamera", "Overlap", "Patch", "cover_floor", "find_overlaps"]
+__all__ = ["FloorCoverage", "MountedCamera", "Overlap", "Patch", "cover_floor", "find_overlaps"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -65,7 +65,7 @@ class Patch(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Coverage:
+class FloorCoverage:
     """The coverage of the floor by the cameras.
 
     Attributes
@@ -94,7 +94,7 @@ class Coverage:
 
 def cover_floor(
     floor: Floor, cameras: Sequence[MountedCamera], marker_length_m: float, height_m: float
-) -> Coverage:
+) -> FloorCoverage:
     """Compute the coverage of the floor at points about every centimetre.
 
     Parameters
@@ -119,7 +119,7 @@ def cover_floor(
     ground = [_seen(camera, xs_m[rim:-rim], ys_m[rim:-rim], 0.0) for camera in cameras]
     grid = _Grid(xs_m[rim:-rim], ys_m[rim:-rim], step_m)
     fits = grid.from_edge(floor) >= marker_length_m / 2
-    return Coverage(
+    return FloorCoverage(
         floor, height_m, diagonal_m, grid.xs_m, grid.ys_m, whole, fits,
         grid.patches(~np.any(ground, axis=0)),
         grid.patches(fits & ~np.any([*whole.values()], axis=0)),

@@ -22,7 +22,7 @@ from ipsys_log.messages import CameraCalibration
 from ipsys_log.models.rays import directions
 from ipsys_log.models.uncertainty import Predict, Uncertainty, leverage_terms
 
-__all__ = ["FittedCamera", "Plan", "PlannedPlace", "mean_length", "plan_points"]
+__all__ = ["FittedCamera", "MeasurementPlan", "PlannedPlace", "mean_length", "plan_points"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -111,7 +111,7 @@ class PlannedPlace:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class MeasurementPlan:
     """Calibration points to measure, in order, and their effect.
 
     Attributes
@@ -135,7 +135,7 @@ def plan_points(
     tape_m2: Tape,
     radius_m: float,
     count: int,
-) -> Plan:
+) -> MeasurementPlan:
     """Choose the calibration points to measure next.
 
     The heights of the candidates alternate, so the numbers of measurements at all heights are similar.
@@ -199,7 +199,7 @@ def plan_points(
         cameras = tuple(view.camera for view, share in zip(views, shares, strict=True) if share.near[best])
         places.append(PlannedPlace(candidates_m[best], cameras, mean_m, float(np.nanmean(after_m))))
     seen = {view.camera: share.on_floor for view, share in zip(views, shares, strict=True)}
-    return Plan(tuple(places), before_m, after_m, seen)
+    return MeasurementPlan(tuple(places), before_m, after_m, seen)
 
 
 class _Share:

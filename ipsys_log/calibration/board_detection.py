@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.chessboard import find_chessboard
 
-__all__ = ["LEAST_CORNERS", "BoardSighting", "Grey", "View", "find_board", "refine_corners", "view_board"]
+__all__ = [
+    "LEAST_CORNERS",
+    "BoardSighting",
+    "BoardView",
+    "Grey",
+    "find_board",
+    "refine_corners",
+    "view_board",
+]
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -184,7 +192,7 @@ class BoardSighting:
     outline: Array
 
 
-class View(NamedTuple):
+class BoardView(NamedTuple):
     """A sighting, or None; for a chessboard also columns and rows of the largest grid of inner corners."""
 
     sighting: BoardSighting | None
@@ -196,7 +204,7 @@ def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> BoardSigh
     return view_board(name, grey, board, thorough).sighting
 
 
-def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
+def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> BoardView:
     """Detect the board in an image, and the largest grid of a chessboard.
 
     Parameters
@@ -215,12 +223,12 @@ def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
         grey = np.asarray(255 - grey, dtype=np.uint8)
     if board.marker_scale is not None:
         corners = _charuco(grey, board)
-        return View(None if corners is None else _sighting(name, grey, board, *corners))
+        return BoardView(None if corners is None else _sighting(name, grey, board, *corners))
     view = find_chessboard(grey, board.grid, thorough)
     if view.corners is None:
-        return View(None, view.size)
+        return BoardView(None, view.size)
     ids = np.arange(board.columns * board.rows)
-    return View(_sighting(name, grey, board, ids, view.corners.reshape(-1, 2)), view.size)
+    return BoardView(_sighting(name, grey, board, ids, view.corners.reshape(-1, 2)), view.size)
 
 
 def _sighting(name: str, grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> BoardSighting:

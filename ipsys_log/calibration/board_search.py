@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_detection import BoardSighting, Grey, View, view_board
+from ipsys_log.calibration.board_detection import BoardSighting, BoardView, Grey, view_board
 from ipsys_log.calibration.board_size import check_charuco_size, check_chessboard_size, describe_other_board
 from ipsys_log.calibration.chessboard import fits_in
 from ipsys_log.calibration.image_selection import ExcludedSighting
@@ -49,7 +49,7 @@ class ImageView(NamedTuple):
 
     name: str
     size: Size
-    view: View
+    view: BoardView
 
 
 def search_images(
@@ -118,7 +118,7 @@ def search_images(
     )
 
 
-def _reason(view: View, board: Board) -> str:
+def _reason(view: BoardView, board: Board) -> str:
     if view.grid is None:
         return "the board is not found"
     columns, rows = view.grid

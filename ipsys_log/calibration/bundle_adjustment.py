@@ -17,7 +17,7 @@ from ipsys_log.calibration.lens_models import LensModel, project_points, project
 
 __all__ = [
     "Corners",
-    "Fit",
+    "LensFit",
     "Normal",
     "adjust",
     "camera_points",
@@ -63,7 +63,7 @@ class Corners:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class LensFit:
     """The intrinsics (p,), and each board pose in camera coordinates: (f, 3, 3) and (f, 3) in m."""
 
     intrinsics: Array
@@ -90,13 +90,13 @@ class Normal:
     pull_gradient: Array
 
 
-def camera_points(fit: Fit, corners: Corners) -> Array:
+def camera_points(fit: LensFit, corners: Corners) -> Array:
     """Return the corners in camera coordinates, (n, 3) in m."""
     rotated = np.einsum("nij,nj->ni", fit.rotations[corners.image_numbers], corners.board_m)
     return np.asarray(rotated + fit.positions_m[corners.image_numbers])
 
 
-def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
+def residuals(model: LensModel, fit: LensFit, corners: Corners) -> Array:
     """Return the reprojection residuals of the corners, (n, 2) in px."""
     return project_points(model, fit.intrinsics, camera_points(fit, corners)) - corners.pixels
 
@@ -115,12 +115,12 @@ def corner_weights(residuals_px: Array, scale_px: float | None) -> Array:
     return _weights(residuals_px, scale_px)[0]
 
 
-def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) -> float:
+def _cost(model: LensModel, fit: LensFit, corners: Corners, scale_px: float | None) -> float:
     return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.intrinsics**2)
 
 
 def normal_equations(
-    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None
+    model: LensModel, fit: LensFit, corners: Corners, basis: Array, scale_px: float | None
 ) -> Normal:
     """Return the normal equations of a step; ``basis`` (p, q) has the free directions of the intrinsics."""
     points_m = camera_points(fit, corners)
@@ -186,19 +186,19 @@ def _diagonals(matrices: Array) -> Array:
     return np.asarray(matrices * np.eye(matrices.shape[-1]))
 
 
-def _apply_step(fit: Fit, lens_step: Array, pose_steps: Array) -> Fit:
+def _apply_step(fit: LensFit, lens_step: Array, pose_steps: Array) -> LensFit:
     turns = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix()
-    return Fit(fit.intrinsics + lens_step, turns @ fit.rotations, fit.positions_m + pose_steps[:, 3:])
+    return LensFit(fit.intrinsics + lens_step, turns @ fit.rotations, fit.positions_m + pose_steps[:, 3:])
 
 
 def adjust(
     model: LensModel,
-    start: Fit,
+    start: LensFit,
     corners: Corners,
     basis: Array,
     scale_px: float | None,
     most_steps: int = 100,
-) -> Fit:
+) -> LensFit:
     """Minimise the cost near ``start`` by the damped steps of Levenberg and Marquardt; return the fit.
 
     Parameters
@@ -231,13 +231,13 @@ def adjust(
 
 def _try_step(
     model: LensModel,
-    fit: Fit,
+    fit: LensFit,
     corners: Corners,
     basis: Array,
     normal: Normal,
     damping: float,
     scale_px: float | None,
-) -> Fit | None:
+) -> LensFit | None:
     """Return the result of a step, or None if there is none."""
     try:
         lens_step, pose_steps = _solve(normal, damping)

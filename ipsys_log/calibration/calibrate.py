@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import BoardSighting
 from ipsys_log.calibration.board_search import NotSeenError, SearchResult, check_sizes, search_images
-from ipsys_log.calibration.bundle_adjustment import Corners, Fit, camera_points
+from ipsys_log.calibration.bundle_adjustment import Corners, LensFit, camera_points
 from ipsys_log.calibration.image_selection import (
-    Coverage,
     ExcludedSighting,
+    ImageCoverage,
     advise,
     measure_coverage,
     select_images,
@@ -92,7 +92,7 @@ class CalibrationResult:
     spare: tuple[ExcludedSighting, ...]
     unseen: tuple[ExcludedSighting, ...]
     outlier_corners: int
-    coverage: Coverage
+    coverage: ImageCoverage
     notes: tuple[str, ...]
     pixels: Array
     residuals_px: Array
@@ -143,7 +143,7 @@ def _refuse(camera: str, faults: list[str], force: bool) -> None:
             raise IpsysError(f"camera {camera}: {fault}; or use --force")
 
 
-def _start(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
+def _start(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> LensFit:
     try:
         return find_start(model, corners, size_px)
     except np.linalg.LinAlgError as error:
@@ -159,7 +159,7 @@ def _too_similar_error(camera: str) -> IpsysError:
 
 
 def _solve(
-    camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit
+    camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int], start: LensFit
 ) -> SolveResult:
     try:
         solved = solve(model, corners, size_px, start)
@@ -174,7 +174,11 @@ def _solve(
 
 
 def _two_cameras(
-    model: LensModel, start: Fit, corners: Corners, used: list[BoardSighting], size_px: tuple[int, int]
+    model: LensModel,
+    start: LensFit,
+    corners: Corners,
+    used: list[BoardSighting],
+    size_px: tuple[int, int],
 ) -> str:
     names = [sighting.name for sighting in used]
     split = find_two_cameras(model, start, corners, names)
@@ -266,7 +270,7 @@ def _build_result(
     )
 
 
-def _measure_coverage(search: SearchResult, used: list[BoardSighting], solved: SolveResult) -> Coverage:
+def _measure_coverage(search: SearchResult, used: list[BoardSighting], solved: SolveResult) -> ImageCoverage:
     outlines = np.stack([s.outline for s in used])
     points_m = camera_points(solved.fit, solved.corners)
     normals = solved.fit.rotations[:, :, 2]

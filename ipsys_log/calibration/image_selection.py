@@ -15,8 +15,8 @@ from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting
 __all__ = [
     "MAX_IMAGES",
     "NEAR",
-    "Coverage",
     "ExcludedSighting",
+    "ImageCoverage",
     "Selection",
     "advise",
     "group_outlines",
@@ -38,7 +38,7 @@ NEAR = 0.03
 
 
 @dataclass(frozen=True, slots=True)
-class Coverage:
+class ImageCoverage:
     """The coverage of the image and of the board poses by all used corners.
 
     ``share`` is the share of the image (in 8 x 6 cells) with corners, ``empty_sides`` are the sides of the
@@ -60,7 +60,7 @@ def measure_coverage(
     outlines: Array,
     normals: Array | None = None,
     points_m: Array | None = None,
-) -> Coverage:
+) -> ImageCoverage:
     """Return the coverage of the image and of the board poses.
 
     Parameters
@@ -89,7 +89,7 @@ def measure_coverage(
     widest = None
     if points_m is not None:
         widest = float(np.arctan2(np.hypot(points_m[:, 0], points_m[:, 1]), points_m[:, 2]).max())
-    return Coverage(share, empty, tilted, places, widest)
+    return ImageCoverage(share, empty, tilted, places, widest)
 
 
 def group_outlines(outlines: Array, near_px: float) -> NDArray[np.intp]:
@@ -109,7 +109,7 @@ def group_outlines(outlines: Array, near_px: float) -> NDArray[np.intp]:
     return np.array(groups)
 
 
-def advise(coverage: Coverage) -> list[str]:
+def advise(coverage: ImageCoverage) -> list[str]:
     """Return advice on additional images; an empty list if the images are good."""
     lines = []
     if coverage.empty_sides:

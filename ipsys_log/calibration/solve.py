@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle_adjustment import Corners, Fit, adjust, residuals
+from ipsys_log.calibration.bundle_adjustment import Corners, LensFit, adjust, residuals
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.uncertainty import group_similar_images, lens_covariance
 
@@ -49,7 +49,7 @@ _HELD_STEPS = 30
 _ALIKE = 0.02
 
 
-def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
+def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> LensFit:
     """Return the best of the fits from several focal lengths.
 
     Parameters
@@ -72,9 +72,9 @@ def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> 
     return min(best, _best(model, fits, corners), key=lambda fit: fit.cost)
 
 
-def _best(model: LensModel, tried: list[Fit], corners: Corners) -> Fit:
+def _best(model: LensModel, tried: list[LensFit], corners: Corners) -> LensFit:
     """Return the best result of the most promising fits; use only one of several similar fits."""
-    promising: list[Fit] = []
+    promising: list[LensFit] = []
     for fit in sorted(tried, key=lambda fit: fit.cost):
         is_similar = any(
             _near(fit.cost, other.cost) and _near(fit.intrinsics[0], other.intrinsics[0])
@@ -88,19 +88,19 @@ def _near(one: float, other: float) -> bool:
     return abs(one - other) <= _ALIKE * abs(other)
 
 
-def _estimate_poses(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
+def _estimate_poses(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> LensFit:
     """Return a fit with the given focal length, and with the poses that follow from it."""
     lens = np.zeros(len(model.names))
     lens[:4] = focal_px, focal_px, (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
     rays = _rays(model, lens, corners.pixels)
     bounds = [*corners.starts, len(corners.image_numbers)]
     poses = [pose_from_rays(corners.board_m[a:b], rays[a:b]) for a, b in pairwise(bounds)]
-    return Fit(lens, np.stack([r for r, _ in poses]), np.stack([t for _, t in poses]))
+    return LensFit(lens, np.stack([r for r, _ in poses]), np.stack([t for _, t in poses]))
 
 
 def _fit_stages(
-    model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int | None, int], ...]
-) -> Fit:
+    model: LensModel, fit: LensFit, corners: Corners, plan: tuple[tuple[int | None, int], ...]
+) -> LensFit:
     """Fit in stages with more and more free intrinsics; ``plan`` has their number and the number of steps."""
     basis = fitted_basis(model, square=True)
     for unknowns, steps in plan:
@@ -108,7 +108,7 @@ def _fit_stages(
     return fit
 
 
-def _fit_distortion(model: LensModel, fit: Fit, corners: Corners) -> Fit:
+def _fit_distortion(model: LensModel, fit: LensFit, corners: Corners) -> LensFit:
     """Fit all parameters except the focal length."""
     basis = fitted_basis(model, square=True)
     return adjust(
@@ -207,7 +207,7 @@ class SolveResult:
     """
 
     model: LensModel
-    fit: Fit
+    fit: LensFit
     covariance: Array
     corners: Corners
     image_numbers: NDArray[np.intp]
@@ -219,7 +219,7 @@ class SolveResult:
 
 
 def solve(
-    model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None
+    model: LensModel, corners: Corners, size_px: tuple[int, int], start: LensFit | None = None
 ) -> SolveResult:
     """Estimate the intrinsics from corners of a board in several images.
 
@@ -249,13 +249,13 @@ def solve(
 class _Purged(NamedTuple):
     """A fit without outliers, with its corners and images, and the images that were left out."""
 
-    fit: Fit
+    fit: LensFit
     corners: Corners
     image_numbers: NDArray[np.intp]
     excluded: tuple[ExcludedImage, ...]
 
 
-def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purged:
+def _purge(model: LensModel, fit: LensFit, corners: Corners, square: bool) -> _Purged:
     """Fit, leave out outliers, and fit again, until there are no outliers."""
     basis, numbers, all_excluded = fitted_basis(model, square), np.arange(corners.image_count), []
     for _ in range(_MOST_ROUNDS):
@@ -266,11 +266,11 @@ def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purge
         all_excluded += [ExcludedImage(int(numbers[one.number]), one.reason) for one in excluded]
         corners, remaining = corners.select(keep_mask)
         numbers = numbers[remaining]
-        fit = Fit(fit.intrinsics, fit.rotations[remaining], fit.positions_m[remaining])
+        fit = LensFit(fit.intrinsics, fit.rotations[remaining], fit.positions_m[remaining])
     return _Purged(fit, corners, numbers, tuple(all_excluded))
 
 
-def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[Fit, Array, int, bool]:
+def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[LensFit, Array, int, bool]:
     """Return the last fit, its covariance (p, p), the number of groups, and whether fx = fy was assumed."""
     start, corners = purged.fit, purged.corners
     groups = group_similar_images(model, start, corners, size_px)
@@ -300,7 +300,7 @@ def determines_focal_length(solved: SolveResult) -> bool:
     most = fit.cost + (_WORSE * _spread(solved.residuals_px)) ** 2
     for factor in _OTHER_FOCALS:
         lens, nearer = fit.intrinsics * ([factor] * 2 + [1.0] * (len(fit.intrinsics) - 2)), [1.0, 1.0, factor]
-        other = Fit(lens, fit.rotations, fit.positions_m * nearer)
+        other = LensFit(lens, fit.rotations, fit.positions_m * nearer)
         for basis in (rest[:, :0], rest):
             other = adjust(model, other, corners, basis, scale_px, _OTHER_STEPS)
         if other.cost < most:
@@ -308,7 +308,7 @@ def determines_focal_length(solved: SolveResult) -> bool:
     return True
 
 
-def loss_scale_px(model: LensModel, fit: Fit, corners: Corners) -> float:
+def loss_scale_px(model: LensModel, fit: LensFit, corners: Corners) -> float:
     """Return the error in px from which a corner has at most half the weight."""
     return max(_DOUBTED * _spread(residuals(model, fit, corners)), _NEAR_PX)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import (
     Corners,
-    Fit,
+    LensFit,
     adjust,
     normal_equations,
     reduce_to_lens,
@@ -64,7 +64,7 @@ class _Split(NamedTuple):
 
 
 def find_two_cameras(
-    model: LensModel, start: Fit, corners: Corners, names: Sequence[str]
+    model: LensModel, start: LensFit, corners: Corners, names: Sequence[str]
 ) -> TwoCameras | None:
     """Return the images of each camera if there are two cameras; None for one camera.
 
@@ -117,7 +117,7 @@ def _name_groups(names: Sequence[str]) -> Iterator[Group]:
 
 
 def _opposite_pulls(
-    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float
+    model: LensModel, fit: LensFit, corners: Corners, basis: Array, scale_px: float
 ) -> list[Group]:
     """Return groups by the sign of the gradient of each image, in the strongest directions."""
     normal = normal_equations(model, fit, corners, basis, scale_px)
@@ -129,7 +129,7 @@ def _opposite_pulls(
 
 
 def _refine(
-    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, second: Group
+    model: LensModel, fit: LensFit, corners: Corners, basis: Array, scale_px: float, second: Group
 ) -> _Split | None:
     """Return the converged groups, or None if a group has too few images."""
     fits = [fit, fit]
@@ -149,13 +149,13 @@ def _refine(
 
 
 def _fit_group(
-    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, group: Group
-) -> Fit:
+    model: LensModel, fit: LensFit, corners: Corners, basis: Array, scale_px: float, group: Group
+) -> LensFit:
     """Return the intrinsics of a group of images, and the poses of all images with these intrinsics."""
     part, _ = corners.select(group[corners.image_numbers])
     group_fit = adjust(
         model,
-        Fit(fit.intrinsics, fit.rotations[group], fit.positions_m[group]),
+        LensFit(fit.intrinsics, fit.rotations[group], fit.positions_m[group]),
         part,
         basis,
         scale_px,
@@ -164,11 +164,16 @@ def _fit_group(
     rotations, places_m = fit.rotations.copy(), fit.positions_m.copy()
     rotations[group], places_m[group] = group_fit.rotations, group_fit.positions_m
     return adjust(
-        model, Fit(group_fit.intrinsics, rotations, places_m), corners, basis[:, :0], scale_px, _POSE_STEPS
+        model,
+        LensFit(group_fit.intrinsics, rotations, places_m),
+        corners,
+        basis[:, :0],
+        scale_px,
+        _POSE_STEPS,
     )
 
 
-def _errors(model: LensModel, fit: Fit, corners: Corners, scale_px: float) -> Array:
+def _errors(model: LensModel, fit: LensFit, corners: Corners, scale_px: float) -> Array:
     """Return the sum of the squared errors of each image, (f,) in px^2; outliers have less weight."""
     squares = (residuals(model, fit, corners) ** 2).sum(axis=1)
     return corners.sums(scale_px**2 * np.log1p(squares / scale_px**2))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import (
     Corners,
-    Fit,
+    LensFit,
     camera_points,
     corner_weights,
     normal_equations,
@@ -45,7 +45,12 @@ class _Terms(NamedTuple):
 
 
 def model_change(
-    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None, variance: float
+    model: LensModel,
+    fit: LensFit,
+    corners: Corners,
+    basis: Array,
+    scale_px: float | None,
+    variance: float,
 ) -> Array:
     """Return the change of the intrinsics along ``basis`` with a richer model, (q,).
 
@@ -98,7 +103,7 @@ def _terms(model: LensModel, distorted: Array) -> _Terms:
     return _Terms(np.stack([radial, *tangential], axis=2), usual)
 
 
-def _enrich(model: LensModel, fit: Fit, basis: Array, terms: _Terms) -> tuple[LensModel, Fit, Array]:
+def _enrich(model: LensModel, fit: LensFit, basis: Array, terms: _Terms) -> tuple[LensModel, LensFit, Array]:
     """Return the richer model at the fitted corners, the same fit in it, and the basis with the terms."""
     count = len(terms.usual)
 
@@ -111,7 +116,11 @@ def _enrich(model: LensModel, fit: Fit, basis: Array, terms: _Terms) -> tuple[Le
     wider = np.zeros((len(basis) + count, basis.shape[1] + count))
     wider[: len(basis), : basis.shape[1]] = basis
     wider[len(basis) :, basis.shape[1] :] = np.eye(count)
-    return richer, Fit(np.append(fit.intrinsics, np.zeros(count)), fit.rotations, fit.positions_m), wider
+    return (
+        richer,
+        LensFit(np.append(fit.intrinsics, np.zeros(count)), fit.rotations, fit.positions_m),
+        wider,
+    )
 
 
 # Near boards form one group. The limit of the distance is halved up to so many times, until there are enough
@@ -123,7 +132,7 @@ _EQUAL_GROUPS = 8
 
 
 def group_similar_images(
-    model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]
+    model: LensModel, fit: LensFit, corners: Corners, size_px: tuple[int, int]
 ) -> NDArray[np.intp]:
     """Return the group of each image, (f,): a group shows the board in nearly the same pose.
 
@@ -144,7 +153,7 @@ def group_similar_images(
 
 def lens_covariance(
     model: LensModel,
-    fit: Fit,
+    fit: LensFit,
     corners: Corners,
     basis: Array,
     scale_px: float | None,
@@ -191,7 +200,7 @@ def _jackknife(whole: Array, matrices: Array, gradients: Array, groups: NDArray[
 
 
 def _variance_px2(
-    model: LensModel, fit: Fit, corners: Corners, scale_px: float | None, unknowns: int
+    model: LensModel, fit: LensFit, corners: Corners, scale_px: float | None, unknowns: int
 ) -> float:
     """Return the variance of a corner coordinate in px^2, for independent corners."""
     residuals_px = residuals(model, fit, corners)

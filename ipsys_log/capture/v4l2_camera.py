@@ -27,7 +27,7 @@ from ipsys_log.capture.frames import (
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["RAW_FORMATS", "Layout", "encode_raw", "open_v4l2"]
+__all__ = ["RAW_FORMATS", "ImageLayout", "encode_raw", "open_v4l2"]
 
 Plane = NDArray[np.uint8]
 
@@ -36,7 +36,7 @@ RAW_FORMATS = ("NV12", "YUYV", "UYVY", "GREY")
 _QUALITY = 95
 
 
-class Layout(NamedTuple):
+class ImageLayout(NamedTuple):
     """The layout of an image in memory; ``stride`` is the number of bytes from one row to the next."""
 
     format: str
@@ -51,7 +51,7 @@ class Layout(NamedTuple):
         return self.stride * rows
 
 
-def encode_raw(data: bytes, layout: Layout) -> bytes | None:
+def encode_raw(data: bytes, layout: ImageLayout) -> bytes | None:
     """Encode an image as JPEG, with the grey levels of the camera; return None if data is missing.
 
     Examples
@@ -71,7 +71,7 @@ def encode_raw(data: bytes, layout: Layout) -> bytes | None:
     return encoded
 
 
-def _planes(rows: Plane, layout: Layout) -> list[Plane]:
+def _planes(rows: Plane, layout: ImageLayout) -> list[Plane]:
     """Return the brightness plane and, for colour formats, the two smaller colour planes."""
     width, height = layout.width, layout.height
     if layout.format == "GREY":
@@ -149,7 +149,7 @@ def _faults(label: str) -> Iterator[None]:
         raise SourceError(f"{label}: {message}") from error
 
 
-def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings, Layout | None]:
+def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings, ImageLayout | None]:
     """Set a camera to the settings of the rig; return its actual settings, and the layout of raw images."""
     offers = v4l2.list_formats(device)
     name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
@@ -180,7 +180,7 @@ def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings,
     if name in _JPEG:
         return actual, None
     least = format.width * (2 if name in ("YUYV", "UYVY") else 1)
-    return actual, Layout(name, format.width, format.height, max(format.bytesperline, least))
+    return actual, ImageLayout(name, format.width, format.height, max(format.bytesperline, least))
 
 
 def _set_rate(device: int, rate_hz: float | None) -> float | None:
@@ -250,7 +250,7 @@ class _Capture(NamedTuple):
     label: str
     device: int
     buffers: list[mmap.mmap]
-    layout: Layout | None
+    layout: ImageLayout | None
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:

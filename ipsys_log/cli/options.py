@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import remarks
-from ipsys_log.stages import CORNERS, METHOD, Parameter
+from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 
-def build_option(parameter: Parameter) -> Any:
+def build_option(parameter: StageParameter) -> Any:
     """Return the option of a parameter of a stage."""
     return typer.Option(
         f"--{parameter.name.replace('_', '-')}",
@@ -49,7 +49,7 @@ def build_option(parameter: Parameter) -> Any:
     )
 
 
-def annotate(parameter: Parameter) -> Any:
+def annotate(parameter: StageParameter) -> Any:
     """Return the annotation of a parameter of a stage: its type with its option."""
     kind = parameter.kind
     return Annotated[kind, build_option(parameter)]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
 
-__all__ = ["Layout", "cut_rows", "read_layout", "whole_rows"]
+__all__ = ["JpegHeader", "cut_rows", "read_layout", "whole_rows"]
 
 _END = b"\xff\xd9"
 _BASELINE = (0xC0, 0xC1)
@@ -28,7 +28,7 @@ _NEAR_PX = 32
 _AT_ONCE = 65_536
 
 
-class Layout(NamedTuple):
+class JpegHeader(NamedTuple):
     """The header of a baseline JPEG.
 
     ``width`` and ``height`` are its size in px. ``block_px`` is the height of a row of blocks in px, and
@@ -51,7 +51,7 @@ class Layout(NamedTuple):
         return self.block_px * lcm(self.interval, self.blocks) // self.blocks
 
 
-def read_layout(data: bytes) -> Layout | None:
+def read_layout(data: bytes) -> JpegHeader | None:
     """Return the layout of a whole baseline JPEG in one scan; None for all other data."""
     # Some cameras append zeros.
     if data[:2] != b"\xff\xd8" or not (data.endswith(_END) or data.rstrip(b"\0").endswith(_END)):
@@ -69,7 +69,7 @@ def read_layout(data: bytes) -> Layout | None:
     return None
 
 
-def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -> Layout | None:
+def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -> JpegHeader | None:
     parts = data[frame + 9]
     if not 1 <= parts <= 4 or frame + 10 + 3 * parts > scan:
         return None
@@ -83,10 +83,10 @@ def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -
         return None
     across, down = max(f >> 4 for f in factors), max(f & 15 for f in factors)
     blocks = -(-width // (8 * across))
-    return Layout(width, height, 8 * down, blocks, frame + 5, scan + 2 + scan_size, interval)
+    return JpegHeader(width, height, 8 * down, blocks, frame + 5, scan + 2 + scan_size, interval)
 
 
-def whole_rows(layout: Layout, rows: Iterable[slice]) -> list[slice]:
+def whole_rows(layout: JpegHeader, rows: Iterable[slice]) -> list[slice]:
     """Return the rows of a JPEG that must be decoded to get ``rows``: each row once, from the top.
 
     Without restart markers, these are all rows from the top of the image.
@@ -104,7 +104,7 @@ def whole_rows(layout: Layout, rows: Iterable[slice]) -> list[slice]:
 
 
 def cut_rows(
-    data: bytes, layout: Layout, rows: Sequence[slice], memory: bytearray
+    data: bytes, layout: JpegHeader, rows: Sequence[slice], memory: bytearray
 ) -> list[bytearray | memoryview]:
     """Return one JPEG for each slice of rows.
 
@@ -136,7 +136,7 @@ def cut_rows(
     return pieces
 
 
-def _find_restarts(codes: NDArray[np.uint8], layout: Layout) -> NDArray[np.intp]:
+def _find_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> NDArray[np.intp]:
     """Return the offsets of restart markers; search in pieces that fit into the processor's cache."""
     offsets = []
     for start in range(layout.data_at, len(codes) - 1, _AT_ONCE):
@@ -145,7 +145,7 @@ def _find_restarts(codes: NDArray[np.uint8], layout: Layout) -> NDArray[np.intp]
     return np.concatenate(offsets)
 
 
-def _check_restarts(codes: NDArray[np.uint8], layout: Layout) -> None:
+def _check_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> None:
     """Check that all restart markers are present and in order, because their count identifies rows."""
     blocks = layout.blocks * -(-layout.height // layout.block_px)
     wanted = _RESTART + np.arange(-(-blocks // layout.interval) - 1) % _CYCLE
@@ -153,7 +153,7 @@ def _check_restarts(codes: NDArray[np.uint8], layout: Layout) -> None:
         raise FrameError("restart markers are missing or out of order")
 
 
-def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearray]:
+def _between(data: bytes, layout: JpegHeader, rows: Sequence[slice]) -> list[bytearray]:
     """Return JPEGs of the header and the data of some rows, from one restart marker to another."""
     if not rows:
         return []

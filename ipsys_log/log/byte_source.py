@@ -10,13 +10,13 @@ from pathlib import Path
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, ReadLimits
 
-__all__ = ["View", "open_for_reading"]
+__all__ = ["LogBytes", "open_for_reading"]
 
 _MOST_PER_CALL = 1 << 30
 
 
 @dataclass(slots=True)
-class View:
+class LogBytes:
     """The bytes of a log at the time when it was opened.
 
     Bytes from `tail_offset` on come from `tail_fd` (a journal). In the journal they begin at `tail_base`.

@@ -18,7 +18,7 @@ from ipsys_log.log.records import (
     chunk_head,
 )
 
-__all__ = ["IMAGES", "IMAGE_SCHEMAS", "SMALL_APPENDED", "SMALL_LIVE", "ChunkBuilder", "Limits"]
+__all__ = ["IMAGES", "IMAGE_SCHEMAS", "SMALL_APPENDED", "SMALL_LIVE", "ChunkBuilder", "ChunkLimits"]
 
 _ZSTD_LEVEL = 3
 _OPCODE = int(Opcode.MESSAGE)
@@ -38,7 +38,7 @@ IMAGE_SCHEMAS = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ChunkLimits:
     """The limits of a full chunk: bytes of records, or ns of log time from its first message."""
 
     size: int
@@ -46,9 +46,9 @@ class Limits:
 
 
 _SECOND = 1_000_000_000
-IMAGES = Limits(4 << 20, _SECOND)
-SMALL_LIVE = Limits(1 << 20, _SECOND)
-SMALL_APPENDED = Limits(1 << 20, 60 * _SECOND)
+IMAGES = ChunkLimits(4 << 20, _SECOND)
+SMALL_LIVE = ChunkLimits(1 << 20, _SECOND)
+SMALL_APPENDED = ChunkLimits(1 << 20, 60 * _SECOND)
 
 
 @dataclass(slots=True)
@@ -60,7 +60,7 @@ class ChunkBuilder:
     `_crc` is the CRC-32 of the messages up to `_crc_end`.
     """
 
-    limits: Limits
+    limits: ChunkLimits
     compress: bool
     _record: memoryview = field(default_factory=lambda: memoryview(bytearray(_FIRST_ROOM)))
     _end: int = CHUNK_HEAD_SIZE

@@ -10,7 +10,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import (
     EqualBlocks,
     RawBlocks,
@@ -60,7 +60,7 @@ def to_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
 
 
 def chunk_entries(
-    view: View, chunk: ChunkRef, searched: dict[int, Entries], wanted: set[int] | None = None
+    view: LogBytes, chunk: ChunkRef, searched: dict[int, Entries], wanted: set[int] | None = None
 ) -> Entries:
     """Return the rows of a chunk's messages, from its message indexes if there are any.
 
@@ -161,7 +161,7 @@ class _Messages:
     `runs` has the byte range to `fetch` first for each message. `read` reads bytes outside of this range.
     """
 
-    view: View
+    view: LogBytes
     topics: Mapping[int, str]
     chunk_offset: int  # the chunk's offset, 0 for messages in no chunk
     times: list[int]
@@ -211,7 +211,7 @@ class _Messages:
 class _Records:
     """The records of one chunk, by their offsets in the chunk. They are read in place if possible."""
 
-    view: View
+    view: LogBytes
     chunk: ChunkRef
     raw: EqualBlocks | RawBlocks | None = None
     whole: bytes | None = None
@@ -241,7 +241,7 @@ class _Records:
 
 
 def open_chunk(
-    view: View, cache: RangeCache, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
+    view: LogBytes, cache: RangeCache, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
 ) -> Cursor:
     """Return a cursor over the messages of the channels in `topics` with start <= log time <= end."""
     offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
@@ -262,7 +262,7 @@ def open_chunk(
 
 
 def open_unchunked(
-    view: View,
+    view: LogBytes,
     cache: RangeCache,
     entries: Entries,
     topics: Mapping[int, str],

@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, chunk_excess
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse
 
 __all__ = [
@@ -55,7 +55,7 @@ class EqualBlocks:
     check for every message that the record has the time in the index.
     """
 
-    view: View
+    view: LogBytes
     offset: int
     size: int
     head: int
@@ -79,7 +79,7 @@ class EqualBlocks:
 class RawBlocks:
     """The raw blocks at the beginning of a compressed frame, located one by one when a read needs them."""
 
-    view: View
+    view: LogBytes
     _blocks: Iterator[_Block]
     _known: list[_Block] = field(default_factory=list)
 
@@ -101,7 +101,7 @@ class RawBlocks:
 
 
 def find_blocks(
-    view: View, compression: str, offset: int, size: int, content: int
+    view: LogBytes, compression: str, offset: int, size: int, content: int
 ) -> EqualBlocks | RawBlocks | None:
     """Return a reader for parts of the frame of `size` bytes at `offset`, which holds `content` bytes.
 
@@ -132,7 +132,7 @@ def _start(block: _Block) -> int:
     return block.start
 
 
-def _zstd_blocks(view: View, offset: int, end: int) -> Iterator[_Block]:
+def _zstd_blocks(view: LogBytes, offset: int, end: int) -> Iterator[_Block]:
     start, last = 0, 0
     while not last and offset + 3 <= end:
         word = int.from_bytes(view.read(offset, 3), "little")
@@ -143,7 +143,7 @@ def _zstd_blocks(view: View, offset: int, end: int) -> Iterator[_Block]:
         start, offset = start + size, offset + 3 + size
 
 
-def _lz4_blocks(view: View, offset: int, end: int, checksum: int) -> Iterator[_Block]:
+def _lz4_blocks(view: LogBytes, offset: int, end: int, checksum: int) -> Iterator[_Block]:
     start = 0
     while offset + 4 <= end:
         word = int.from_bytes(view.read(offset, 4), "little")
@@ -170,7 +170,7 @@ _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _FAULTS = (zstandard.ZstdError, RuntimeError, EOFError, ValueError)
 
 
-def check_compression(view: View, compression: str) -> None:
+def check_compression(view: LogBytes, compression: str) -> None:
     """Refuse a compression that is not in the MCAP specification."""
     if compression not in ("", "zstd", "lz4"):
         raise LogError(
@@ -179,7 +179,7 @@ def check_compression(view: View, compression: str) -> None:
         )
 
 
-def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
+def unpack(view: LogBytes, offset: int, head: ChunkHead) -> bytes:
     """Return the records of the chunk at `offset`, decompressed; size and CRC are checked.
 
     Raises
@@ -210,7 +210,7 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
     return data
 
 
-def _decompress(view: View, offset: int, head: ChunkHead, data: bytes, excess: str) -> bytes:
+def _decompress(view: LogBytes, offset: int, head: ChunkHead, data: bytes, excess: str) -> bytes:
     size = head.uncompressed_size
     # The library uses the size in the frame instead of max_output_size, and allocates so much memory.
     frame_size = zstandard.frame_content_size(data) if head.compression == "zstd" else -1
@@ -250,7 +250,7 @@ def _pieces(compression: str, data: bytes, most: int) -> Iterator[bytes]:
         yield piece
 
 
-def inner_records(view: View, offset: int, data: bytes) -> Iterator[RecordAt]:
+def inner_records(view: LogBytes, offset: int, data: bytes) -> Iterator[RecordAt]:
     """Yield the records inside the chunk at `offset`; their offsets count from the chunk's first record."""
     position = 0
     while position < len(data):
@@ -273,7 +273,7 @@ class ChunkContents:
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
-    def add(self, view: View, record: RecordAt, offset: int, body: bytes) -> None:
+    def add(self, view: LogBytes, record: RecordAt, offset: int, body: bytes) -> None:
         """Add one record of type Schema, Channel or Message; ignore other types."""
         if record.opcode == Opcode.MESSAGE:
             if len(body) < MESSAGE.size - HEADER.size:
@@ -290,7 +290,7 @@ class ChunkContents:
             view.check_number(len(self.channels), "channels")
 
 
-def check_definition(view: View, record: RecordAt) -> None:
+def check_definition(view: LogBytes, record: RecordAt) -> None:
     """Refuse a record that is too large to be read as a whole."""
     if record.length > LARGEST_DEFINITION:
         raise view.refusal(
@@ -298,7 +298,7 @@ def check_definition(view: View, record: RecordAt) -> None:
         )
 
 
-def parse_chunk_contents(view: View, offset: int, data: bytes) -> ChunkContents:
+def parse_chunk_contents(view: LogBytes, offset: int, data: bytes) -> ChunkContents:
     """Return the definitions and message entries of the decompressed chunk `data` at `offset`."""
     inside, number = ChunkContents(), 0
     left = view.read_limits.records_left(offset)

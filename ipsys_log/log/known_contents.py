@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import NamedTuple
 
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.summary import load_contents
 
@@ -41,7 +41,7 @@ def one_reading() -> Iterator[None]:
         _known.reset(token)
 
 
-def contents_of(view: View) -> Contents:
+def contents_of(view: LogBytes) -> Contents:
     """Return the table of contents of an open log, which the caller may change.
 
     Raises

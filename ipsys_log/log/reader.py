@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import ReadLimits
-from ipsys_log.log.byte_source import View, open_for_reading
+from ipsys_log.log.byte_source import LogBytes, open_for_reading
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
     RangeCache,
@@ -211,7 +211,7 @@ class LogReader:
         return {key: c.topic for key, c in self._contents.channels.items() if c.topic in wanted}
 
 
-def stored_hashes(view: View, contents: Contents) -> dict[str, ChannelHash]:
+def stored_hashes(view: LogBytes, contents: Contents) -> dict[str, ChannelHash]:
     """Return the hashes that writers stored in the log, the newest per topic."""
     hashes: dict[str, ChannelHash] = {}
     for index in sorted(contents.metadata, key=lambda record: record.offset):
@@ -223,13 +223,13 @@ def stored_hashes(view: View, contents: Contents) -> dict[str, ChannelHash]:
     return hashes
 
 
-def _open(path: Path) -> tuple[View, Contents]:
+def _open(path: Path) -> tuple[LogBytes, Contents]:
     """Open a log in a consistent state: the old log if its journal is valid, else an unchanging file."""
     fault: LogError | None = None
     for _ in range(_ATTEMPTS):
         fd = open_for_reading(path)
         status_before = os.fstat(fd)
-        view = View(path, fd, status_before.st_size, status_before.st_size)
+        view = LogBytes(path, fd, status_before.st_size, status_before.st_size)
         has_journal = attach_journal(view)
         fault = None
         try:
@@ -257,9 +257,9 @@ def _open(path: Path) -> tuple[View, Contents]:
     raise fault
 
 
-def _is_unchanged(view: View, before: os.stat_result) -> bool:
+def _is_unchanged(view: LogBytes, before: os.stat_result) -> bool:
     now = os.fstat(view.fd)
-    probe = View(view.path, os.dup(view.fd), now.st_size, now.st_size)
+    probe = LogBytes(view.path, os.dup(view.fd), now.st_size, now.st_size)
     try:
         same = (now.st_size, now.st_mtime_ns) == (before.st_size, before.st_mtime_ns)
         return same and not attach_journal(probe)

@@ -13,7 +13,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 
 __all__ = [
     "CHUNK_HEAD_SIZE",
@@ -118,7 +118,7 @@ def to_bytes(*records: mcap.McapRecord) -> bytes:
     return data
 
 
-def parse(read: Callable[[ReadDataStream], R], view: View, record: RecordAt, body: bytes) -> R:
+def parse(read: Callable[[ReadDataStream], R], view: LogBytes, record: RecordAt, body: bytes) -> R:
     """Parse one record with a `read` of ``mcap``; wrong lengths in the record cannot reach beyond `body`."""
     try:
         return read(ReadDataStream(BytesIO(body)))
@@ -141,7 +141,7 @@ _READERS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
 }
 
 
-def parse_exact(view: View, record_at: RecordAt, data: bytes) -> mcap.McapRecord:
+def parse_exact(view: LogBytes, record_at: RecordAt, data: bytes) -> mcap.McapRecord:
     """Parse the record `data`, of any type without messages; its lengths must be right.
 
     Bytes after the known fields are ignored: later versions of the format may add fields.
@@ -156,7 +156,7 @@ def parse_exact(view: View, record_at: RecordAt, data: bytes) -> mcap.McapRecord
     return record
 
 
-def parse_chunk_index(view: View, record: RecordAt, body: bytes) -> ChunkRef:
+def parse_chunk_index(view: LogBytes, record: RecordAt, body: bytes) -> ChunkRef:
     """Parse a ChunkIndex record, much faster than field by field; each chunk has such a record."""
     try:
         start, end, offset, length, map_length = _CHUNK_INDEX.unpack_from(body)
@@ -170,7 +170,7 @@ def parse_chunk_index(view: View, record: RecordAt, body: bytes) -> ChunkRef:
     return ChunkRef(offset, length, start, end, name, compressed, uncompressed, index_length, offsets)
 
 
-def parse_chunk_head(view: View, offset: int) -> tuple[RecordAt, ChunkHead]:
+def parse_chunk_head(view: LogBytes, offset: int) -> tuple[RecordAt, ChunkHead]:
     """Parse the head of the Chunk record at `offset`; check it with the lengths of record and file."""
     data = view.read(offset, min(HEADER.size + _CHUNK.size + 4 + _LONGEST_NAME + 8, view.size - offset))
     try:
@@ -199,7 +199,7 @@ def chunk_head(start_ns: int, end_ns: int, size: int, crc: int, compression: str
     return HEADER.pack(Opcode.CHUNK, len(fields) + data_size) + fields
 
 
-def parse_message_index(view: View, data: bytes, position: int, channel_id: int, offset: int) -> bytes:
+def parse_message_index(view: LogBytes, data: bytes, position: int, channel_id: int, offset: int) -> bytes:
     """Return the entries of the record at `position` in `data`; each has the layout of `ENTRY`."""
     if 0 <= position <= len(data) - INDEX_HEAD.size:
         opcode, length, channel, size = INDEX_HEAD.unpack_from(data, position)
@@ -210,7 +210,7 @@ def parse_message_index(view: View, data: bytes, position: int, channel_id: int,
     raise view.fault(offset, f"a MessageIndex record of channel {channel_id} is missing")
 
 
-def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:
+def walk(view: LogBytes, start: int, end: int) -> Iterator[RecordAt]:
     """Yield the positions of the records from `start` to `end`; read only their heads."""
     block, base = b"", start
     while start < end:

@@ -5,7 +5,7 @@ import struct
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import ChunkContents, check_definition, parse_chunk_contents, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, RecordAt, parse, parse_chunk_head, walk
@@ -13,7 +13,7 @@ from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, RecordAt, pa
 __all__ = ["add_record", "count_all", "scan"]
 
 
-def scan(view: View, data_end: int) -> Contents:
+def scan(view: LogBytes, data_end: int) -> Contents:
     """Read the heads of all records in the data section, and the contents of chunks if necessary."""
     contents, unchunked = Contents(), ChunkContents()
     counts: dict[int, dict[int, int]] = {}  # per chunk offset, from its MessageIndex records
@@ -35,7 +35,7 @@ def scan(view: View, data_end: int) -> Contents:
 
 
 def add_record(
-    view: View,
+    view: LogBytes,
     contents: Contents,
     unchunked: ChunkContents,
     counts: dict[int, dict[int, int]],
@@ -64,13 +64,13 @@ def add_record(
         unchunked.add(view, record, record.offset, _body(view, record))
 
 
-def _body(view: View, record: RecordAt) -> bytes:
+def _body(view: LogBytes, record: RecordAt) -> bytes:
     check_definition(view, record)
     return view.read(record.offset + HEADER.size, record.length - HEADER.size)
 
 
 def _add_message_index(
-    view: View, contents: Contents, counts: dict[int, dict[int, int]], record: RecordAt
+    view: LogBytes, contents: Contents, counts: dict[int, dict[int, int]], record: RecordAt
 ) -> None:
     if not contents.chunks or contents.chunks[-1].end != record.offset or record.length < 15:
         raise view.fault(record.offset, "a MessageIndex record follows no chunk")
@@ -84,7 +84,7 @@ def _add_message_index(
     )  # fmt: skip
 
 
-def _add_index(view: View, contents: Contents, record: RecordAt) -> None:
+def _add_index(view: LogBytes, contents: Contents, record: RecordAt) -> None:
     """Add an attachment or a metadata record to the indexes; read only the head of an attachment."""
     if record.opcode == Opcode.METADATA:
         metadata = parse(mcap.Metadata.read, view, record, _body(view, record))

@@ -9,7 +9,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, parse, parse_chunk_index, to_bytes, walk
 from ipsys_log.log.scan import scan
@@ -37,7 +37,7 @@ def temporary_tail_bytes(contents: Contents, offset: int) -> bytes:
     return mark + tail_bytes(contents, offset + len(mark))
 
 
-def temporary_tail_data_end(view: View, offset: int) -> int | None:
+def temporary_tail_data_end(view: LogBytes, offset: int) -> int | None:
     """Return the end of the data if the DataEnd record at `offset` belongs to a temporary tail, else None."""
     if offset < len(MAGIC) + TEMPORARY_TAIL_MARK.size:
         return None
@@ -102,7 +102,7 @@ class Summary(NamedTuple):
     checked: bool
 
 
-def read_summary(view: View) -> Summary | None:
+def read_summary(view: LogBytes) -> Summary | None:
     """Read only the summary; None if the log has none.
 
     Raises
@@ -117,7 +117,7 @@ def read_summary(view: View) -> Summary | None:
     return Summary(contents, statistics, checked)
 
 
-def load_contents(view: View) -> Contents:
+def load_contents(view: LogBytes) -> Contents:
     """Read the table of contents of a finished log.
 
     Raises
@@ -147,7 +147,7 @@ def load_contents(view: View) -> Contents:
     return contents
 
 
-def _check_start(view: View) -> None:
+def _check_start(view: LogBytes) -> None:
     start = view.read(0, min(len(MAGIC), view.size))
     if not start:
         raise LogError(f"{view.path} is empty: it has no messages")
@@ -158,7 +158,7 @@ def _check_start(view: View) -> None:
         )
 
 
-def _footer(view: View) -> tuple[int, int, bool]:
+def _footer(view: LogBytes) -> tuple[int, int, bool]:
     """Return the offsets of the footer and the summary (0: none), and whether a CRC confirms both."""
     path = view.path
     footer_at = view.size - len(MAGIC) - FOOTER.size
@@ -178,7 +178,7 @@ def _footer(view: View) -> tuple[int, int, bool]:
     return footer_at, summary_start, bool(summary_start and crc)
 
 
-def _from_summary(view: View, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
+def _from_summary(view: LogBytes, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
     """Parse the summary and its Statistics record. A summary without this record is not complete."""
     contents = Contents()
     statistics: mcap.Statistics | None = None
@@ -224,7 +224,7 @@ def _is_complete(contents: Contents, statistics: mcap.Statistics) -> bool:
     )
 
 
-def _gaps_hold_no_messages(view: View, contents: Contents, data_end: int) -> bool:
+def _gaps_hold_no_messages(view: LogBytes, contents: Contents, data_end: int) -> bool:
     """Return whether all messages lie in the indexed chunks.
 
     The gaps between the chunks are small, so all their records are checked.

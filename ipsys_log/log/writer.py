@@ -14,14 +14,14 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.bounds import LARGEST_MESSAGE
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunk_builder import (
     IMAGE_SCHEMAS,
     IMAGES,
     SMALL_APPENDED,
     SMALL_LIVE,
     ChunkBuilder,
-    Limits,
+    ChunkLimits,
 )
 from ipsys_log.log.contents import Contents, Schema, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
@@ -61,7 +61,7 @@ class LogWriter:
     ['/a', '/runs/poly/b']
     """
 
-    def __init__(self, path: Path, output: Output, contents: Contents, limits: Limits) -> None:
+    def __init__(self, path: Path, output: Output, contents: Contents, limits: ChunkLimits) -> None:
         self.path = path
         self._output = output
         self._contents = contents
@@ -129,7 +129,7 @@ class LogWriter:
         try:
             roll_back(storage, target, fd)
             size = os.fstat(fd).st_size
-            view = View(target, fd, size, size)
+            view = LogBytes(target, fd, size, size)
             contents = contents_of(view)
             stored = stored_hashes(view, contents)
         except BaseException:

@@ -10,7 +10,7 @@ from ipsys_log.messages.channels import MODEL, Channel
 from ipsys_log.messages.message import Message
 from ipsys_log.messages.rig import Rig
 
-__all__ = ["Plan", "Progress", "Stage", "Step", "View", "model_read"]
+__all__ = ["Plan", "Progress", "Stage", "StageView", "Step", "model_read"]
 
 # A step turns a message into payloads; it is called with the messages in log order.
 Step = Callable[[Message], Iterable[Any]]
@@ -18,7 +18,7 @@ Step = Callable[[Message], Iterable[Any]]
 Progress = Callable[[int, int], None]
 
 
-class View(Protocol):
+class StageView(Protocol):
     """The view of a stage on a log: its channels; derived ones come from the runs that the stage reads."""
 
     @property
@@ -99,9 +99,9 @@ class Stage:
     versions: Mapping[str, int]
     reads: tuple[Channel, ...]
     writes: tuple[Channel, ...]
-    plan: Callable[[View, Mapping[str, str]], Plan | str]
+    plan: Callable[[StageView, Mapping[str, str]], Plan | str]
     rig_part: Callable[[Rig], Any]
-    method: Callable[[Mapping[str, str], View], str] = lambda parameters, view: ""
+    method: Callable[[Mapping[str, str], StageView], str] = lambda parameters, view: ""
     causal: bool = True
     per_camera: bool = True
     in_threads: bool = False
@@ -115,7 +115,7 @@ class Stage:
         return next(channel for channel in self.writes if payload in channel.payloads)
 
 
-def model_read(_parameters: Mapping[str, str], view: View) -> str:
+def model_read(_parameters: Mapping[str, str], view: StageView) -> str:
     """Return the method of a stage that reads a model: the name of the model, "" without one."""
     models = view.payloads(MODEL)
     return models[-1].name if models else ""

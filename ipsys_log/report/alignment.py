@@ -10,7 +10,7 @@ import numpy as np
 
 from ipsys_log.analysis.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.analysis.calibration_points import find_pairs, measured
-from ipsys_log.analysis.coverage import Coverage, MountedCamera, Overlap, cover_floor, find_overlaps
+from ipsys_log.analysis.coverage import FloorCoverage, MountedCamera, Overlap, cover_floor, find_overlaps
 from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.analysis.stationary import find_stationary
 from ipsys_log.errors import IpsysError
@@ -58,7 +58,7 @@ class AlignedLab:
     alignments: tuple[Alignment, ...]
     lenses: Lenses
     mounted_cameras: tuple[MountedCamera, ...]
-    coverage: Coverage | None
+    coverage: FloorCoverage | None
     overlaps: tuple[Overlap, ...]
     diagonal_m: float
     notes: tuple[str, ...]
@@ -197,7 +197,7 @@ def _marker(rig: Rig) -> tuple[float, float]:
 
 def _cover(
     rig: Rig, mounted: Sequence[MountedCamera], length_m: float, height_m: float, notes: list[str]
-) -> Coverage | None:
+) -> FloorCoverage | None:
     if not mounted:
         notes.append(
             "the coverage of the floor needs at least three calibration points in the view of each camera, "

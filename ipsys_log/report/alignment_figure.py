@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import Alignment
-from ipsys_log.analysis.coverage import Coverage
+from ipsys_log.analysis.coverage import FloorCoverage
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.report.alignment import AlignedLab
@@ -69,7 +69,7 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
     write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
 
 
-def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
+def _draw_floor(axes: Axes, lab: AlignedLab, coverage: FloorCoverage) -> None:
     draw_ground(axes, lab.rig, [])
     axes.grid(visible=False)
     counts = np.sum([*coverage.whole.values()], axis=0)

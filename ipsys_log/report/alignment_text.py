@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.alignment import LEVEL_M, Alignment
-from ipsys_log.analysis.coverage import Coverage, Overlap, Patch
+from ipsys_log.analysis.coverage import FloorCoverage, Overlap, Patch
 from ipsys_log.report.alignment import AlignedLab
 from ipsys_log.units import CM_PER_M
 
@@ -120,7 +120,7 @@ def coverage_lines(lab: AlignedLab) -> list[tuple[str, bool]]:
     ]
 
 
-def _floor_lines(coverage: Coverage) -> list[tuple[str, bool]]:
+def _floor_lines(coverage: FloorCoverage) -> list[tuple[str, bool]]:
     floor_m2 = coverage.floor.width_m * coverage.floor.depth_m
     size = f"a marker of {coverage.diagonal_m / math.sqrt(2) * CM_PER_M:.0f} cm"
     if coverage.height_m:
@@ -209,7 +209,7 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else value * factor
 
 
-def _coverage_json(coverage: Coverage) -> dict[str, Any]:
+def _coverage_json(coverage: FloorCoverage) -> dict[str, Any]:
     return {
         "marker_height_m": coverage.height_m,
         "unseen": [_patch_json(patch) for patch in coverage.unseen],

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.plan import FittedCamera, Plan, plan_points
+from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, plan_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
 from ipsys_log.geometry.trilateration import are_collinear, tape_covariance
@@ -58,7 +58,7 @@ class PlannedFloor:
     model: str
     run: str
     rig: Rig
-    plan: Plan
+    plan: MeasurementPlan
     xs_m: Array
     ys_m: Array
     height_m: float
@@ -210,7 +210,7 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
     return variances
 
 
-def _notes(model: Model, rig: Rig, lenses: Lenses, plan: Plan) -> Iterator[str]:
+def _notes(model: Model, rig: Rig, lenses: Lenses, plan: MeasurementPlan) -> Iterator[str]:
     fitted = {camera.camera for camera in model.cameras if camera.pairs}
     for camera in sorted({camera.name for camera in rig.cameras} - fitted):
         yield (

@@ -15,7 +15,7 @@ from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.cameras import Camera
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
-__all__ = ["FIELD_PX", "Check", "View", "lay_floor", "pixel_rays", "prepare_view", "to_light"]
+__all__ = ["FIELD_PX", "Check", "FloorView", "lay_floor", "pixel_rays", "prepare_view", "to_light"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -140,7 +140,7 @@ FIELD_PX = 192
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class FloorView:
     """The constant data of the frames of a camera.
 
     ``rays`` (h + 2 border, w + 2 border, 2) are normalized coordinates of pixels. ``floor`` (h, w) is the
@@ -157,7 +157,7 @@ class View:
     bare: Plane | None = None
 
 
-def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: None) -> View:
+def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: None) -> FloorView:
     """Compute all data of a camera's frames that do not depend on the markers."""
     border_px = int(np.ceil(4 * settings.psf_sigma_px)) + 2
     rays = pixel_rays(camera.lens, border_px, check)
@@ -170,7 +170,7 @@ def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: N
     rng = random_stream(settings.seed, Purpose.NOISE_FIELD, index)
     size = (camera.lens.height + FIELD_PX, camera.lens.width + FIELD_PX)
     noise = rng.standard_normal(size, dtype=np.float32) * np.float32(settings.noise_sigma)
-    return View(camera, border_px, rays, np.ascontiguousarray(behind[inner, inner]), noise)
+    return FloorView(camera, border_px, rays, np.ascontiguousarray(behind[inner, inner]), noise)
 
 
 def to_light(levels: Plane | np.float32, settings: LabSettings) -> Plane:

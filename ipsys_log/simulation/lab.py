@@ -35,7 +35,7 @@ from ipsys_log.simulation.calibration_points import (
 )
 from ipsys_log.simulation.cameras import FLOOR_M, Camera, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
-from ipsys_log.simulation.floor import View, prepare_view
+from ipsys_log.simulation.floor import FloorView, prepare_view
 from ipsys_log.simulation.pixel_shares import exposure_interval
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
@@ -177,7 +177,7 @@ class _Shutter:
     instant: Instant
     index: int
 
-    def __call__(self, number: int, view: View) -> CompressedImage:
+    def __call__(self, number: int, view: FloorView) -> CompressedImage:
         rng = random_stream(self.settings.seed, Purpose.FRAME, number, self.index)
         data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
         return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")

@@ -29,7 +29,7 @@ from ipsys_log.simulation.calibration_points import (
 )
 from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
-from ipsys_log.simulation.floor import Check, View, prepare_view
+from ipsys_log.simulation.floor import Check, FloorView, prepare_view
 from ipsys_log.simulation.lab import build_rig, moving_marker
 from ipsys_log.simulation.render import Print, add_static_prints, encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
@@ -267,6 +267,6 @@ def _moving_marker(lab: LiveLab, index: int) -> list[Print]:
     return [moving_marker(lab.drive, marker_id, time_s, lab.settings) for marker_id in lab.drive.ahead_s]
 
 
-def _picture(view: View, prints: list[Print], settings: LabSettings, number: int, index: int) -> bytes:
+def _picture(view: FloorView, prints: list[Print], settings: LabSettings, number: int, index: int) -> bytes:
     rng = random_stream(settings.seed, Purpose.FRAME, number, index)
     return encode_jpeg(render(view, prints, settings, rng), settings)

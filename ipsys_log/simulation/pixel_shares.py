@@ -30,7 +30,7 @@ from ipsys_log.geometry.marker_cells import (
     printed_cells,
 )
 from ipsys_log.geometry.poses import transform
-from ipsys_log.simulation.floor import View
+from ipsys_log.simulation.floor import FloorView
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
@@ -118,7 +118,7 @@ class Shares:
 
 
 def find_shares(
-    view: View, placed: PlacedMarker | PlacedBoard | MovingMarker, settings: LabSettings
+    view: FloorView, placed: PlacedMarker | PlacedBoard | MovingMarker, settings: LabSettings
 ) -> Shares | None:
     """Return the shares of a print; None if the print is not in the image."""
     if isinstance(placed, (PlacedMarker, PlacedBoard)):
@@ -128,12 +128,12 @@ def find_shares(
     return _moving(view, placed, settings)
 
 
-def _still(view: View, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Shares | None:
+def _still(view: FloorView, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Shares | None:
     box = _box_of(view, placed, settings)
     return None if box is None else Shares(box, *_print_shares(view, placed, box, settings))
 
 
-def _moving(view: View, moving: MovingMarker, settings: LabSettings) -> Shares | None:
+def _moving(view: FloorView, moving: MovingMarker, settings: LabSettings) -> Shares | None:
     """Return the shares of a moving print: in each row, the mean over the exposure of the row."""
     path = _path(view, moving, settings)
     if path is None:
@@ -155,7 +155,7 @@ def _moving(view: View, moving: MovingMarker, settings: LabSettings) -> Shares |
     return Shares(whole, cover, dark)
 
 
-def _path(view: View, moving: MovingMarker, settings: LabSettings) -> tuple[Box, float] | None:
+def _path(view: FloorView, moving: MovingMarker, settings: LabSettings) -> tuple[Box, float] | None:
     """Return the box of a moving print during a frame, and the speed of its fastest point in px/s."""
     start_s, end_s = exposure_interval(0, view.camera.lens.height - 1, settings)
     outlines_px = []
@@ -185,12 +185,12 @@ def _part(box: Box | None, whole: Box, weights: Array, settings: LabSettings) ->
     )
 
 
-def _box_of(view: View, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Box | None:
+def _box_of(view: FloorView, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Box | None:
     outline_px = _outline_px(view, placed, settings)
     return None if outline_px is None else _box(view, outline_px, settings)
 
 
-def _outline_px(view: View, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Array | None:
+def _outline_px(view: FloorView, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Array | None:
     """Return points around a print, (n, 2) in px; None if some of them are not in front of the camera."""
     outline_m = print_outline(placed, settings.dictionary)
     outline_m = transform(view.camera.camera_from_world, outline_m)
@@ -202,7 +202,7 @@ def _around_px(settings: LabSettings) -> int:
     return int(np.ceil(4 * settings.psf_sigma_px)) + 2
 
 
-def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
+def _box(view: FloorView, px: Array, settings: LabSettings) -> Box | None:
     """Return rows and columns of ``view.rays`` around points (n, 2), with blur; None outside the image."""
     around = _around_px(settings)
     low = np.floor(px.min(axis=0)).astype(int) - around + view.border_px
@@ -217,7 +217,7 @@ def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
 
 
 def _print_shares(
-    view: View, placed: PlacedMarker | PlacedBoard, box: Box, settings: LabSettings
+    view: FloorView, placed: PlacedMarker | PlacedBoard, box: Box, settings: LabSettings
 ) -> tuple[Plane, Plane]:
     """Return the shares of each pixel's light from the print and from its black cells, (h, w) each."""
     black, cells_per_m = printed_cells(placed, settings.dictionary)
@@ -240,7 +240,7 @@ def _print_shares(
 
 
 def _cells_of(
-    view: View, world_from_marker: Array, box: Box, shape: tuple[int, ...], cells_per_m: float
+    view: FloorView, world_from_marker: Array, box: Box, shape: tuple[int, ...], cells_per_m: float
 ) -> tuple[Array, Array, tuple[float, float]]:
     """Return the positions of the pixels of a box on a print, and the size of a pixel, in cells.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.marker_cells import MovingMarker, PlacedBoard, PlacedMarker
-from ipsys_log.simulation.floor import FIELD_PX, View, to_light
+from ipsys_log.simulation.floor import FIELD_PX, FloorView, to_light
 from ipsys_log.simulation.pixel_shares import Box, find_shares
 from ipsys_log.simulation.settings import LabSettings
 
@@ -30,7 +30,7 @@ _BLUE, _RED = 9, 6
 
 
 def render(
-    view: View, placed: Sequence[Print], settings: LabSettings, rng: np.random.Generator | None
+    view: FloorView, placed: Sequence[Print], settings: LabSettings, rng: np.random.Generator | None
 ) -> Image:
     """Render an image with markers.
 
@@ -58,7 +58,7 @@ def render(
     return np.asarray(cv2.merge([blue, levels, red]), dtype=np.uint8)
 
 
-def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
+def expose(view: FloorView, placed: Sequence[Print], settings: LabSettings) -> Plane:
     """Return the grey levels of an image before noise and rounding, (height, width).
 
     Parameters
@@ -68,7 +68,7 @@ def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
     return _compose(view, placed, settings)[0]
 
 
-def add_static_prints(view: View, placed: Sequence[PlacedMarker], settings: LabSettings) -> View:
+def add_static_prints(view: FloorView, placed: Sequence[PlacedMarker], settings: LabSettings) -> FloorView:
     """Return a view whose floor contains stationary prints, so the renderer does not draw them again."""
     grey, bare = _compose(view, placed, settings)
     return replace(view, floor=to_light(grey, settings), bare=bare)
@@ -83,7 +83,7 @@ def encode_jpeg(image: Image, settings: LabSettings) -> bytes:
     return bytes(cv2.imencode(".jpg", image, options)[1])
 
 
-def _compose(view: View, placed: Sequence[Print], settings: LabSettings) -> tuple[Plane, Plane]:
+def _compose(view: FloorView, placed: Sequence[Print], settings: LabSettings) -> tuple[Plane, Plane]:
     """Return the grey levels of an image and the share of the floor in each pixel, both (h, w)."""
     grey = _levels(view.floor, settings)
     bare = np.ones_like(grey) if view.bare is None else view.bare.copy()
@@ -103,7 +103,7 @@ def _compose(view: View, placed: Sequence[Print], settings: LabSettings) -> tupl
     return grey, bare
 
 
-def _inside(view: View, box: Box) -> tuple[slice, slice, Box]:
+def _inside(view: FloorView, box: Box) -> tuple[slice, slice, Box]:
     """Return the rows and columns of a box in the image, and the part of the box inside the image."""
     frame, kept = [], []
     for part, size in zip(box, view.floor.shape, strict=True):

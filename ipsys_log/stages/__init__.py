@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CORNERS", "ENTRIES", "METHOD", "Entry", "Parameter", "parameters_until"]
+__all__ = ["CORNERS", "ENTRIES", "METHOD", "StageEntry", "StageParameter", "parameters_until"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Parameter:
+class StageParameter:
     """A parameter of a stage that the user sets, as an option of its command and of those of later stages.
 
     Attributes
@@ -35,7 +35,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class StageEntry:
     """The entry of a stage: the part of its row that the command line needs.
 
     Attributes
@@ -48,7 +48,7 @@ class Entry:
 
     name: str
     help: str
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[StageParameter, ...] = ()
     prints: tuple[str, ...] = ()
 
     @property
@@ -57,25 +57,25 @@ class Entry:
         return f"{__name__}.{self.name.replace('-', '_')}"
 
 
-CORNERS = Parameter(
+CORNERS = StageParameter(
     name="corners",
     help="Method for corners: edges of the print (edges, the default if all cameras have a calibration), "
     "or the method of the paper (stock).",
     metavar="NAME",
 )
-AS_LIVE = Parameter(
+AS_LIVE = StageParameter(
     name="as_live",
     help="Exclude the frames that were skipped during the recording.",
     kind=bool,
     default=False,
 )
-SKIP_AMBIGUOUS = Parameter(
+SKIP_AMBIGUOUS = StageParameter(
     name="skip_ambiguous",
     help="Exclude a marker from frames that show its id twice.",
     kind=bool,
     default=False,
 )
-METHOD = Parameter(
+METHOD = StageParameter(
     name="method",
     help="Method for camera points: perimeter (eq. 3 to 5 of the paper, for level markers) or "
     "pose (for tilted markers, too).",
@@ -83,27 +83,27 @@ METHOD = Parameter(
     kind=str,
     default="perimeter",
 )
-MODEL = Parameter(
+MODEL = StageParameter(
     name="model",
     help="Model: rigid, poly, ann, kriging, kriging-regression, rayplane, best, or a hybrid such as "
     "rigid+poly; repeat it for several.",
     metavar="NAME",
     kind=list[str] | None,
 )
-MODEL_FROM = Parameter(
+MODEL_FROM = StageParameter(
     name="model_from",
     help="Copy the model of this log, and apply it.",
     metavar="LOG",
     kind=Path | None,
 )
-TRAIN = Parameter(
+TRAIN = StageParameter(
     name="train",
     help="Fit on the measurements with this label.",
     metavar="LABEL",
     kind=str,
     default="train",
 )
-SEED = Parameter(
+SEED = StageParameter(
     name="seed",
     help="Seed of random splits, folds and subsets.",
     metavar="N",
@@ -113,35 +113,35 @@ SEED = Parameter(
 )
 
 # Each stage comes after the stages that write its channels.
-ENTRIES: tuple[Entry, ...] = (
-    Entry(
+ENTRIES: tuple[StageEntry, ...] = (
+    StageEntry(
         name="detect",
         help="Detect the markers in the frames.",
         parameters=(CORNERS, AS_LIVE, SKIP_AMBIGUOUS),
     ),
-    Entry(
+    StageEntry(
         name="camera-frame",
         help="Compute the position of each marker in camera coordinates.",
         parameters=(METHOD,),
     ),
-    Entry(
+    StageEntry(
         name="fit",
         help="Fit models to the calibration points (default: poly).",
         parameters=(MODEL, MODEL_FROM, TRAIN, SEED),
     ),
-    Entry(
+    StageEntry(
         name="evaluate",
         help="Evaluate models: their errors, the learning curve and outliers of the measurements.\n\n"
         "The errors are on held-out calibration points and by cross-validation. Without --model, the command "
         "evaluates all models.",
         prints=("plots", "details"),
     ),
-    Entry(name="locate", help="Apply a model: compute world positions from each camera."),
-    Entry(name="fuse", help="Combine the positions of all cameras into one pose per robot."),
+    StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),
+    StageEntry(name="fuse", help="Combine the positions of all cameras into one pose per robot."),
 )
 
 
-def parameters_until(name: str | None) -> list[Parameter]:
+def parameters_until(name: str | None) -> list[StageParameter]:
     """Return the parameters of a stage and of those before it, in their order; of all stages for None."""
     names = [entry.name for entry in ENTRIES]
     last = len(names) if name is None else names.index(name) + 1

@@ -32,7 +32,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
-from ipsys_log.messages.stage import Plan, Stage, View
+from ipsys_log.messages.stage import Plan, Stage, StageView
 
 __all__ = ["METHODS", "PERIMETER", "STAGE", "CameraFrame", "check_method", "points_run"]
 
@@ -214,7 +214,7 @@ def points_run(markers: str, method: str) -> str:
     return markers if method == PERIMETER else f"{markers}_{method}"
 
 
-def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     method = options.get("method", PERIMETER)
     markers = view.run(MARKERS)
     if not markers:

@@ -32,7 +32,7 @@ from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
-from ipsys_log.messages.stage import Plan, Progress, Stage, View, model_read
+from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
 from ipsys_log.models.table import CalibrationPoints, min_pairs
 
 __all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
@@ -129,7 +129,7 @@ def _suspects(
         return ()
 
 
-def can_evaluate(view: View, options: Mapping[str, str], model: str) -> bool:
+def can_evaluate(view: StageView, options: Mapping[str, str], model: str) -> bool:
     """Return whether a model has held-out points, or enough points for cross-validation."""
     measurements = [point.measurement for point in measured(view)]
     enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
@@ -137,14 +137,14 @@ def can_evaluate(view: View, options: Mapping[str, str], model: str) -> bool:
     return bool(held_out) or (_is_fitted_here(view, options, model) and enough)
 
 
-def _is_fitted_here(view: View, options: Mapping[str, str], model: str) -> bool:
+def _is_fitted_here(view: StageView, options: Mapping[str, str], model: str) -> bool:
     """Return whether a model is fitted to points of this log: then it can be fitted to fewer points too."""
     if "model_from" in options:
         return False
     return has_measurements(view) or all(copy.name != model for _, copy in view.copied(MODEL))
 
 
-def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     model: Model = view.payloads(MODEL)[-1]
     if not can_evaluate(view, options, model.name):
         return ""

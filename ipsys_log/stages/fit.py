@@ -19,7 +19,7 @@ from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
-from ipsys_log.messages.stage import Plan, Progress, Stage, View
+from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
 from ipsys_log.models.table import (
     MODEL_VERSIONS,
     CalibrationPoints,
@@ -201,7 +201,7 @@ def model_run(model: str) -> str:
     return model.replace("+", "_").replace("-", "_")
 
 
-def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     name = options["model"]
     if not has_measurements(view):
         copied = next((run for run, model in view.copied(MODEL) if model.name == name), None)

@@ -23,7 +23,7 @@ from ipsys_log.messages import (
     Vector3,
 )
 from ipsys_log.messages.channels import EVENTS, POSES, POSITIONS, RIG, TRACKS
-from ipsys_log.messages.stage import Plan, Stage, View
+from ipsys_log.messages.stage import Plan, Stage, StageView
 
 __all__ = ["STAGE", "Fuse", "fuse_positions"]
 
@@ -164,7 +164,7 @@ def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
     )
 
 
-def _plan(view: View, _options: Mapping[str, str]) -> Plan:
+def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
     has_late_frames = any(event.kind == STAMP_UNRELIABLE for event in view.payloads(EVENTS))
     return Plan(
         run=view.run(POSITIONS),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, POSITIONS, RIG
-from ipsys_log.messages.stage import Plan, Stage, View, model_read
+from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
 from ipsys_log.models.table import AppliedModel, reads_height
 
 __all__ = ["STAGE", "Locate"]
@@ -87,7 +87,7 @@ def _positions(
     )
 
 
-def _plan(view: View, _options: Mapping[str, str]) -> Plan:
+def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
     model: Model = view.payloads(MODEL)[-1]
     return Plan(
         run=view.run(MODEL),

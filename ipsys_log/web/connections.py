@@ -12,7 +12,7 @@ from uvicorn import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
-__all__ = ["Connections", "Limits", "derive_limits"]
+__all__ = ["Connections", "PageLimits", "derive_limits"]
 
 # The page gets one of this many descriptors. Cameras, the log and libraries of a recorder need the others.
 _SHARE_OF_DESCRIPTORS = 8
@@ -25,7 +25,7 @@ _PAUSE_S = 0.002
 _RETRY_S = 0.2
 
 
-class Limits(NamedTuple):
+class PageLimits(NamedTuple):
     """The limits of open connections.
 
     Attributes
@@ -39,12 +39,12 @@ class Limits(NamedTuple):
     request_s: float = _REQUEST_TIMEOUT_S
 
 
-def derive_limits() -> Limits:
+def derive_limits() -> PageLimits:
     """Return the limits that leave most file descriptors of this process to the recorder."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     share = _MAX_TOTAL if soft == resource.RLIM_INFINITY else soft // _SHARE_OF_DESCRIPTORS
     total = min(max(share, _MIN_TOTAL), _MAX_TOTAL)
-    return Limits(total, max(total // 4, _MIN_PER_ADDRESS))
+    return PageLimits(total, max(total // 4, _MIN_PER_ADDRESS))
 
 
 class Connections:
@@ -54,7 +54,7 @@ class Connections:
     a user of the page. To make room, only connections without an answer are closed, the oldest first.
     """
 
-    def __init__(self, limits: Limits, config: Config, state: ServerState) -> None:
+    def __init__(self, limits: PageLimits, config: Config, state: ServerState) -> None:
         self._limits, self._config, self._state = limits, config, state
         self._addresses: dict[_Connection, str] = {}  # the oldest first
 

@@ -22,7 +22,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.survey.scene import MeasuringScene
 from ipsys_log.web.access import Guard
 from ipsys_log.web.app import build_app
-from ipsys_log.web.connections import Connections, Limits, derive_limits
+from ipsys_log.web.connections import Connections, PageLimits, derive_limits
 
 __all__ = ["PageServer", "ServerExceptions", "check_port_free", "qr_code", "serve"]
 
@@ -92,7 +92,7 @@ class PageServer:
 
 @contextmanager
 def serve(
-    scene: MeasuringScene, host: str | None = None, port: int = 8000, limits: Limits | None = None
+    scene: MeasuringScene, host: str | None = None, port: int = 8000, limits: PageLimits | None = None
 ) -> Iterator[PageServer]:
     """Serve the page of a scene until the end of the with-block.
 
@@ -134,7 +134,7 @@ def serve(
 
 
 def _run(
-    server: uvicorn.Server, listening: socket.socket, limits: Limits, exceptions: ServerExceptions
+    server: uvicorn.Server, listening: socket.socket, limits: PageLimits, exceptions: ServerExceptions
 ) -> None:
     """Serve until ``server.should_exit`` is true; an exception ends only this thread."""
     try:
@@ -144,7 +144,7 @@ def _run(
 
 
 async def _serve(
-    server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: ServerExceptions
+    server: uvicorn.Server, listening: socket.socket, limits: PageLimits, faults: ServerExceptions
 ) -> None:
     faults.watch_loop(asyncio.get_running_loop())
     listening.setblocking(False)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ellipe
 
-from ipsys_log.analysis.plan import FittedCamera, Plan, mean_length, plan_points
+from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, mean_length, plan_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, look_down, pose_facing_up, transform
@@ -175,7 +175,7 @@ def true_mean_error_m(cameras: list[Camera], pairs: dict[str, list[Pair]], model
     return float(np.nanmean(np.where(np.isnan(first_m), second_m, first_m)))
 
 
-def planned(views: list[FittedCamera], count: int = 6) -> Plan:
+def planned(views: list[FittedCamera], count: int = 6) -> MeasurementPlan:
     return plan_points(views, grid(0.2, (0.1,)), grid(0.2, HEIGHTS_M), tape_m2, RADIUS_M, count)
 
 

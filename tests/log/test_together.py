@@ -13,7 +13,7 @@ import pytest
 
 from ipsys_log.errors import LogError
 from ipsys_log.log import reader as reader_module
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import Disk, journal_path, replace_tail
 from ipsys_log.log.reader import LogReader
@@ -83,7 +83,7 @@ def test_a_log_that_changes_while_it_is_opened_is_opened_again(
 ) -> None:
     changes = [[("/runs/a", k, k, b"x")] for k in range(3)]
 
-    def slowly(view: View) -> Contents:
+    def slowly(view: LogBytes) -> Contents:
         contents = load_contents(view)
         if changes:
             append(log, list(changes.pop()))

@@ -13,16 +13,16 @@ from typing import Any
 from ipsys_log import stages
 from ipsys_log.messages import Message, Tracks, channels
 from ipsys_log.messages.channels import TRACKS, Channel
-from ipsys_log.messages.stage import Plan, Stage, View
-from ipsys_log.stages import Entry, Parameter
+from ipsys_log.messages.stage import Plan, Stage, StageView
+from ipsys_log.stages import StageEntry, StageParameter
 
 __all__ = ["ENTRY", "SMOOTHED_TRACKS", "STAGE"]
 
 SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
-ENTRY = Entry(
+ENTRY = StageEntry(
     name="smooth",
     help="Smooth the tracks.",
-    parameters=(Parameter(name="weight", help="The weight of the newest pose.", metavar="W"),),
+    parameters=(StageParameter(name="weight", help="The weight of the newest pose.", metavar="W"),),
 )
 
 
@@ -43,7 +43,7 @@ class Smooth:
         yield replace(tracks, tracks=tuple(smoothed))
 
 
-def _plan(view: View, options: Mapping[str, str]) -> Plan:
+def _plan(view: StageView, options: Mapping[str, str]) -> Plan:
     weight = options.get("weight", "0.5")
     return Plan(
         run=view.run(TRACKS),

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from ipsys_log.geometry.marker_cells import PlacedMarker, project_corners
 from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation
 from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.floor import View, prepare_view
+from ipsys_log.simulation.floor import FloorView, prepare_view
 from ipsys_log.simulation.render import encode_jpeg, expose, render
 from ipsys_log.simulation.settings import LabSettings
 
@@ -21,7 +21,7 @@ SETTINGS = LabSettings()
 
 
 @pytest.fixture(scope="module")
-def views() -> list[View]:
+def views() -> list[FloorView]:
     return [prepare_view(camera, SETTINGS) for camera in mount_cameras(SETTINGS)]
 
 
@@ -51,7 +51,7 @@ def to_pixels(camera: Camera, points_m: Array) -> Array:
 CORNERS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]) * LENGTH_M / 2
 
 
-def test_true_corners_agree_with_the_formulas(views: list[View]) -> None:
+def test_true_corners_agree_with_the_formulas(views: list[FloorView]) -> None:
     rng = np.random.default_rng(1)
     for view in views:
         for _ in range(10):
@@ -61,7 +61,7 @@ def test_true_corners_agree_with_the_formulas(views: list[View]) -> None:
             np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
-def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Array:
+def edge_errors(view: FloorView, placed: PlacedMarker, settings: LabSettings) -> Array:
     """Return the errors in px of the drawn sides of the black square, by pixel row.
 
     The sum of the light along a line across an edge gives the position of the edge, for any blur.
@@ -93,7 +93,7 @@ def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Arra
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, np.pi / 2, 0.3, 2.0])
-def test_rendered_edges_are_exact_to_0_01_px(views: list[View], turn_rad: float) -> None:
+def test_rendered_edges_are_exact_to_0_01_px(views: list[FloorView], turn_rad: float) -> None:
     rng = np.random.default_rng(int(turn_rad * 10))
     for view in views:
         y_m = view.camera.origin_m[1]
@@ -106,7 +106,7 @@ def test_rendered_edges_are_exact_to_0_01_px(views: list[View], turn_rad: float)
             assert abs(errors.mean()) < 0.001
 
 
-def test_edges_of_a_tilted_marker_are_as_exact(views: list[View]) -> None:
+def test_edges_of_a_tilted_marker_are_as_exact(views: list[FloorView]) -> None:
     tilted = pose_facing_up(3.0, 2.6, 0.1, 0.7) @ make_pose(
         rotation(np.array([0.12, -0.05, 0.0])), np.zeros(3)
     )
@@ -114,7 +114,7 @@ def test_edges_of_a_tilted_marker_are_as_exact(views: list[View]) -> None:
     assert np.abs(errors).max() < 0.01
 
 
-def test_a_frame_equals_one_drawn_by_brute_force(views: list[View]) -> None:
+def test_a_frame_equals_one_drawn_by_brute_force(views: list[FloorView]) -> None:
     """Render twelve by twelve samples per pixel through a numerical inverse of the lens."""
     view, samples = views[1], 12
     where = (3.1, 2.9, 0.15, 0.6)
@@ -168,7 +168,7 @@ def hard_print(local: Array, marker_id: int) -> Array:
     return np.where(black, SETTINGS.black, SETTINGS.white)
 
 
-def test_gamma_keeps_black_and_white_and_thins_black(views: list[View]) -> None:
+def test_gamma_keeps_black_and_white_and_thins_black(views: list[FloorView]) -> None:
     settings = replace(SETTINGS, gamma=2.2)
     view = prepare_view(views[1].camera, settings)
     placed = lay(3, 2.6, 2.3, 0.0, 0.2)
@@ -181,7 +181,7 @@ def test_gamma_keeps_black_and_white_and_thins_black(views: list[View]) -> None:
     assert -0.5 < edge_errors(view, placed, settings).mean() < -0.1
 
 
-def test_unblurred_pixels_are_black_white_or_mixed_at_edges(views: list[View]) -> None:
+def test_unblurred_pixels_are_black_white_or_mixed_at_edges(views: list[FloorView]) -> None:
     settings = replace(SETTINGS, psf_sigma_px=0.0)
     view = prepare_view(views[1].camera, settings)
     image = expose(view, [lay(3, 2.6, 2.3, 0.0, 0.0)], settings)
@@ -189,7 +189,7 @@ def test_unblurred_pixels_are_black_white_or_mixed_at_edges(views: list[View]) -
     assert np.abs(edge_errors(view, lay(3, 2.6, 2.3, 0.0, 0.0), settings)).max() < 0.02
 
 
-def test_the_stock_detector_finds_every_marker_near_its_truth(views: list[View]) -> None:
+def test_the_stock_detector_finds_every_marker_near_its_truth(views: list[FloorView]) -> None:
     rng = np.random.default_rng(5)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100))
     errors = []
@@ -208,7 +208,7 @@ def test_the_stock_detector_finds_every_marker_near_its_truth(views: list[View])
     assert np.sqrt(np.mean(np.sum(np.square(errors), axis=-1))) < 0.35
 
 
-def test_marker_at_the_image_edge_is_cut_off(views: list[View]) -> None:
+def test_marker_at_the_image_edge_is_cut_off(views: list[FloorView]) -> None:
     view = views[1]
     bare = expose(view, [], SETTINGS)
     cut = expose(view, [lay(1, 2.44, view.camera.origin_m[1] + 1.0, 0.0, 0.4)], SETTINGS)
@@ -219,7 +219,7 @@ def test_marker_at_the_image_edge_is_cut_off(views: list[View]) -> None:
     assert (expose(view, [lay(1, 2.44, -3.0, 0.0, 0.4)], SETTINGS) == bare).all()
 
 
-def test_a_marker_is_not_seen_from_behind(views: list[View]) -> None:
+def test_a_marker_is_not_seen_from_behind(views: list[FloorView]) -> None:
     turned = pose_facing_up(2.44, 2.44, 0.1, 0.0) @ make_pose(
         rotation(np.array([np.pi, 0.0, 0.0])), np.zeros(3)
     )
@@ -227,7 +227,7 @@ def test_a_marker_is_not_seen_from_behind(views: list[View]) -> None:
     assert (expose(views[1], [PlacedMarker(1, LENGTH_M, turned)], SETTINGS) == bare).all()
 
 
-def test_noise_has_the_stated_sigma_and_is_new_in_each_frame(views: list[View]) -> None:
+def test_noise_has_the_stated_sigma_and_is_new_in_each_frame(views: list[FloorView]) -> None:
     rng = np.random.default_rng(0)
     still = expose(views[1], [], SETTINGS)
     first, second = (render(views[1], [], SETTINGS, rng)[..., 1] - still for _ in range(2))

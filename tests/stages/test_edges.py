@@ -16,7 +16,7 @@ from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCa
 from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
 from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import plan_drive
-from ipsys_log.simulation.floor import View, prepare_view
+from ipsys_log.simulation.floor import FloorView, prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
@@ -54,7 +54,7 @@ CAMERAS = dict(zip(LAB.cameras, mount_cameras(LAB), strict=True))
 
 
 @cache
-def view(camera: str, gamma: float) -> View:
+def view(camera: str, gamma: float) -> FloorView:
     return prepare_view(CAMERAS[camera], replace(LAB, gamma=gamma))
 
 

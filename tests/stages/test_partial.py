@@ -18,7 +18,7 @@ from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.detect import Detect, decode_grey, detect_markers
-from ipsys_log.stages.detect.adjustment import Fit, Guess
+from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.partial import fit_visible_edges
 from ipsys_log.stages.detect.uneven_light import compare_pattern
 from tests.stages.drawing import (
@@ -179,7 +179,7 @@ def test_partial_fit_is_never_that_of_another_marker() -> None:
     grey = draw(VGA, [one], Look(glare=glare))
     centre = one.centre_m / SIDE_M
     fits = [fit_visible_edges(grey, [Guess(n, one.axes, centre)], DICTIONARY, VGA) for n in range(5, 100, 3)]
-    assert [isinstance(fit, Fit) for fit in fits] == [True] + [False] * (len(fits) - 1)
+    assert [isinstance(fit, MarkerFit) for fit in fits] == [True] + [False] * (len(fits) - 1)
     noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
     for empty in (np.full_like(grey, 150), noise):
         assert fit_visible_edges(empty, [Guess(5, one.axes, centre)], DICTIONARY, VGA) is None
@@ -192,7 +192,7 @@ def test_side_in_glare_makes_its_corners_uncertain() -> None:
     y, _ = np.mgrid[: VGA.height, : VGA.width]
     grey = draw(VGA, [one], Look(glare=400 * np.exp(-((y - top[1]) ** 2) / (2 * 4.0**2))))
     fit = fit_visible_edges(grey, [Guess(5, one.axes, one.centre_m / SIDE_M)], DICTIONARY, VGA)
-    assert isinstance(fit, Fit)
+    assert isinstance(fit, MarkerFit)
     sigmas_px = np.sqrt(np.diag(fit.covariance_px2)).reshape(4, 2)[:, 1]
     assert sigmas_px[:2].min() > 1.15 * sigmas_px[2:].max()
     assert np.abs(fit.corners_px - corners_px(VGA, one)).max() < 0.3
@@ -205,7 +205,7 @@ def test_partial_fit_settles_from_some_pixels_aside(where: str) -> None:
     grey = draw(VGA, [one], Look(glare=glare))
     aside = np.array([2.0, -2.0, 0.0]) * one.centre_m[2] / SIDE_M / VGA.K[0, 0]
     fit = fit_visible_edges(grey, [Guess(5, one.axes, one.centre_m / SIDE_M + aside)], DICTIONARY, VGA)
-    assert isinstance(fit, Fit)
+    assert isinstance(fit, MarkerFit)
     assert np.hypot(*(fit.corners_px - corners_px(VGA, one)).T).max() < 0.15
 
 

@@ -24,7 +24,7 @@ from ipsys_log.cli.measure_live import say_faults
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.survey.scene import CameraView
-from ipsys_log.web.connections import Limits, derive_limits
+from ipsys_log.web.connections import PageLimits, derive_limits
 from ipsys_log.web.server import PageServer, ServerExceptions, serve
 from tests.test_measure_now import Lab, still_lab
 from tests.web.test_access import Caller
@@ -104,7 +104,7 @@ def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> N
 
 
 @contextmanager
-def page_with(limits: Limits, scene: Recording | None = None) -> Iterator[tuple[Caller, PageServer]]:
+def page_with(limits: PageLimits, scene: Recording | None = None) -> Iterator[tuple[Caller, PageServer]]:
     with serve(scene or Recording(), "127.0.0.1", 0, limits) as page:
         yield Caller(page.url), page
 
@@ -131,7 +131,7 @@ def is_closed_by_page(connection: socket.socket) -> bool:
 
 
 def test_idle_connections_leave_room_for_a_phone() -> None:
-    with page_with(Limits(total=6, per_address=4)) as (caller, page):
+    with page_with(PageLimits(total=6, per_address=4)) as (caller, page):
         with ExitStack() as stack:
             held = [
                 connection
@@ -146,7 +146,7 @@ def test_idle_connections_leave_room_for_a_phone() -> None:
 
 
 def test_phone_keeps_its_connection_beside_new_ones() -> None:
-    with page_with(Limits(total=6, per_address=4)) as (caller, _):
+    with page_with(PageLimits(total=6, per_address=4)) as (caller, _):
         phone = http.client.HTTPConnection(str(caller.parts.hostname), caller.parts.port or 0, timeout=10)
         with closing(phone):
             headers = {"Cookie": sign_in(caller)}
@@ -173,7 +173,7 @@ SLOW_REQUESTS = [
 
 
 def test_slow_requests_are_closed() -> None:
-    with page_with(Limits(total=12, per_address=8, request_s=0.5)) as (caller, page):
+    with page_with(PageLimits(total=12, per_address=8, request_s=0.5)) as (caller, page):
         cookie = sign_in(caller).encode()
         with connections(caller, len(SLOW_REQUESTS)) as slow:
             for connection, start in zip(slow, SLOW_REQUESTS, strict=True):
@@ -192,7 +192,7 @@ def answers(caller: Caller) -> bool:
 def test_unread_answers_are_closed_in_time() -> None:
     scene = Recording()
     scene.views = lambda interval: [CameraView("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
-    with page_with(Limits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
+    with page_with(PageLimits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
         cookie = sign_in(caller)
         assert caller.ask("GET", "/api/views", Cookie=cookie)[0] == 200
         request = f"GET /picture/red/1 HTTP/1.1\r\nHost: localhost\r\nCookie: {cookie}\r\n\r\n".encode()
@@ -205,7 +205,7 @@ def test_unread_answers_are_closed_in_time() -> None:
 
 
 def test_noise_on_the_port_stays_off_the_screen(capfd: pytest.CaptureFixture[str]) -> None:
-    with page_with(Limits(total=6, per_address=4)) as (caller, page):
+    with page_with(PageLimits(total=6, per_address=4)) as (caller, page):
         for noise in (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET\r\n\r\n", b"\0" * (1 << 17)):
             with connections(caller, 1) as (noisy,):
                 noisy.sendall(noise)

@@ -6,7 +6,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunk_messages import chunk_entries
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.findings import Survey
@@ -17,7 +17,7 @@ from ipsys_log.log.summary import Summary, load_contents, read_summary
 __all__ = ["count_by_indexes", "disagreement"]
 
 
-def disagreement(view: View, findings: Survey) -> str:
+def disagreement(view: LogBytes, findings: Survey) -> str:
     """Return the first disagreement of a log with its survey, "" if there is none."""
     try:
         loaded, summary = load_contents(view), read_summary(view)
@@ -42,7 +42,7 @@ def disagreement(view: View, findings: Survey) -> str:
     return difference if difference or summary is None else _summary_disagreement(summary, surveyed, findings)
 
 
-def count_by_indexes(view: View) -> int:
+def count_by_indexes(view: LogBytes) -> int:
     """Return the number of messages that a reader finds by the summary and the message indexes."""
     contents = load_contents(view)
     total = sum(map(len, contents.unchunked.values()))
@@ -51,7 +51,7 @@ def count_by_indexes(view: View) -> int:
     return total
 
 
-def _check_lengths(view: View, start: int) -> None:
+def _check_lengths(view: LogBytes, start: int) -> None:
     """Refuse a summary with wrong lengths: a reader that trusts them would read too much."""
     for record_at in walk(view, start, view.size):
         if record_at.opcode == Opcode.FOOTER:

@@ -10,7 +10,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import ChunkContents
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.regions import DamagedRange
@@ -62,7 +62,7 @@ class Definitions:
             if checked and statistics and counts == (statistics.schema_count, statistics.channel_count):
                 self._sure = contents
 
-    def add_record(self, view: View, record_at: RecordAt, *, doubtful: bool = False) -> None:
+    def add_record(self, view: LogBytes, record_at: RecordAt, *, doubtful: bool = False) -> None:
         """Add a Schema or Channel record outside of chunks; `doubtful` says that damage is near.
 
         Raises
@@ -103,7 +103,7 @@ class Definitions:
 
     def take_chunk(
         self,
-        view: View,
+        view: LogBytes,
         offset: int,
         inside: ChunkContents,
         *,
@@ -142,7 +142,7 @@ class Definitions:
             self._schema_at.setdefault(key, offset)
         self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
 
-    def ensure_channel(self, view: View, offset: int, channel_id: int) -> None:
+    def ensure_channel(self, view: LogBytes, offset: int, channel_id: int) -> None:
         """Ensure that the channel of a message at `offset` is defined, if necessary by a placeholder.
 
         Raises
@@ -280,7 +280,7 @@ class Definitions:
         rooms = islice(self.free_ranges, self._full, self._full + _MOST_FREE_RANGES)
         return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
-    def _by_one_bit(self, view: View, offset: int, channel_id: int) -> mcap.Channel | None:
+    def _by_one_bit(self, view: LogBytes, offset: int, channel_id: int) -> mcap.Channel | None:
         """Return the channel without messages whose id differs from `channel_id` in one bit.
 
         If this channel has messages after the message at `offset`, the id in that message is wrong.
@@ -297,7 +297,7 @@ class Definitions:
         return replace(records[0], id=channel_id) if len(records) == 1 else None
 
 
-def _has_message(view: View, start: int, channel_id: int) -> bool:
+def _has_message(view: LogBytes, start: int, channel_id: int) -> bool:
     """Return whether a message of a channel lies outside of chunks, from `start` up to the next damage."""
     with suppress(LogError):
         for record_at in walk(view, start, view.size):

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from mcap.opcode import Opcode
 
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import ChunkContents
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.definitions import Definitions
@@ -67,7 +67,7 @@ class Survey:
     `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
     """
 
-    view: View
+    view: LogBytes
     resync: Resync
     definitions: Definitions
     salvage: Salvage | None = None

@@ -12,7 +12,7 @@ from itertools import islice
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import parse_chunk_contents, unpack
 from ipsys_log.log.records import (
     DATA_END,
@@ -74,7 +74,7 @@ class Resync:
     `budget` limits the bytes that are searched without result.
     """
 
-    view: View
+    view: LogBytes
     channels: Container[int] = ()
     chunked: bool | None = None
     span_ns: tuple[int, int] | None = None
@@ -272,7 +272,7 @@ class Resync:
         return True
 
 
-def is_index(view: View, record: RecordAt) -> bool:
+def is_index(view: LogBytes, record: RecordAt) -> bool:
     """Return whether a MessageIndex record has the length that its entries need."""
     if record.length < INDEX_HEAD.size:
         return False
@@ -280,7 +280,7 @@ def is_index(view: View, record: RecordAt) -> bool:
     return bool(length == size + 6 and size % 16 == 0)
 
 
-def check_exact(view: View, record: RecordAt, padding: int | None = None) -> None:
+def check_exact(view: LogBytes, record: RecordAt, padding: int | None = None) -> None:
     """Refuse a Schema, Channel or Metadata record with wrong lengths, or with more than `padding` zeros."""
     data = view.read(record.offset, record.length)
     rest = data[len(to_bytes(parse_exact(view, record, data))) :]
@@ -288,7 +288,7 @@ def check_exact(view: View, record: RecordAt, padding: int | None = None) -> Non
         raise view.fault(record.offset, "a record holds more than its fields")
 
 
-def attachment_crc(view: View, record: RecordAt) -> tuple[int, int]:
+def attachment_crc(view: LogBytes, record: RecordAt) -> tuple[int, int]:
     """Return the stated CRC of an attachment (0: none), and its computed CRC.
 
     Raises
@@ -311,7 +311,7 @@ def attachment_crc(view: View, record: RecordAt) -> tuple[int, int]:
     return stored, crc_of(view, record.length - HEADER.size - 4, record.offset + HEADER.size) if stored else 0
 
 
-def crc_of(view: View, length: int, start: int = 0, crc: int = 0) -> int:
+def crc_of(view: LogBytes, length: int, start: int = 0, crc: int = 0) -> int:
     """Return the CRC-32 of a byte range of the file, continued from `crc`."""
     for offset in range(start, start + length, _BLOCK):
         crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)

@@ -11,7 +11,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunk_builder import IMAGES, ChunkBuilder
 from ipsys_log.log.chunks import ChunkContents, parse_chunk_contents, unpack
 from ipsys_log.log.damage.definitions import Definitions, placeholder
@@ -94,7 +94,7 @@ class Salvage:
 
     def save(
         self,
-        view: View,
+        view: LogBytes,
         damaged_range: DamagedRange,
         rows: Rows,
         definitions: Definitions,
@@ -194,7 +194,7 @@ def _note(damaged_range: DamagedRange, records: _Records, count: int, *, complet
     return f"{chunk_text}: one of its messages is damaged, but it is unknown which, so none was saved"
 
 
-def _records_of(view: View, damaged_range: DamagedRange) -> _Records | None:
+def _records_of(view: LogBytes, damaged_range: DamagedRange) -> _Records | None:
     """Decode a chunk as far as possible; return None if there is no chunk."""
     head = view.read(damaged_range.offset, min(_HEAD.size + 4 + _SIZE.size, damaged_range.length))
     if len(head) < _HEAD.size + _SIZE.size:
@@ -226,7 +226,7 @@ def _records_of(view: View, damaged_range: DamagedRange) -> _Records | None:
     return _Records(data, checked, is_wrong, ends_early, bool(name), data_offset, size, span)
 
 
-def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
+def _decode(view: LogBytes, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
     """Decode compressed bytes up to their end, an error, or the size limit.
 
     Return the data, and whether an error or the limit stopped the decoder.
@@ -253,14 +253,14 @@ def _decompressor(name: bytes) -> Callable[[bytes], bytes]:
     return decompress
 
 
-def _pieces(view: View, offset: int, length: int) -> Iterator[bytes]:
+def _pieces(view: LogBytes, offset: int, length: int) -> Iterator[bytes]:
     for position in range(offset, offset + length, _READ):
         block = view.read(position, min(_READ, offset + length - position))
         for start in range(0, len(block), _PIECE):
             yield block[start : start + _PIECE]
 
 
-def up_to_first_hole(view: View, offset: int, length: int) -> int:
+def up_to_first_hole(view: LogBytes, offset: int, length: int) -> int:
     """Return the number of bytes before the first sector of zeros."""
     zeros = bytes(_SECTOR)
     sector = offset + -offset % _SECTOR
@@ -285,7 +285,7 @@ class _PlausibleRecords(NamedTuple):
 
 
 def _plausible_records(
-    view: View, records: _Records, rows: Rows, channels: Mapping[int, object]
+    view: LogBytes, records: _Records, rows: Rows, channels: Mapping[int, object]
 ) -> _PlausibleRecords:
     data = records.data
     named = {(channel, time_ns, offset) for channel, entries in rows.items() for time_ns, offset in entries}
@@ -310,7 +310,7 @@ def _head(data: Buffer, position: int) -> tuple[int, int, int]:
     return opcode, position, HEADER.size + length
 
 
-def _is_plausible(view: View, data: Buffer, record: RecordAt, inside: ChunkContents) -> bool:
+def _is_plausible(view: LogBytes, data: Buffer, record: RecordAt, inside: ChunkContents) -> bool:
     """Return whether the record may lie in a chunk; add its definitions to `inside`."""
     if record.opcode == Opcode.MESSAGE:
         return MESSAGE.size <= record.length <= _MOST

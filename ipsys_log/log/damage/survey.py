@@ -7,7 +7,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError
-from ipsys_log.log.byte_source import View
+from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import ChunkContents, inner_records, parse_chunk_contents, unpack
 from ipsys_log.log.damage.definitions import Definitions
 from ipsys_log.log.damage.findings import (
@@ -47,7 +47,7 @@ _LONGEST_HEADER = 1 << 20  # bytes
 
 
 def survey(
-    view: View, known: Summary | None = None, salvage: Salvage | None = None, *, doubtful: bool = False
+    view: LogBytes, known: Summary | None = None, salvage: Salvage | None = None, *, doubtful: bool = False
 ) -> Survey:
     """Check the data section record by record, without trusting lengths or raising errors for damage.
 
@@ -296,7 +296,7 @@ def _check_without_crc(findings: Survey, record: RecordAt) -> None:
         )
 
 
-def _check_definitions(view: View, offset: int, data: bytes) -> None:
+def _check_definitions(view: LogBytes, offset: int, data: bytes) -> None:
     """Refuse a chunk without CRC whose definitions have wrong lengths."""
     for record_at in inner_records(view, offset, data):
         if record_at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -350,7 +350,7 @@ def _take_index(findings: Survey, record: RecordAt) -> None:
         findings.damaged[-1].length += record.length
 
 
-def _index_rows(view: View, record: RecordAt) -> tuple[int, list[tuple[int, int]]]:
+def _index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, int]]]:
     """Return the channel of a MessageIndex record, and the log times and offsets of its messages."""
     body = view.read(record.offset, record.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")

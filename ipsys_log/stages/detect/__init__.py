@@ -40,8 +40,8 @@ from ipsys_log.messages.channels import (
     RIG,
     RUN_EVENTS,
 )
-from ipsys_log.messages.stage import Plan, Stage, View
-from ipsys_log.stages.detect.edges import Fit
+from ipsys_log.messages.stage import Plan, Stage, StageView
+from ipsys_log.stages.detect.edges import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
 from ipsys_log.units import NS_PER_S
@@ -221,7 +221,7 @@ def check_corners(name: str) -> str:
     return name
 
 
-def _marker(fit: Fit) -> Marker:
+def _marker(fit: MarkerFit) -> Marker:
     # In single precision, as in the log: the next stages must read the same numbers from both.
     covariance_px2 = fit.covariance_px2.astype(np.float32).astype(np.float64)
     return Marker(fit.pose.id, fit.corners_px, covariance_px2, edge_offset_px=fit.edge_offset_px)
@@ -281,7 +281,7 @@ def skipped_frames(events: Iterable[Event]) -> set[int]:
     return {event.timestamp for event in events if event.kind == FRAME_SKIPPED}
 
 
-def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     if not view.cameras:
         return view.newest(MARKERS)
     import scipy.special  # noqa: F401 - before the first frame, which must not wait for it

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.lenses import project
 from ipsys_log.images.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints
-from ipsys_log.stages.detect.profiles import Poses, View
+from ipsys_log.stages.detect.profiles import MarkerView, Poses
 
-__all__ = ["Fit", "Guess", "edge_derivatives", "inside_image", "outline", "poses_of", "prior", "solve"]
+__all__ = ["Guess", "MarkerFit", "edge_derivatives", "inside_image", "outline", "poses_of", "prior", "solve"]
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Guess(NamedTuple):
     blurred: NDArray[np.bool_] = _SHARP
 
 
-class Fit(NamedTuple):
+class MarkerFit(NamedTuple):
     """A marker's pose, its corners, and their covariance (8, 8) in the order x0 y0 .. x3 y3.
 
     ``edge_offset_px`` is the edge offset into the black, ``rms_px`` the RMS residual of the edges, and
@@ -119,7 +119,7 @@ def edge_derivatives(prints: Prints, camera: Array, slopes: Array, late: Array, 
     return rows
 
 
-def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
+def outline(view: MarkerView, poses: Poses) -> tuple[Array, Array, Array]:
     """Return the corners, their derivatives and the grey levels of the cells of m markers.
 
     Returns

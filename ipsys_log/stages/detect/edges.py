@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from ipsys_log.images.decode import Grey
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
-    Fit,
     Guess,
+    MarkerFit,
     edge_derivatives,
     inside_image,
     outline,
@@ -31,9 +31,9 @@ from ipsys_log.stages.detect.adjustment import (
     solve,
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
-from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, Poses, View, measure
+from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, MarkerView, Poses, measure
 
-__all__ = ["Fit", "Guess", "fit_edges"]
+__all__ = ["Guess", "MarkerFit", "fit_edges"]
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def fit_edges(
     edge_offset_px: float | None = None,
     row_time_s: float = 0.0,
     blur_px: float | None = None,
-) -> list[Fit | None]:
+) -> list[MarkerFit | None]:
     """Fit marker poses to an image.
 
     Parameters
@@ -92,7 +92,7 @@ def fit_edges(
         return [next(fits) if ok else None for ok in possible]
     if not guesses:
         return []
-    view = View(
+    view = MarkerView(
         grey, lens, build_prints(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px
     )
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
@@ -101,7 +101,7 @@ def fit_edges(
     uneven = _uneven(view.prints, settled, colours)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
-        Fit(
+        MarkerFit(
             Guess(guess.id, settled.poses.rotations[n], settled.poses.centres[n], None, settled.blurred[n]),
             corners_px[n],
             covariances_px2[n],
@@ -148,7 +148,7 @@ class _Settled(NamedTuple):
 
 
 def _settle_all(
-    view: View, guesses: Sequence[Guess], edge_offset_px: float | None
+    view: MarkerView, guesses: Sequence[Guess], edge_offset_px: float | None
 ) -> tuple[_Settled, tuple[Array, Array, Array]]:
     """Fit markers until they converge; repeat the fit if edges are blurred; return fits and outlines."""
     settled = _settle(view, guesses, edge_offset_px, np.array([guess.blurred for guess in guesses]))
@@ -164,7 +164,7 @@ def _settle_all(
 
 
 def _sharpened(
-    view: View,
+    view: MarkerView,
     guesses: Sequence[Guess],
     edge_offset_px: float | None,
     blurred: NDArray[np.bool_],
@@ -186,7 +186,7 @@ def _sharpened(
 
 
 def _settle(
-    view: View, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
+    view: MarkerView, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
 ) -> _Settled:
     """Move markers until they converge; ``blurred`` (m, 2) marks the axes across which edges are blurred."""
     poses = poses_of(guesses)

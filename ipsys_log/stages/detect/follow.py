@@ -13,7 +13,7 @@ from ipsys_log.geometry.square_pose import is_convex, solve_squares
 from ipsys_log.images.decode import Grey, decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.changes import ChangeDetector
-from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
+from ipsys_log.stages.detect.edges import Guess, MarkerFit, fit_edges
 from ipsys_log.stages.detect.motion import LONG_S, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.partial import Rejection, fit_visible_edges, resembles
 from ipsys_log.stages.detect.search import (
@@ -98,7 +98,7 @@ class MarkerTracker:
         last = {rejection.id: rejection for rejection in self._rejections if rejection.id not in fitted}
         return [last[n] for n in sorted(last)]
 
-    def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
+    def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[MarkerFit], int, int]:
         """Return the markers in a frame, sorted by id, and its width and height; an id can occur twice.
 
         A frame that raises an error does not affect the frames after it.
@@ -146,7 +146,7 @@ class MarkerTracker:
 
     def _look_again(
         self, frame: CompressedImage | RawImage, time_ns: int, whole: bool
-    ) -> tuple[Grey, list[slice], dict[int, Fit], set[int]]:
+    ) -> tuple[Grey, list[slice], dict[int, MarkerFit], set[int]]:
         """Follow the markers of the last frame.
 
         Returns
@@ -175,7 +175,7 @@ class MarkerTracker:
             grey, rows = decode_rows(frame)
         return grey, rows, seen, lost
 
-    def _fit(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
+    def _fit(self, grey: Grey, guesses: Sequence[Guess]) -> list[MarkerFit | None]:
         fits = self._fit_as_guessed(grey, guesses)
         unknown = [n for n, guess in enumerate(guesses) if guess.motion is None]
         if not self._row_time_s or not unknown:
@@ -188,7 +188,7 @@ class MarkerTracker:
                 fits[n] = still
         return fits
 
-    def _fit_as_guessed(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
+    def _fit_as_guessed(self, grey: Grey, guesses: Sequence[Guess]) -> list[MarkerFit | None]:
         return fit_edges(
             grey,
             guesses,
@@ -206,9 +206,9 @@ class MarkerTracker:
         self,
         grey: Grey,
         guesses: Sequence[Sequence[Guess]],
-        fits: Sequence[Fit | None],
+        fits: Sequence[MarkerFit | None],
         near: bool = False,
-    ) -> list[Fit | None]:
+    ) -> list[MarkerFit | None]:
         """Return the fits; replace those of markers in uneven light by fits to their visible edges."""
         better = list(fits)
         for n, (poses, fit) in enumerate(zip(guesses, fits, strict=True)):
@@ -228,7 +228,7 @@ class MarkerTracker:
                 self._known_blur_px(),
                 near,
             )
-            if isinstance(part, Fit):
+            if isinstance(part, MarkerFit):
                 better[n] = part
             elif fit is not None and (fit.rms_px > _DISTURBED_PX or fit.pose.blurred.any()):
                 better[n] = None
@@ -237,8 +237,8 @@ class MarkerTracker:
         return better
 
     def _with_speed(
-        self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[Fit | None]
-    ) -> list[Fit | None]:
+        self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[MarkerFit | None]
+    ) -> list[MarkerFit | None]:
         """Return the fits; with a rolling shutter, repeat those whose track gives a new speed."""
         if not self._row_time_s:
             return fits
@@ -252,8 +252,8 @@ class MarkerTracker:
         return [better.get(n) or fit for n, fit in enumerate(fits)]
 
     def _add(
-        self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate], better: float = 1.0
-    ) -> list[Fit]:
+        self, grey: Grey, fits: list[MarkerFit], candidates: Iterable[Candidate], better: float = 1.0
+    ) -> list[MarkerFit]:
         """Return the fits and those of the candidates that are not among them.
 
         If two poses look alike, the function selects the upright pose. It selects the other pose if the
@@ -310,7 +310,7 @@ class MarkerTracker:
         px[~ahead] = -1e6
         return [*px]
 
-    def _remember(self, followed: Sequence[int], fits: Sequence[Fit], frame_ns: int) -> None:
+    def _remember(self, followed: Sequence[int], fits: Sequence[MarkerFit], frame_ns: int) -> None:
         """Extend the tracks by ``fits``: first the fits of followed tracks, in their order, then new fits."""
         # A marker that is lost and detected again in the same frame continues its old track.
         left = {t[0].pose.id: t for n, t in enumerate(self._tracks) if n not in followed}
@@ -325,13 +325,13 @@ class MarkerTracker:
             self._breadth_px = max(float(np.ptp(fit.corners_px, axis=0).min()) for fit in fits)
 
 
-def _among(marker_id: int, corners_px: Array, fits: Iterable[Fit]) -> bool:
+def _among(marker_id: int, corners_px: Array, fits: Iterable[MarkerFit]) -> bool:
     return any(
         fit.pose.id == marker_id and np.abs(fit.corners_px - corners_px).max() < _SAME_PX for fit in fits
     )
 
 
-def _jumped(outlines_px: Sequence[Array], fits: Sequence[Fit | None]) -> bool:
+def _jumped(outlines_px: Sequence[Array], fits: Sequence[MarkerFit | None]) -> bool:
     return any(
         fit is not None and np.abs(fit.corners_px - outline_px).max() > _JUMP_PX
         for outline_px, fit in zip(outlines_px, fits, strict=True)

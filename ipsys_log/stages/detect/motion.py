@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.poses import rotation, rotation_vector
-from ipsys_log.stages.detect.edges import Fit, Guess
+from ipsys_log.stages.detect.edges import Guess, MarkerFit
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LONG_S", "Track", "extend", "predict", "same_speed"]
@@ -37,7 +37,7 @@ class MarkerSighting(NamedTuple):
 Track = tuple[MarkerSighting, ...]
 
 
-def extend(track: Track, fit: Fit, frame_ns: int, row_time_s: float) -> Track:
+def extend(track: Track, fit: MarkerFit, frame_ns: int, row_time_s: float) -> Track:
     """Return a track, possibly empty, with the new fit of its marker in front.
 
     Parameters

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from ipsys_log.images.decode import Grey
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
-    Fit,
     Guess,
+    MarkerFit,
     edge_derivatives,
     inside_image,
     outline,
@@ -28,7 +28,7 @@ from ipsys_log.stages.detect.adjustment import (
     solve,
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
-from ipsys_log.stages.detect.profiles import EdgePositions, Poses, View, locate, read_profiles
+from ipsys_log.stages.detect.profiles import EdgePositions, MarkerView, Poses, locate, read_profiles
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
@@ -85,7 +85,7 @@ def resembles(grey: Grey, lens: CameraCalibration, dictionary: str, guesses: Seq
     if not guesses:
         return False
     marker_id = guesses[0].id
-    view = View(grey, lens, build_prints(dictionary, (marker_id,) * len(guesses)), 0.0, None)
+    view = MarkerView(grey, lens, build_prints(dictionary, (marker_id,) * len(guesses)), 0.0, None)
     *_, levels = outline(view, poses_of(guesses))
     return any(compare_pattern(row, dictionary, marker_id).possible for row in levels)
 
@@ -99,7 +99,7 @@ def fit_visible_edges(
     row_time_s: float = 0.0,
     blur_px: float | None = None,
     near: bool = False,
-) -> Fit | Rejection | None:
+) -> MarkerFit | Rejection | None:
     """Fit one marker to its visible edges.
 
     Parameters
@@ -201,7 +201,7 @@ class _PartialFit:
     def _move(self, state: _State, number: int) -> tuple[_State, _Solved]:
         """Return hypotheses after one pass of least squares, and the residuals before it."""
         count = len(state.without)
-        view = View(
+        view = MarkerView(
             self._grey,
             self._lens,
             build_prints(self._dictionary, (self._id,) * count),
@@ -239,7 +239,7 @@ class _PartialFit:
         solved = _Solved(rows, normal, unknowns, weights, left_px, steps.clear, costs, blur_px)
         return _State(poses, motions, state.without), solved
 
-    def _steps(self, view: View, sites: EdgePositions, number: int) -> tuple[Steps, float, float]:
+    def _steps(self, view: MarkerView, sites: EdgePositions, number: int) -> tuple[Steps, float, float]:
         """Return the steps at edges, their blur, and the least residual from which weights may be 0."""
         farthest_px = _FAR_PX if number < _ROUGH else _NEAR_PX
         cell_px = float(np.quantile(sites.slopes[0], 0.2)) / view.prints.cells
@@ -254,11 +254,11 @@ class _PartialFit:
                 self._blur_px = blur_px
         return exact_steps(view.prints, profiles, reach_px, blur_px), blur_px, _CUT_PX
 
-    def judge(self, settled: tuple[_State, _Solved]) -> Fit | Rejection | None:
+    def judge(self, settled: tuple[_State, _Solved]) -> MarkerFit | Rejection | None:
         """Return the fit of the best hypothesis, a rejection, or None if the marker is absent."""
         state, solved = settled
         n = self._choose(state, solved)
-        view = View(
+        view = MarkerView(
             self._grey, self._lens, build_prints(self._dictionary, (self._id,)), self._row_time_s, None
         )
         corners_px, slopes, levels = outline(view, state.only(np.array([n])).poses)
@@ -284,7 +284,7 @@ class _PartialFit:
         pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
         spread_px = float(np.sqrt(solved.variance_px2(n)))
         offset_px = float(solved.unknowns[n, 6])
-        return Fit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
 
     def _choose(self, state: _State, solved: _Solved) -> int:
         """Return the hypothesis with all sides, or the hypothesis without a completely disturbed side."""

@@ -20,8 +20,8 @@ __all__ = [
     "USUAL_BLUR_PX",
     "EdgeMeasurements",
     "EdgePositions",
+    "MarkerView",
     "Poses",
-    "View",
     "locate",
     "measure",
     "read_profiles",
@@ -47,7 +47,7 @@ _WEAK = 0.3
 _HORIZON = 1e4
 
 
-class View(NamedTuple):
+class MarkerView(NamedTuple):
     """An image, the intrinsics of its camera, and the prints of the markers to measure in it."""
 
     grey: Grey
@@ -136,7 +136,7 @@ class EdgeMeasurements(NamedTuple):
         return self.profiles[..., :: len(_TAPS) - 1]
 
 
-def locate(view: View, poses: Poses, motions: Array) -> EdgePositions:
+def locate(view: MarkerView, poses: Poses, motions: Array) -> EdgePositions:
     """Return the predicted positions of edges.
 
     Parameters
@@ -175,7 +175,7 @@ def read_profiles(grey: Grey, sites: EdgePositions, reaches_px: Array, taps: Arr
     return levels_at(grey, x, y)
 
 
-def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> EdgeMeasurements:
+def measure(view: MarkerView, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> EdgeMeasurements:
     """Measure profiles across the edges, near their predicted positions.
 
     Parameters
@@ -229,7 +229,7 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
     return (0.5 - white) * width_px * prints.polarity, width_px, real & (rise > 0)
 
 
-def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
+def _blurs(view: MarkerView, profiles: Array, reaches_px: Array, wide: bool) -> Array:
     """Estimate the blur of the edges of each marker in px, by the least residual of the mean profile."""
     if view.blur_px is not None or wide:
         return np.full(len(profiles), view.blur_px or USUAL_BLUR_PX)

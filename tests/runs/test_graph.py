@@ -140,7 +140,7 @@ def test_rows_have_the_names_of_their_entries() -> None:
 
 def test_added_stage_is_a_command_in_the_help() -> None:
     *_, stage_panel, _ = ipsys_with_smoothing("--help").split("\n╭─ ")
-    assert stage_panel.startswith("The stages of replay, one by one")
+    assert stage_panel.startswith("Single stages of replay")
     assert "Smooth the tracks." in stage_panel.splitlines()[-2]
     text = ipsys_with_smoothing("smooth", "--help")
     assert all(option in text for option in ("--weight", "--model", "--method", "--corners", "--json"))

@@ -93,8 +93,8 @@ def test_base_commands_without_extras_work(folder: Path) -> None:
         ["calibrate", "--board", "6x4", "new.mcap"],
     )
     assert [code for code, *_ in results[:-1]] == [0] * 6, results
-    assert results[3][1].endswith("a replay equals the log\n")
-    assert "is not seen in any of" in results[-1][2]
+    assert results[3][1].endswith("the replay is identical to the log\n")
+    assert "is not found in any of" in results[-1][2]
     log = (folder / "live.mcap").read_bytes()
     (folder / "live.mcap").write_bytes(log[: len(log) * 3 // 4])
     ((code, out, err),) = run_without(folder, ["repair", "live.mcap"])

@@ -450,7 +450,7 @@ def test_calibration_is_scaled_to_another_size_of_the_same_shape(
         )
     with streams(pictures[0], tmp_path) as rig:
         done = ipsys(*once, tmp_path / "b.mcap", "--calibration", f"red={lens(640, 480)}")
-        assert "camera red: its calibration is scaled from 640 to 320 px" in done.err
+        assert "camera red: its calibration is scaled from a width of 640 px to 320 px" in done.err
     video = encode(pictures[0].parent, "red.mp4", "-c:v", "libx264", "-bf", "0", "-pix_fmt", "yuv420p")
     rig.write_text(re.sub(r"http://\S+/red", f"file:{video}", rig.read_text()))
     done = ipsys(*once, tmp_path / "c.mcap", "--calibration", f"red={lens(640, 400)}")
@@ -469,7 +469,7 @@ def test_input_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -
     files = {path: path.read_bytes() for path in (played, rig, lens)}
     once = ("--rig", rig, "--calibration", lens, "--force", "--seconds", "1", "-o")
     for path, said in (
-        (played, "is what camera red plays"),
+        (played, "is the source of camera red"),
         (lens, "is a calibra"),
     ):
         assert said in ipsys("record", *once, path).err

@@ -243,6 +243,8 @@ def test_frames_that_were_skipped_stay_skipped(
     assert markers == frames - len(skipped)
 
 
+# A live recording until a real disk is full, then a replay of it.
+@pytest.mark.slow
 def test_a_full_disk_ends_live_with_runs_that_are_signed(
     ipsys: Ipsys,
     rig: Path,

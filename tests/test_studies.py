@@ -168,6 +168,8 @@ def test_a_wrong_side_is_found_named_and_put_right(ipsys: Ipsys, tmp_path: Path)
     assert (first["measurement"], first["kind"]) == ("m13", "side")
 
 
+# The published data with two models.
+@pytest.mark.slow
 def test_wrong_point_of_the_authors_ranks_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     """Training pair 11 of the white camera contradicts its neighbours by 8 to 14 cm."""
     log = tmp_path / "imsel.mcap"

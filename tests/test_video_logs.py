@@ -69,6 +69,8 @@ def found_markers(log: Path) -> dict[tuple[str, int], list[int]]:
         }
 
 
+# Two whole replays; their detections are compared in the fast tier.
+@pytest.mark.slow
 def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
     tracks = []
     for log in (video, lab):

@@ -40,7 +40,9 @@ __all__ = [
     "writes",
 ]
 
-STAGES: tuple[Stage, ...] = tuple(import_module(entry.module).STAGE for entry in ENTRIES)
+STAGES: tuple[Stage, ...] = tuple(
+    import_module(f"ipsys_log.stages.{entry.module}").STAGE for entry in ENTRIES
+)
 VERSIONS: dict[str, int] = {name: number for stage in STAGES for name, number in stage.versions.items()}
 
 

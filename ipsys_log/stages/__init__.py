@@ -53,8 +53,8 @@ class StageEntry:
 
     @property
     def module(self) -> str:
-        """Return the name of the module with the row, ``STAGE``."""
-        return f"{__name__}.{self.name.replace('-', '_')}"
+        """Return the name of the module with the row, ``STAGE``, in this package."""
+        return self.name.replace("-", "_")
 
 
 CORNERS = StageParameter(

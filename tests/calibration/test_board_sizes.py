@@ -61,6 +61,8 @@ STRIPES = [
 ]
 
 
+# A search over a rendered set of images.
+@pytest.mark.slow
 @pytest.mark.parametrize("stripes", STRIPES)
 def test_board_over_stripes_right_size_gives_the_lens(stripes: tuple[float, float, float]) -> None:
     """The edge of the paper before a dark stripe looks like another row of corners."""

@@ -115,6 +115,8 @@ def test_pinhole_on_a_fisheye_is_refused() -> None:
         calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"])
 
 
+# A second solution of the same images.
+@pytest.mark.slow
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     result = calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"], force=True)
     assert result.rms_px > 2

@@ -271,6 +271,8 @@ def pairs(log: Path) -> dict[tuple[str, str], Pair]:
     return seen
 
 
+# Two whole measuring sessions, one with a full recording.
+@pytest.mark.slow
 def test_few_frames_give_the_points_of_a_full_recording(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
     places, whole = tmp_path / "places.mcap", tmp_path / "whole.mcap"
     sent = stretched(lab_log, 18)

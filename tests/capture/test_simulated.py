@@ -135,6 +135,8 @@ def test_stations_do_not_depend_on_the_frame_size() -> None:
     assert plans[0] == plans[1] == plans[2]
 
 
+# Renders a board in many poses and calibrates.
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["6x4", "charuco:4x5"])
 def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None:
     """The images give the intrinsics as with the command; the simulator knows the focal length."""

@@ -288,6 +288,8 @@ def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     )
 
 
+# All photographs of a real set; tests/calibration has the refusal on rendered corners.
+@pytest.mark.slow
 def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     folder = data / "fisheye_chessboard"
     done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
@@ -320,6 +322,8 @@ def test_invalid_sources_are_refused(ipsys: Ipsys, red: Path, tmp_path: Path) ->
     )
 
 
+# All photographs of a real set; rendered corners are in tests/calibration.
+@pytest.mark.slow
 def test_photographs_through_a_lens_of_more_than_180_degrees(
     ipsys: Ipsys, data: Path, tmp_path: Path
 ) -> None:
@@ -354,6 +358,8 @@ def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, cam
     assert len(found["pictures"]["used"]) >= 28
 
 
+# Two whole calibrations for each codec.
+@pytest.mark.slow
 @pytest.mark.parametrize("codec", [("-c:v", "libx264", "-g", "5"), ("-c:v", "libx265", "-x265-params",
                                    "keyint=5:bframes=0:log-level=none")])  # fmt: skip
 def test_a_recorded_video_gives_the_lens_of_its_pictures(

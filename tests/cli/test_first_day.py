@@ -248,6 +248,8 @@ def test_figure_without_a_valid_suffix_is_refused_first(
     assert not (lab.parent / "floor").exists()
 
 
+# Ten replays, two for each kind of file.
+@pytest.mark.slow
 def test_a_picture_is_what_its_name_says(ipsys: Ipsys, detected_lab: Path) -> None:
     begins = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml", "jpg": b"\xff\xd8", "webp": b"RIFF"}
     for kind, magic in begins.items():

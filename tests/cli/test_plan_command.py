@@ -167,6 +167,8 @@ def test_figure_of_the_plan_is_drawn(ipsys: Ipsys, fitted: Path) -> None:
     assert sorted(path.name for path in fitted.parent.iterdir()) == ["paper.mcap", "plan.png"]
 
 
+# Plans ten points on the published data.
+@pytest.mark.slow
 def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -> None:
     found = planned(ipsys, authors, "--train", "train_10", "--places", 6)
     with Session([authors]) as session:

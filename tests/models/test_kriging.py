@@ -104,6 +104,8 @@ def test_duplicate_points_do_not_break_the_fit() -> None:
 _TOO_FEW = {"check_regressor_multioutput": "has fewer rows than a linear trend of its columns needs"}
 
 
+# The checks of scikit-learn: dozens of fits.
+@pytest.mark.slow
 @pytest.mark.parametrize("noisy", [False, True])
 def test_estimator_passes_scikit_learn_checks(noisy: bool) -> None:
     with warnings.catch_warnings():

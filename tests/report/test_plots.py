@@ -67,6 +67,8 @@ def test_the_table_of_cross_validation_is_the_json(paper: Findings) -> None:
         assert row["within_95"] == f"{figures['within']['95']:.4f}"
 
 
+# Draws every figure of two models.
+@pytest.mark.slow
 def test_all_files_are_there_and_differ_between_models(paper: Findings, tmp_path: Path) -> None:
     for model in ("rigid", "poly"):
         assert set(write_plots(only(paper, model), tmp_path / "deep" / model)) == ALL_FILES

@@ -189,5 +189,5 @@ def test_many_runs_of_a_stage_are_counted(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "lab.mcap"
     write_log(log, lab_messages())
     models = [word for name in ("rigid", "poly", "rayplane", "best", "kriging") for word in ("--model", name)]
-    assert "fit           5 runs made" in ipsys("fit", log, *models).err
+    assert "fit           5 runs computed" in ipsys("fit", log, *models).err
     assert "fit           5 runs up to date" in ipsys("fit", log, *models).err

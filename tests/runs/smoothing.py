@@ -66,7 +66,7 @@ STAGE = Stage(
 
 def _add_stage() -> None:
     """Add the stage to the tables of the program before it reads them, as its file would."""
-    sys.modules[ENTRY.module] = sys.modules[__name__]
+    sys.modules[f"ipsys_log.stages.{ENTRY.module}"] = sys.modules[__name__]
     stages.ENTRIES = (*stages.ENTRIES, ENTRY)
     channels.CHANNELS = (*channels.CHANNELS, SMOOTHED_TRACKS)
 

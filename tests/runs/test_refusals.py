@@ -140,11 +140,11 @@ CASES: dict[str, Case] = {
     "no_rig": Case(said="has no rig", change=without(Rig)),
     "no_calibration": Case(said="camera black has no calibration", change=without(CameraCalibration)),
     "no_calibration_edges": Case(
-        said="has no calibration in the log, through which edges are fitted",
+        said="has no calibration in the log, but the corner method edges needs one",
         change=without(CameraCalibration), log="lab", command="detect LOG --corners edges",
     ),
     "dictionary": Case(
-        said="marker dictionary 'DICT_X' is none of OpenCV's", change=rig(dictionary="DICT_X"), log="lab"
+        said="marker dictionary 'DICT_X' of the rig is unknown to OpenCV", change=rig(dictionary="DICT_X"), log="lab"
     ),
     "calibration": Case(
         said="takes 4 coefficients, found 3",
@@ -164,72 +164,72 @@ CASES: dict[str, Case] = {
         change=edit(CompressedImage, lambda image: replace(image, data=b"no image")),
     ),
     # Names that the user gives.
-    "corners": Case(said="there is no such method", command="replay LOG --corners x"),
+    "corners": Case(said="--corners x: is not known", command="replay LOG --corners x"),
     "method": Case(said="method 'x' is not known", command="replay LOG --method x"),
     "model": Case(said="model 'x' is not known", command="replay LOG --model x"),
     "pose": Case(
-        said="cannot take effect, the log has no markers", before="camera-frame LOG", late=True,
+        said="has no effect, because the log has no markers", before="camera-frame LOG", late=True,
         change=without(Markers), command="replay LOG --method pose",
     ),
-    "train": Case(said="no measurement is labelled 'x'", command="replay LOG --train x"),
-    "train_test": Case(said="held out to evaluate on", command="replay LOG --train test"),
+    "train": Case(said="no measurement has the label 'x'", command="replay LOG --train x"),
+    "train_test": Case(said="held out for the evaluation", command="replay LOG --train test"),
     "run_name": Case(
-        said="run mine already has the stage fit from other input", before="fit LOG --run mine",
+        said="run mine already has the stage fit with other input", before="fit LOG --run mine",
         command="replay LOG --run mine --method pose",
     ),
     # Markers and camera points of other programs.
-    "covariance": Case(said="covariance_px2 has no variance in it", change=NO_COVARIANCE),
-    "far_point": Case(said="is not a possible point", before="camera-frame LOG", late=True, change=FAR),
+    "covariance": Case(said="covariance_px2 has no variance", change=NO_COVARIANCE),
+    "far_point": Case(said="a camera point of marker 0 is impossible", before="camera-frame LOG", late=True, change=FAR),
     # Measurements.
     "two_of_one_id": Case(said="two measurements have the id 's001'", change=to("s002", id="s001")),
-    "no_marker": Case(said="s003 names no marker", change=to("s003", marker_id=None)),
+    "no_marker": Case(said="s003 has no marker", change=to("s003", marker_id=None)),
     "unknown_marker": Case(said="marker 77, which is not in the rig", change=to("s003", marker_id=77)),
     "unseen_marker": Case(
         said="marker 7, which no camera saw", before="camera-frame LOG --rig RIG",
         command="replay LOG --rig RIG", change=to("s003", marker_id=7),
     ),
-    "duplicate": Case(said="one and the same pair", before="camera-frame LOG"),
-    "no_distances": Case(said="neither a world point nor two distances", change=tape()),
+    "duplicate": Case(said="are the same pair", before="camera-frame LOG"),
+    "no_distances": Case(said="needs a world point, or two or more distances", change=tape()),
     "one_reference": Case(said="from one reference point", change=tape(A, replace(A, distance_m=1.0))),
     "unknown_reference": Case(
         said="reference point 'C' is not in the rig", change=tape(A, Distance("C", 1.0))
     ),
     "long_tape": Case(said="too long", change=tape(A, Distance("B", 1e9))),
     "no_triangle": Case(
-        said="no triangle has the sides", change=tape(Distance("A", 0.1), Distance("B", 0.1))
+        said="do not meet", change=tape(Distance("A", 0.1), Distance("B", 0.1))
     ),
-    "no_side": Case(said="say whether the place is", change=tape(A, B, side=None)),
-    "wrong_side": Case(said="neither 'left' nor 'right'", change=tape(A, B, side="up")),
+    "no_side": Case(said="the distances fit on both sides; give the side", change=tape(A, B, side=None)),
+    "wrong_side": Case(said="side 'up' of AB is not valid", change=tape(A, B, side="up")),
     "no_distance": Case(said="not all above 0", change=tape(A, B, Distance("B", -1.0))),
-    "no_sigma": Case(said="is no standard deviation", change=tape(A, replace(B, sigma_m=-1.0))),
+    "no_sigma": Case(said="is not a standard deviation", change=tape(A, replace(B, sigma_m=-1.0))),
     "far_place": Case(said="is impossible", change=to("s003", point=WorldPoint(1e9, 0.0, 0.0))),
     # Too few calibration points.
     "few": Case(
-        said="poly needs at least 10 measured places",
+        said="poly needs at least 10 calibration points",
         change=lambda m: None if isinstance(m.payload, Measurement) and m.payload.id > "s008" else m,
     ),
-    "one_line": Case(said="lie on one line", change=places(lambda number: (0.01 * number, 1.0, 0.0))),
+    "one_line": Case(said="calibration points are on one line", change=places(lambda number: (0.01 * number, 1.0, 0.0))),
     "one_place": Case(
-        said="needs at least 10 different places, found 2",
+        said="needs at least 10 different points, found 2",
         change=places(lambda number: (number % 2, 1.0, 0.0)),
     ),
     "few_of_a_camera": Case(
-        said="camera red: poly needs at least 10 measured places", before="camera-frame LOG",
+        said="camera red: poly needs at least 10 calibration points", before="camera-frame LOG",
         change=red_sees_until(1_700_000_008),
         command="replay LOG --model rigid --model poly",
     ),
     "unseen": Case(
-        said="no camera saw any of the measured places", before="camera-frame LOG",
+        said="no camera saw a calibration point", before="camera-frame LOG",
         change=edit(Measurement, lambda m: replace(m, timestamp=1, still=None)),
     ),
     "no_height": Case(
-        said="rayplane needs the height at which marker 0 is carried", change=rig(marker_height_m=None),
+        said="rayplane needs the height of marker 0 above the floor", change=rig(marker_height_m=None),
         command="replay LOG --model rayplane",
     ),
     # Models of other logs.
     "no_such_model": Case(said="has no fitted model best", command="fit LOG --model best --model-from MODEL"),
     "no_such_model_live": Case(said="has no fitted model best", command=f"{MODEL_FROM} --model best"),
-    "other_cameras": Case(said="its model is of the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
+    "other_cameras": Case(said="its model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
     "incomplete_model": Case(
         said="the stored model poly has no parameter", command=MODEL_FROM, change_model=NO_PARAMETERS
     ),
@@ -237,7 +237,7 @@ CASES: dict[str, Case] = {
         said="two measurements have the id", command=MODEL_FROM, change=to("s002", id="s001")
     ),
     "evaluate_no_triangle": Case(
-        said="no triangle", command=MODEL_FROM, change=tape(Distance("A", 0.1), Distance("B", 0.1))
+        said="do not meet", command=MODEL_FROM, change=tape(Distance("A", 0.1), Distance("B", 0.1))
     ),
     "evaluate_unknown_marker": Case(
         said="marker 77, which is not in the rig", command=MODEL_FROM, change=to("s003", marker_id=77)

@@ -198,7 +198,7 @@ def test_robots_stay_in_view_and_within_their_speed(markers: int) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"markers": 101}, "has 100 markers, 101 are wanted"),
+        ({"markers": 101}, "has 100 markers, but markers = 101"),
         ({"dictionary": "DICT_9X9"}, "no marker dictionary 'DICT_9X9'"),
         ({"rate_hz": 0.0}, "rate_hz is 0.0; give a value between 1 and 240"),
         ({"row_time_ns": -1}, "row_time_ns is -1; give a value between 0 and 500000"),

@@ -114,6 +114,8 @@ def test_edges_of_a_tilted_marker_are_as_exact(views: list[FloorView]) -> None:
     assert np.abs(errors).max() < 0.01
 
 
+# Draws each pixel from 144 samples.
+@pytest.mark.slow
 def test_a_frame_equals_one_drawn_by_brute_force(views: list[FloorView]) -> None:
     """Render twelve by twelve samples per pixel through a numerical inverse of the lens."""
     view, samples = views[1], 12

@@ -149,6 +149,8 @@ def drive_error_m(log: Path, rig: Rig | None) -> float:
     return found[0].mean_m
 
 
+# Two replays of a rendered drive.
+@pytest.mark.slow
 def test_row_time_of_the_rig_corrects_a_moving_robot(rolling: Path) -> None:
     with Session([rolling]) as session:
         (rig,) = session.payloads([RIG_TOPIC])

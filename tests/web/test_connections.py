@@ -82,6 +82,8 @@ def sign_in(caller: Caller) -> str:
     return headers["set-cookie"].split(";")[0]
 
 
+# Hundreds of connections to a real recorder.
+@pytest.mark.slow
 def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> None:
     log = tmp_path / "session.mcap"
     with recording(still_lab, log) as (program, caller, errors):

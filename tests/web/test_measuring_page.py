@@ -122,7 +122,7 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
         hand.wait("document.querySelectorAll('#floor .maybe').length == 2")
         hand.wait("document.querySelector('#verdict[aria-busy=false]')")
         hand.tap(f"#floor .maybe[aria-label$={other}]")
-        says(hand, "#verdict", f"it lies {side} of the line from A to B, not {other}?")
+        says(hand, "#verdict", f"side {side} would fit, not {other}")
         says(hand, "#save", "despite the warning")
         hand.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
         says(hand, "#verdict", "Difference from the present model")

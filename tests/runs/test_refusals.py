@@ -144,7 +144,7 @@ CASES: dict[str, Case] = {
         change=without(CameraCalibration), log="lab", command="detect LOG --corners edges",
     ),
     "dictionary": Case(
-        said="marker dictionary 'DICT_X' of the rig is unknown to OpenCV", change=rig(dictionary="DICT_X"), log="lab"
+        said="'DICT_X' of the rig is unknown to OpenCV", change=rig(dictionary="DICT_X"), log="lab"
     ),
     "calibration": Case(
         said="takes 4 coefficients, found 3",
@@ -179,7 +179,7 @@ CASES: dict[str, Case] = {
     ),
     # Markers and camera points of other programs.
     "covariance": Case(said="covariance_px2 has no variance", change=NO_COVARIANCE),
-    "far_point": Case(said="a camera point of marker 0 is impossible", before="camera-frame LOG", late=True, change=FAR),
+    "far_point": Case(said="point of marker 0 is impossible", before="camera-frame LOG", late=True, change=FAR),
     # Measurements.
     "two_of_one_id": Case(said="two measurements have the id 's001'", change=to("s002", id="s001")),
     "no_marker": Case(said="s003 has no marker", change=to("s003", marker_id=None)),
@@ -208,7 +208,7 @@ CASES: dict[str, Case] = {
         said="poly needs at least 10 calibration points",
         change=lambda m: None if isinstance(m.payload, Measurement) and m.payload.id > "s008" else m,
     ),
-    "one_line": Case(said="calibration points are on one line", change=places(lambda number: (0.01 * number, 1.0, 0.0))),
+    "one_line": Case(said="points are on one line", change=places(lambda number: (0.01 * number, 1.0, 0.0))),
     "one_place": Case(
         said="needs at least 10 different points, found 2",
         change=places(lambda number: (number % 2, 1.0, 0.0)),
@@ -229,7 +229,7 @@ CASES: dict[str, Case] = {
     # Models of other logs.
     "no_such_model": Case(said="has no fitted model best", command="fit LOG --model best --model-from MODEL"),
     "no_such_model_live": Case(said="has no fitted model best", command=f"{MODEL_FROM} --model best"),
-    "other_cameras": Case(said="its model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
+    "other_cameras": Case(said="model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
     "incomplete_model": Case(
         said="the stored model poly has no parameter", command=MODEL_FROM, change_model=NO_PARAMETERS
     ),

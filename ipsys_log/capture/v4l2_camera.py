@@ -56,7 +56,7 @@ def encode_raw(data: bytes, layout: ImageLayout) -> bytes | None:
 
     Examples
     --------
-    >>> encode_raw(bytes(64), Layout("GREY", 8, 8, 8))[:2].hex()
+    >>> encode_raw(bytes(64), ImageLayout("GREY", 8, 8, 8))[:2].hex()
     'ffd8'
 
     References

@@ -220,7 +220,7 @@ function showStop() {
   const { marker: id, seconds } = lab.stops[stop], as = history.measured[stop];
   const open = history.measured.filter((one) => one === null).length;
   const state = as === null ? `stationary ${seconds.toFixed(1)} s, not measured` : `measured as ${as}`;
-  $("stop").replaceChildren(`Marker ${id}, interval ${stop + 1} of ${lab.stops.length}`, make("small", {}, state));
+  $("stop").replaceChildren(`Marker ${id}, interval ${stop + 1}/${lab.stops.length}`, make("small", {}, state));
   $("before").disabled = stop === 0;
   $("after").disabled = stop === lab.stops.length - 1;
   $("open").disabled = open === 0;

@@ -144,7 +144,7 @@ CASES: dict[str, Case] = {
         change=without(CameraCalibration), log="lab", command="detect LOG --corners edges",
     ),
     "dictionary": Case(
-        said="'DICT_X' of the rig is unknown to OpenCV", change=rig(dictionary="DICT_X"), log="lab"
+        said="dictionary 'DICT_X' of the rig is unknown", change=rig(dictionary="DICT_X"), log="lab"
     ),
     "calibration": Case(
         said="takes 4 coefficients, found 3",
@@ -179,7 +179,7 @@ CASES: dict[str, Case] = {
     ),
     # Markers and camera points of other programs.
     "covariance": Case(said="covariance_px2 has no variance", change=NO_COVARIANCE),
-    "far_point": Case(said="point of marker 0 is impossible", before="camera-frame LOG", late=True, change=FAR),
+    "far_point": Case(said="of marker 0 is impossible", before="camera-frame LOG", late=True, change=FAR),
     # Measurements.
     "two_of_one_id": Case(said="two measurements have the id 's001'", change=to("s002", id="s001")),
     "no_marker": Case(said="s003 has no marker", change=to("s003", marker_id=None)),

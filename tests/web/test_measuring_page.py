@@ -90,7 +90,7 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         save(hand, "p001")
         says(hand, "#notice", "p001 is in the log")
         assert [(row.id, row.withdraws) for row in foreign_read(log)] == [("p001", "")]
-        says(hand, "#stop", "interval 2 of")
+        says(hand, "#stop", "interval 2/")
         assert hand.run("[...document.querySelectorAll('.cm input')].every(e => e.value === '')")
 
         hand.tap("#places button")
@@ -316,7 +316,7 @@ def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmea
         # The token disappears from the address after its use.
         assert hand.run("location.pathname + location.search") == "/"
         for number in range(5):
-            says(hand, "#stop", f"interval {number + 1} of")
+            says(hand, "#stop", f"interval {number + 1}/")
             says(hand, "#sight", "is stationary")
             fill(hand, *texts_at(scene, tape, number))
             save(hand, f"p00{number + 1}")

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-__all__ = ["defer", "undivided"]
+__all__ = ["defer", "is_undivided", "undivided"]
 
 
 @dataclass(slots=True)
@@ -27,7 +27,10 @@ _state = _State()
 
 @contextmanager
 def undivided() -> Iterator[None]:
-    """Defer the interrupts of the command line to the end of the block. Blocks may be nested."""
+    """Defer the interrupts of the command line to the end of the block; for the main thread only.
+
+    Blocks may be nested.
+    """
     _state.depth += 1
     try:
         yield
@@ -39,9 +42,14 @@ def undivided() -> Iterator[None]:
             signal.raise_signal(number)
 
 
+def is_undivided() -> bool:
+    """Return whether a block is entered."""
+    return _state.depth > 0
+
+
 def defer(number: int) -> bool:
     """Note a signal for the end of the block; return False if no block is entered. For signal handlers."""
-    if _state.depth == 0:
+    if not is_undivided():
         return False
     _state.deferred = number
     return True

@@ -33,8 +33,6 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from threadpoolctl import threadpool_limits
-
 from ipsys_log.analysis.latency import Ledger
 from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.frames import SourceError
@@ -50,6 +48,7 @@ from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import MODELS
+from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_fits, check_inputs
 from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
@@ -104,8 +103,7 @@ def replay(
             unchecked.clear()
         return compute_messages(task, session, name, progress)
 
-    # The matrices are small: threads of BLAS would only wait for one another.
-    with open_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
+    with open_target(paths, output) as (logs, target), one_blas_thread():
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""
@@ -205,7 +203,7 @@ def measure(
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     with (
         Consumers(consumers, cameras.add_event, sinks) as show,
-        threadpool_limits(1, user_api="blas"),
+        one_blas_thread(),
         open_recording(target, settings, overwrite) as log,
         RecentFrames(log) as recent,
         Backlog(cameras, recent, cameras.now_ns) as frames,
@@ -256,7 +254,7 @@ def live(
     first = (*settings, *plan.copies(cameras.now_ns))
     with (
         Consumers(consumers, cameras.add_event, sinks) as show,
-        threadpool_limits(1, user_api="blas"),
+        one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         Backlog(cameras, log, cameras.now_ns) as frames,
     ):

@@ -119,8 +119,7 @@ def _check_dictionary(board: Board) -> None:
     if markers > known:
         raise IpsysError(
             f"--dictionary {board.dictionary}: has {known} markers, but the board has {markers}; give a "
-            "larger "
-            "dictionary"
+            "larger dictionary"
         )
 
 

@@ -153,8 +153,7 @@ def _start(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, 
 def _too_similar_error(camera: str) -> IpsysError:
     return IpsysError(
         f"camera {camera}: the intrinsics cannot be estimated, because the poses of the board are too "
-        "similar; "
-        "tilt it to all sides, near and far, in all parts of the image"
+        "similar; tilt it to all sides, near and far, in all parts of the image"
     )
 
 

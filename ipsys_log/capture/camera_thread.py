@@ -234,9 +234,8 @@ class CameraReader:
         if before in (None, frame.format):
             return
         text = (
-            f"camera {name}: its format changed from {before} to {frame.format}, but a log can hold "
-            "only one; "
-            f"set the camera to {before}, or start a new recording"
+            f"camera {name}: its format changed from {before} to {frame.format}, but a log can hold only "
+            f"one; set the camera to {before}, or start a new recording"
         )
         if not self.state.up:
             self._say_once("camera_lost", f"{text}; ipsys tries again")

@@ -143,9 +143,8 @@ def describe_disk_full(path: Path, error: WriteError) -> str:
 def describe_disk_failure(path: Path, fault: OSError) -> str:
     """Describe what to do with a log that may be incomplete on a failed disk."""
     return (
-        f"{path}: {describe_disk_fault(fault)} during the recording; messages may be missing. To check "
-        "the log: "
-        f"ipsys repair {path}. Record to another disk"
+        f"{path}: {describe_disk_fault(fault)} during the recording; messages may be missing. To check the "
+        f"log: ipsys repair {path}. Record to another disk"
     )
 
 

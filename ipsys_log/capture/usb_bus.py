@@ -274,7 +274,7 @@ def _hub(usb: Path) -> str:
     name = " ".join(filter(None, (_read(hub / "manufacturer"), _read(hub / "product"))))
     # The root of the tree is the controller in the machine.
     if _read(hub / "devpath") in ("", "0"):
-        return f"built in, controller {hub.parent.name}"
+        return f"the machine's own, controller {hub.parent.name}"
     return f"{name or 'a hub'} at port {_read(hub / 'devpath')}"
 
 

@@ -56,8 +56,7 @@ Lens = Annotated[
     typer.Option(
         metavar="NAME",
         help="Distortion model: fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 "
-        "(without k3) or "
-        "pinhole8 (with k4 k5 k6).",
+        "(without k3) or pinhole8 (with k4 k5 k6).",
     ),
 ]
 Cameras = Annotated[
@@ -89,9 +88,8 @@ Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Override four checks: no file is overwritten; the board in the pictures is not larger "
-        "than --board; "
-        "the RMS is at most 2 px, from 5 pictures or more; all pictures are of one camera.",
+        help="Override four checks: no file is overwritten; the board in the pictures is not larger than "
+        "--board; the RMS is at most 2 px, from 5 pictures or more; all pictures are of one camera.",
     ),
 ]
 
@@ -215,9 +213,8 @@ def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
 
     if rig is None:
         raise IpsysError(
-            "no source is given; name pictures, a video or a log of a board, or give --rig lab.toml to "
-            "use its "
-            "cameras now"
+            "no source is given; name pictures, a video or a log of a board, or give --rig lab.toml to use "
+            "its cameras now"
         )
     lab = prepare_lab(rig, only, None, with_lenses=False)
     return lab._replace(cameras=[show_board(camera, board) for camera in lab.cameras])

@@ -53,9 +53,8 @@ def images(
         str | None,
         typer.Option(
             metavar="FILE|names",
-            help="Times of the pictures: a CSV file with the columns file (red/0001.jpg) and time, or "
-            "names if "
-            "the file names are times. A time is in s, ms, us or ns since 1970, or like "
+            help="Times of the pictures: a CSV file with the columns file (red/0001.jpg) and time, or names "
+            "if the file names are times. A time is in s, ms, us or ns since 1970, or like "
             "2024-05-31T12:30:00.25Z.",
         ),
     ] = None,
@@ -117,7 +116,7 @@ def _refuse_log(path: Path) -> None:
         return  # a folder, or no file: the importer reports it
     if is_log:
         raise IpsysError(
-            f"{path}: is already a log and needs no import. To list its contents: ipsys info {path};  "
+            f"{path}: is already a log and needs no import. To list its contents: ipsys info {path}; "
             f"to process it: ipsys replay {path}"
         )
 

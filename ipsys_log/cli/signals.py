@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-from ipsys_log.interrupts import defer
+from ipsys_log.interrupts import defer, is_undivided
 
 __all__ = [
     "InterruptError",
@@ -190,13 +190,13 @@ def _interrupt(number: int, _: FrameType | None = None) -> None:
 
 
 def _interrupt_again(*_: object) -> None:
-    """Raise an interrupt again if it was suppressed."""
+    """Raise an interrupt again if it was suppressed; the timer calls this until it arrives."""
     error = sys.exception()
     while error is not None:
         if isinstance(error, (Interrupted, GeneratorExit)):
             return  # the interrupt has arrived: a block, or a generator that it has ended, cleans up
         error = error.__context__
-    if _state.raised is not None:
+    if _state.raised is not None and not is_undivided():
         raise Interrupted(_state.raised.exit_code, _state.raised.text)
 
 

@@ -63,9 +63,8 @@ def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> 
         raise IpsysError("the two reference points are identical; give them different coordinates")
     if d1_m <= 0 or d2_m <= 0 or not (abs(d1_m - d2_m) <= base_m <= d1_m + d2_m):
         raise IpsysError(
-            f"the distances d1 = {d1_m:.4f} m and d2 = {d2_m:.4f} m do not meet, because AB is "
-            f"{base_m:.4f} m; "
-            "measure d1 and d2 again"
+            f"the distances d1 = {d1_m:.4f} m and d2 = {d2_m:.4f} m do not meet, because AB is {base_m:.4f} "
+            "m; measure d1 and d2 again"
         )
     return intersect_circles(a_m, b_m, d1_m, d2_m, side)
 

@@ -342,9 +342,8 @@ class Session:
                     continue
                 if topic in images and _overlap(reader, other, topic):
                     raise LogError(
-                        f"two cameras have the same name: {topic} is in {other.path} and, at the same "
-                        "time, in "
-                        f"{reader.path}; leave one of them out"
+                        f"two cameras have the same name: {topic} is in {other.path} and, at the same time, "
+                        f"in {reader.path}; leave one of them out"
                     )
                 if run_of_topic(topic) is not None:
                     raise LogError(
@@ -364,9 +363,8 @@ class Session:
                 camera = name if names.count(name) == 1 else clean_name(topic)
                 if camera in topic_of:
                     raise LogError(
-                        f"{self}: two cameras have the same name {camera!r}:  {topic_of[camera]} and "
-                        f"{topic}; "
-                        "rename one of the topics"
+                        f"{self}: two cameras have the same name {camera!r}: {topic_of[camera]} and "
+                        f"{topic}; rename one of the topics"
                     )
                 topic_of[camera] = topic
             cameras = topic_of | cameras

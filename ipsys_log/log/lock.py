@@ -50,9 +50,8 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
 def _without_locks(path: Path, error: OSError) -> str:
     return (
         f"{path}: its file system has no locks ({error.strerror}), so two programs could write a log at the "
-        "same time: write to a local disk, or mount this one with locks (NFS: start rpc.statd, or mount "
-        "it with "
-        "nolock if only this machine writes there)"
+        "same time: write to a local disk, or mount this one with locks (NFS: start rpc.statd, or mount it "
+        "with nolock if only this machine writes there)"
     )
 
 

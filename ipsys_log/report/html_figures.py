@@ -89,9 +89,9 @@ def residual_pictures(findings: Findings) -> list[Picture]:
         bar.set_label(f"{_SPACE[findings.in_space]} error in cm", fontsize=9)
         bar.ax.tick_params(labelsize=8)
         caption = (
-            f"Errors of {label(accuracy.model)}, seen from above. An arrow points from "
-            "the calibration point to "
-            "the estimated position; arrows are enlarged. Dashed: area of the calibration points of a camera"
+            f"Errors of {label(accuracy.model)}, seen from above. An arrow points from the calibration "
+            "point to the estimated position; arrows are enlarged. Dashed: area of the calibration points "
+            "of a camera"
         )
         pictures.append(_picture(figure, caption))
     return pictures

@@ -96,7 +96,7 @@ def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[st
         return []
     if len(missing) == len(set(cameras)):
         raise IpsysError(
-            f"{where}: describes the cameras {', '.join(described)}, but the log has only "
+            f"{where}: describes the cameras {', '.join(described)}, but the images are from "
             f"{', '.join(missing)}. Give the rig of these cameras, rename its cameras, or remove its "
             "[[cameras]]"
         )

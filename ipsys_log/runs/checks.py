@@ -359,7 +359,6 @@ def _check_evaluation(session: Session, request: Request, models: Sequence[str])
     view = LogView(session, rig=request.rig)
     if not any(can_evaluate(view, request.options(), model) for model in models):
         raise IpsysError(
-            f"{session}: has no held-out points, and its {len(measured(view))} calibration points are "
-            "too few "
-            "for cross-validation; label some 'test', or measure more"
+            f"{session}: has no held-out points, and its {len(measured(view))} calibration points are too "
+            "few for cross-validation; label some 'test', or measure more"
         )

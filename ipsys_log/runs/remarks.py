@@ -76,8 +76,8 @@ class Remarks:
         if self._unknown and not self._markers:
             raise IpsysError(
                 "no frame has a marker of the rig, but the frames have ids "
-                f"{', '.join(sorted(self._unknown))}: "
-                "add them as [[markers]] to lab.toml, and give the file with --rig"
+                f"{', '.join(sorted(self._unknown))}: add them as [[markers]] to lab.toml, and give the "
+                "file with --rig"
             )
         rejected = self._events["rejected_marker"]
         if rejected and not self._markers:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.differences import (
     Comparison,
@@ -25,6 +24,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.messages import CameraCalibration, FrameTransforms, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
+from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
@@ -61,14 +61,14 @@ def verify(
     IpsysError
         There is no such run, nothing of it can be verified, or its inputs are no longer in the log.
     """
-    with Session(paths) as session, threadpool_limits(1, user_api="blas"):
+    with Session(paths) as session, one_blas_thread():
         names = session.run_names() if run is None else session.run_names() & {run}
         recorded = [stage for stage in recorded_stages(session) if stage.run.run in names]
         records = [stage.run for stage in recorded if not _is_of_copied_model(stage.run)]
         if not records:
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
-                "to compute one: ipsys replay; to list the runs: ipsys runs"
+                f"to compute one: ipsys replay {paths[-1]}; to list the runs: ipsys runs {paths[-1]}"
             )
         checked = {output.topic for record in records for output in record.outputs}
         repeated = [
@@ -79,7 +79,9 @@ def verify(
             and _is_up_to_date(session, stage.run, checked, say)
         ]
         if not repeated:
-            raise IpsysError(f"{session}: has no run that can be verified; for the reasons: ipsys runs")
+            raise IpsysError(
+                f"{session}: has no run that can be verified; for the reasons: ipsys runs {paths[-1]}"
+            )
         comparisons = []
         for name in sorted(names):
             stages = [record for record in repeated if record.run == name]
@@ -155,8 +157,8 @@ def _compared_runs(
     both = names[0] & names[1] if runs[0] is None else names[0]
     if not both:
         raise IpsysError(
-            f"{one} and {other} have no run with the same name; to list the runs: ipsys runs; give the "
-            "runs with --run"
+            f"{one} and {other} have no run with the same name; to list the runs of one: ipsys runs {one}; "
+            "give the runs with --run"
         )
     return both, both if runs[1] is None else names[1]
 
@@ -220,15 +222,13 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
             continue
         if count == 0:
             say(
-                f"run {run.run}: {run.stage} is not verified: its input {read.topic} is not in "
-                f"{session}; give "
-                "the log with this topic, too"
+                f"run {run.run}: {run.stage} is not verified: its input {read.topic} is not in {session}; "
+                "give the log with this topic, too"
             )
             return False
         text = (
-            f"run {run.run} is out of date: it has read {read.messages} messages of {read.topic}, but "
-            "the log "
-            f"has other ones now ({count} messages)"
+            f"run {run.run} is out of date: it has read {read.messages} messages of {read.topic}, but the "
+            f"log has other ones now ({count} messages)"
         )
         if _is_of_model(run):
             say(f"{text}; its {run.stage} is not verified: ipsys replay computes it again")

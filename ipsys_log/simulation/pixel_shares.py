@@ -110,7 +110,7 @@ _PATH_INSTANTS = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shares:
-    """Shares of the light in a box of ``View.rays``: ``cover`` of a print, ``dark`` of its black, (h, w)."""
+    """Shares of light in a box of ``FloorView.rays``: ``cover`` of a print, ``dark`` of its black, (h, w)."""
 
     box: Box
     cover: Plane

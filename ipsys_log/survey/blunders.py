@@ -149,8 +149,8 @@ def _explanation(read: Measurement, blunder: Blunder) -> str:
     if blunder.kind == "height":
         return f"the height reads {_correction(read.height_m or 0.0, corrected.height_m or 0.0)}"
     changed = [(old, new) for old, new in zip(read.distances, corrected.distances, strict=True) if old != new]
-    if blunder.kind == "distance":
-        ((old, new),) = changed
+    if blunder.kind == "distance" and changed:
+        old, new = changed[0]
         return f"the distance to {old.reference} reads {_correction(old.distance_m, new.distance_m)}"
     tapes = [f"{new.distance_m * CM_PER_M:.1f} cm to {new.reference}" for _, new in changed]
     names = " and ".join(new.reference for _, new in changed)

@@ -134,7 +134,6 @@ def name_columns(text: str, rig: Rig) -> str:
         text,
     )
     text = re.sub(rf"\b(?:the )?distance to ({names_pattern})\b", r"d_\1_cm", text)
-
     return re.sub(r"\b(?:the )?height(?=:|\?| reads| and)", "height_cm", text)
 
 
@@ -170,9 +169,8 @@ def assign_intervals(
             yield _timed(row.time_ns, marker_id, intervals)
         elif len(own) != len(in_order[marker_id]):
             yield (
-                f"marker {marker_id} has {len(own)} stationary intervals, but "
-                f"{len(in_order[marker_id])} rows "
-                "without place and time: fill in place with the numbers of ipsys measure LOG --places"
+                f"marker {marker_id} has {len(own)} stationary intervals, but {len(in_order[marker_id])} "
+                "rows without place and time: fill in place with the numbers of ipsys measure LOG --places"
             )
         else:
             yield own[in_order[marker_id].index(row.line)]

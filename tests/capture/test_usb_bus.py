@@ -90,7 +90,7 @@ def test_camera_poses_are_recovered(tmp_path: Path, plug_in: Callable[[int, str]
     first, second = find_cameras(tmp_path)
     assert (first.device, first.name) == (str(tmp_path / "dev/video2"), "Lab Camera 2")
     assert first.stable == str(tmp_path / "dev/v4l/by-id/usb-Acme_2-video-index0")
-    assert first.plug == UsbConnection(1, "4", 480.0, "built in, controller 0000:00:14.0", 3060)
+    assert first.plug == UsbConnection(1, "4", 480.0, "the machine's own, controller 0000:00:14.0", 3060)
     assert second.plug == UsbConnection(1, "2.3", 480.0, "Acme USB2.0 Hub at port 2", 3060)
     assert first.modes == (
         Mode("YUYV", 640, 480, 30),

@@ -114,7 +114,7 @@ def test_rig_of_other_cameras_is_refused(ipsys: Ipsys, lab: Path) -> None:
     rig = rig_file(lab, "left", "right")
     for command in (("detect", lab), ("measure", lab, "--places")):
         line = refused(ipsys, lab, *command, "--rig", rig)
-        assert "describes the cameras left, right, but the log has only black, red, white" in line
+        assert "describes the cameras left, right, but the images are from black, red, white" in line
         assert "rename its cameras, or remove its [[cameras]]" in line
 
 
@@ -134,7 +134,7 @@ def test_rig_of_other_cameras_is_refused_for_pictures(ipsys: Ipsys, lab: Path) -
         (folder / "1.jpg").write_bytes(session.payloads(["/cameras/red/image"])[0].data)
     rig, new = rig_file(lab, "left", "right"), lab.with_name("new.mcap")
     line = refused(ipsys, lab, "import", "images", folder.parent, "-o", new, "--rig", rig)
-    assert "describes the cameras left, right, but the log has only front" in line
+    assert "describes the cameras left, right, but the images are from front" in line
 
 
 def changed(lab: Path, name: str, change: Callable[[Message], Message | None]) -> Path:

@@ -46,8 +46,9 @@ from ipsys_log.stages.fit import BESIDE_LINE_M, check_different, check_pairs
 
 __all__ = ["check_fits", "check_inputs"]
 
-# The size of a camera's images is that of the first image that can be decoded, among so many.
-_TRIED_FRAMES = 100
+# Most messages of a channel that the checks read. Some recorders write a calibration with each frame, so that
+# all of them are spread over the whole log.
+_CHECKED_MESSAGES = 100
 
 
 def check_inputs(
@@ -208,11 +209,11 @@ def _check_lenses(session: Session, request: Request, cameras: set[str]) -> None
 
 
 def _check_distortion(session: Session, request: Request, cameras: set[str]) -> None:
-    """Check that the calibrations in a log are valid, unless others are given."""
+    """Check that the first calibrations in a log are valid, unless others are given."""
     for name in sorted(cameras - set(request.lenses)):
         topic = session.calibrations.get(name)
-        for lens in session.payloads([topic] if topic else []):
-            check_calibration(replace(lens, frame_id=name), f"{session}: {topic}")
+        for message in islice(session.messages([topic] if topic else []), _CHECKED_MESSAGES):
+            check_calibration(replace(message.payload, frame_id=name), f"{session}: {topic}")
 
 
 def _check_sizes(session: Session, request: Request) -> None:
@@ -228,7 +229,7 @@ def _check_sizes(session: Session, request: Request) -> None:
 def _first_size_px(session: Session, topic: str) -> tuple[int, int] | None:
     """Return width and height of the first frame that can be decoded; None if the first frames cannot be."""
     video: Video | None = None
-    for message in islice(session.messages([topic]), _TRIED_FRAMES):
+    for message in islice(session.messages([topic]), _CHECKED_MESSAGES):
         frame = message.payload
         with suppress(FrameError):  # a corrupt frame is an event
             if isinstance(frame, CompressedVideo):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import chi
+from scipy.stats import chi, norm
 
+from ipsys_log.analysis import consistency
 from ipsys_log.analysis.consistency import score, usual_covariances
 from ipsys_log.models.poly import PolynomialRegression
 
@@ -145,3 +146,8 @@ def test_degenerate_sessions_have_a_yardstick(kind: str) -> None:
     found = usual(places, off)
     assert np.isfinite(found).all()
     assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_medians_are_those_of_normal_errors() -> None:
+    assert pytest.approx(norm.ppf(0.75), rel=1e-15) == consistency._MEDIAN_1D
+    assert pytest.approx(chi.median(3), rel=1e-15) == consistency._MEDIAN_3D

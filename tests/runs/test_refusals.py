@@ -28,6 +28,7 @@ from ipsys_log.messages import (
     RigMarker,
     WorldPoint,
 )
+from ipsys_log.runs import checks
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused, rewrite
@@ -424,3 +425,17 @@ def test_each_error_of_a_stage_has_a_case_or_a_reason() -> None:
 def test_guard_sees_a_function_that_raises() -> None:
     source = "class A:\n    def f(self):\n        if x:\n            raise FitError('a')\n"
     assert [*raising(source)] == ["A.f"]
+
+
+def test_calibrations_of_every_frame_are_not_all_read(
+    ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some recorders write a calibration with each frame; a check must not read the whole log."""
+    with Session([lab]) as session:
+        first = next(iter(session.messages([session.calibrations["red"]])))
+    later = tuple(replace(first, log_time_ns=first.log_time_ns + n) for n in range(1, 1001))
+    log = rewrite(lab, lambda message: message, later)
+    checked: list[str] = []
+    monkeypatch.setattr(checks, "check_calibration", lambda lens, label: checked.append(lens.frame_id))
+    ipsys("camera-frame", log)
+    assert 0 < checked.count("red") <= 100

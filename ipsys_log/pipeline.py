@@ -49,9 +49,10 @@ from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.blas import one_blas_thread
-from ipsys_log.runs.checks import check_fits, check_inputs
+from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
+from ipsys_log.runs.model_checks import check_fits
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.provenance import Outcome

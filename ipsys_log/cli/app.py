@@ -26,7 +26,7 @@ from ipsys_log.cli import (
 from ipsys_log.cli.signals import interruptible
 from ipsys_log.stages import ENTRIES
 
-__all__ = ["EXAMPLES", "PANELS", "arrange"]
+__all__ = ["EXAMPLES", "arrange", "panels"]
 
 _STAGES = "Single stages of replay"
 # The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
@@ -41,13 +41,11 @@ _PLACED: dict[str, tuple[str, ...]] = {
 }
 
 
-def all_panels() -> dict[str, tuple[str, ...]]:
+def panels() -> dict[str, tuple[str, ...]]:
     """Return the panels with the commands of all stages."""
     placed = {name for names in _PLACED.values() for name in names}
     return {**_PLACED, _STAGES: tuple(entry.name for entry in ENTRIES if entry.name not in placed)}
 
-
-PANELS = all_panels()
 
 # Each line is a command and its purpose; at most 76 columns.
 EXAMPLES: dict[str, str] = {
@@ -131,9 +129,8 @@ ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4
 
 def arrange(app: typer.Typer) -> None:
     """Put the commands into their panels, in this order, and the examples below their help."""
-    panels = all_panels()
-    order = [name for names in panels.values() for name in names]
-    panel_of = {name: panel for panel, names in panels.items() for name in names}
+    order = [name for names in panels().values() for name in names]
+    panel_of = {name: panel for panel, names in panels().items() for name in names}
     for command in app.registered_commands:
         assert command.callback is not None
         command.name = command.name or command.callback.__name__

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from ipsys_log.cli.app import EXAMPLES, PANELS, app
+from ipsys_log.cli.app import EXAMPLES, app, panels
 from ipsys_log.log.dataset import Session
 from tests.conftest import Ipsys
 
@@ -292,7 +292,7 @@ def test_the_help_lists_the_commands_in_the_order_of_a_first_day(ipsys: Ipsys) -
     out = ipsys("--help").out
     panel = out[out.index("First day, in this order") : out.index("Accuracy, and the next")]
     listed = [line.split()[1] for line in panel.splitlines()[1:] if line[2:3].isalpha()]
-    assert tuple(listed) == PANELS["First day, in this order"]
+    assert tuple(listed) == panels()["First day, in this order"]
 
 
 @pytest.mark.parametrize("command", EXAMPLES)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.cli.app import PANELS
+from ipsys_log.cli.app import panels
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
@@ -199,7 +199,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
         day(stage, "session.mcap")
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
     day.commands.add("import")  # needs public data
-    assert day.commands == {name for names in PANELS.values() for name in names}
+    assert day.commands == {name for names in panels().values() for name in names}
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import format_time
 from tests.conftest import Ipsys
+from tests.tiers import first_fast
 
 
 def rewrite(lab: Path, change: Callable[[Message], Message | None], extra: tuple[Message, ...] = ()) -> Path:
@@ -249,7 +250,7 @@ def test_two_cameras_of_one_name(ipsys: Ipsys, lab: Path, tmp_path: Path) -> Non
     assert "two cameras have the same name" in line
 
 
-@pytest.mark.parametrize("damage", ["cut", "zeros", "empty", "noise"])
+@pytest.mark.parametrize("damage", first_fast(2, ["cut", "zeros", "empty", "noise"]))
 def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> None:
     times: list[int] = []
 

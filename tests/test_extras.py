@@ -131,6 +131,7 @@ def test_commands_without_their_extra_name_it_and_write_nothing(folder: Path) ->
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_commands_need_only_their_own_extra(folder: Path) -> None:
     figures = [name for name in HIDDEN if name not in ("matplotlib", "PIL")]
     page = [name for name in HIDDEN if name not in ("jinja2", "markupsafe", "matplotlib", "PIL")]

@@ -24,6 +24,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from tests.capture.streams import encode, free_port, serve
+from tests.tiers import first_fast
 
 H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")
 H265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=20:bframes=0:log-level=none")
@@ -81,7 +82,7 @@ def slow_decoding(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("codec", "machine"), [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)]
+    ("codec", "machine"), first_fast(1, [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)])
 )
 def test_skipped_video_frames_are_equal_in_a_replay(
     codec: tuple[str, ...],

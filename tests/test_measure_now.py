@@ -27,6 +27,7 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import foreign_read
+from tests.tiers import first_fast
 
 PATIENCE_S = 240.0
 RATE_HZ = 10
@@ -139,7 +140,7 @@ def counted(log: Path) -> dict[str, int]:
         return {name: session.count(topic) for name, topic in session.images.items()}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", first_fast(1, [signal.SIGINT, signal.SIGTERM]))
 def test_page_measures_points_until_it_is_stopped(
     number: int, ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:
@@ -260,7 +261,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), told
 
 
-@pytest.mark.parametrize("end", ["q\n", "\x03", "SIGTERM"])
+@pytest.mark.parametrize("end", first_fast(2, ["q\n", "\x03", "SIGTERM"]))
 def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
     log, one = tmp_path / "places.mcap", still_lab.tape[0]
     a, b = (f"{100 * d.distance_m:.2f}" for d in one.distances)

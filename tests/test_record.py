@@ -22,6 +22,7 @@ from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
 from tests.capture.streams import encode, free_port, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
+from tests.tiers import first_fast
 
 NAMES = ("red", "white", "black")
 # a limit far above any duration on a busy machine
@@ -151,7 +152,7 @@ def test_a_password_in_the_rig_of_a_run_is_not_recorded(ipsys: Ipsys, lab: Path,
     assert b"hush" not in lab.read_bytes()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", first_fast(1, [signal.SIGINT, signal.SIGTERM]))
 def test_simulation_ends_cleanly_on_request(
     number: int, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
@@ -376,6 +377,7 @@ def late_by_s(images: list[CompressedImage], jpegs: list[bytes]) -> list[float]:
     return [(image.timestamp - images[0].timestamp) / 1e9 - n / 30 for n, image in enumerate(images)]
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_it_with_a_complete_log(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:

@@ -28,6 +28,7 @@ from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from tests.conftest import Ipsys, small_disk
 from tests.test_live import go_live, recorded, slow  # noqa: F401
+from tests.tiers import first_fast
 
 # a limit far above any duration on a busy machine
 LIMIT_S = 240
@@ -99,6 +100,7 @@ def topics_of(log: Path) -> set[str]:
 LIVE = [("detect", "edges"), ("camera-frame", "edges"), ("locate", "poly"), ("fuse", "poly")]
 
 
+@pytest.mark.slow
 def test_killed_live_run_is_completed_by_repair(
     ipsys: Ipsys,
     rig: Path,
@@ -144,7 +146,7 @@ def test_killed_live_run_is_completed_by_repair(
     assert not any(one.fresh for one in again)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+@pytest.mark.parametrize("share", first_fast(1, [0.3, 0.6, 0.95]))
 def test_skipped_frames_are_processed_by_a_replay(
     recorded: Path,  # noqa: F811
     tmp_path: Path,
@@ -180,6 +182,7 @@ def _chunks(log: Path) -> Iterator[ChunkRef]:
         yield from reader._contents.chunks
 
 
+@pytest.mark.slow
 def test_run_with_other_content_is_left_unchanged(
     recorded: Path,  # noqa: F811
     ipsys: Ipsys,

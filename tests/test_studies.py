@@ -78,6 +78,7 @@ def test_nan_in_an_import_is_refused_and_nothing_is_written(ipsys: Ipsys, data: 
     assert not (tmp_path / "x.mcap").exists()
 
 
+@pytest.mark.slow
 def test_equal_heights_give_a_2d_model(ipsys: Ipsys, tmp_path: Path) -> None:
     log = made(tmp_path / "flat.mcap", heights=(0.1,))
     done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
@@ -131,6 +132,7 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
     assert inside(5.2, 0.9, 0.1) is False
 
 
+@pytest.mark.slow
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
     """The tolerance is 1e-9 m, for every model in the table, by the numbers in the log."""
     from ipsys_log.models.table import MODELS, AppliedModel, CalibrationPoints, fit_cameras, inputs

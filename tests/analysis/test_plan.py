@@ -179,6 +179,7 @@ def planned(views: list[FittedCamera], count: int = 6) -> MeasurementPlan:
     return plan_points(views, grid(0.2, (0.1,)), grid(0.2, HEIGHTS_M), tape_m2, RADIUS_M, count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seeds", [range(8), pytest.param(range(8, 48), marks=pytest.mark.slow)], ids=["8", "40"]
 )

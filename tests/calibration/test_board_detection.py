@@ -207,6 +207,7 @@ def test_impossible_boards_are_refused(text: str, said: str) -> None:
         parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
 
 
+@pytest.mark.slow
 def test_chessboard_instead_of_charuco_is_reported() -> None:
     pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
     tried: list[tuple[int, int]] = []

@@ -74,6 +74,7 @@ def test_board_over_stripes_right_size_gives_the_lens(stripes: tuple[float, floa
     assert result.outlier_corners < 0.02 * len(result.pixels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stripes", STRIPES[:2])
 @pytest.mark.parametrize("stated", ["8x7", pytest.param("9x6", marks=pytest.mark.slow)])
 def test_board_over_stripes_wrong_size_is_refused(stripes: tuple[float, float, float], stated: str) -> None:

@@ -13,6 +13,7 @@ from ipsys_log.calibration.bundle_adjustment import Corners
 from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.calibration.solve import SolveResult, find_start, pose_from_rays, solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, seen
+from tests.tiers import first_fast
 
 
 def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[np.float64]:
@@ -28,7 +29,7 @@ def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[n
     return np.array(rows)
 
 
-@pytest.mark.parametrize("name", list(TRUTH))
+@pytest.mark.parametrize("name", first_fast(2, list(TRUTH)))
 def test_known_intrinsics_are_recovered_within_their_sigma(name: str) -> None:
     """With 8 seeds and about 8 correlated parameters, the mean square is 1 within a factor of two."""
     errors = squared_errors(name, range(8))

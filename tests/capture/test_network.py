@@ -21,6 +21,7 @@ from ipsys_log.capture.network import open_network
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, free_port, make_jpegs, serve, serve_rtsp
+from tests.tiers import first_fast
 
 MJPEG = ("-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=ffmpeg", "-listen", "1")
 X264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "10", "-bf", "0", "-pix_fmt", "yuv420p")
@@ -58,7 +59,7 @@ def units(data: bytes, name: str) -> list[int]:
 # FFmpeg 5 writes no H.265 into FLV; the tests of files cover the form of MP4.
 @pytest.mark.parametrize(
     ("name", "options", "container"),
-    [("h264", X264, "mpegts"), ("h264", X264, "flv"), ("h265", X265, "mpegts")],
+    first_fast(1, [("h264", X264, "mpegts"), ("h264", X264, "flv"), ("h265", X265, "mpegts")]),
 )
 def test_video_is_annex_b_and_readable_from_each_keyframe(
     tmp_path: Path, name: str, options: tuple[str, ...], container: str

@@ -19,6 +19,7 @@ from ipsys_log.capture.network import open_network
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs
+from tests.tiers import first_fast
 
 SERVER = Path(__file__).with_name("rtsp_server.py")
 # The bindings of GStreamer belong to the system's Python, not to ours.
@@ -75,7 +76,7 @@ def decoded(name: str, frames: list[bytes]) -> list[NDArray[np.uint8]]:
 
 @pytest.mark.parametrize(
     ("name", "protocol"),
-    [("h264", "tcp"), ("h264", "udp"), ("h265", "tcp"), ("jpeg", "tcp"), ("jpeg", "udp")],
+    first_fast(2, [("h264", "tcp"), ("h264", "udp"), ("h265", "tcp"), ("jpeg", "tcp"), ("jpeg", "udp")]),
 )
 def test_every_frame_comes_with_the_cameras_stamp(videos: dict[str, Path], name: str, protocol: str) -> None:
     said: list[str] = []

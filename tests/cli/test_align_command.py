@@ -172,6 +172,7 @@ def changed(log: Path, change: Callable[[Message], Message | None]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
     """The plumb lines and common markers of two cameras give nearly the result of the tape."""
     by_tape = {tuple(row["cameras"]): row["width_m"] for row in aligned(ipsys, lab)["overlaps"]}
@@ -189,6 +190,7 @@ def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
     assert len(found["overlaps"]) == 2
 
 
+@pytest.mark.slow
 def test_gross_tape_error_does_not_change_the_alignment(ipsys: Ipsys, lab: Path) -> None:
     def too_short(message: Message) -> Message:
         if isinstance(message.payload, Measurement) and message.payload.id == "s000":
@@ -202,6 +204,7 @@ def test_gross_tape_error_does_not_change_the_alignment(ipsys: Ipsys, lab: Path)
     assert len(found["cameras"]) == 3
 
 
+@pytest.mark.slow
 def test_camera_moved_after_the_measurement_gives_a_note(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     tilted = hung({"white": (4.0, 270.0)})
     assert ipsys("fit", lab, "--model", "poly").code == 0

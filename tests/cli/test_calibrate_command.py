@@ -28,6 +28,7 @@ from tests.calibration.boards_seen import (
 )
 from tests.capture.streams import ffmpeg
 from tests.conftest import Done, Ipsys
+from tests.tiers import first_fast
 
 SIZE_PX = (480, 360)
 LENS = (140.0, 140.0, 243.0, 178.0, -0.02, 0.01, -0.004, 0.0005)
@@ -180,23 +181,29 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("board", "said"),
-    [
-        ("7x5", "a chessboard of 6 x 4 inner corners is in"),
-        (
-            "5x3",
-            "only a part of the board: 3 of 3 pictures show a chessboard of 6 x 4 inner corners; give "
-            "--board 6x4; if the size is right, give --force",
-        ),
-        ("9x9", "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4"),
-        (
-            "charuco:7x5",
-            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
-        ),
-        (
-            "charuco:6x4",
-            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
-        ),
-    ],
+    first_fast(
+        2,
+        [
+            ("7x5", "a chessboard of 6 x 4 inner corners is in"),
+            (
+                "5x3",
+                "only a part of the board: 3 of 3 pictures show a chessboard of 6 x 4 inner corners; give "
+                "--board 6x4; if the size is right, give --force",
+            ),
+            (
+                "9x9",
+                "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+            ),
+            (
+                "charuco:7x5",
+                "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+            ),
+            (
+                "charuco:6x4",
+                "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+            ),
+        ],
+    ),
 )
 def test_wrong_board_size_is_reported(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
     for path in list(red.iterdir())[3:]:
@@ -338,10 +345,8 @@ def test_photographs_through_a_lens_of_more_than_180_degrees(
     assert found["coverage"]["widest_rad"] > np.pi / 2
 
 
-@pytest.mark.parametrize(
-    "camera", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow),
-               pytest.param(3, marks=pytest.mark.slow)],
-)  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", range(4))
 def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, camera: int) -> None:
     """Focal lengths are within 2 % of the reference, and within three of their standard deviations."""
     folder = data / "charuco_videos"

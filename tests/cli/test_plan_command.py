@@ -134,6 +134,7 @@ def test_the_plan_as_json(ipsys: Ipsys, fitted: Path) -> None:
     assert any("little" in note for note in found["notes"])
 
 
+@pytest.mark.slow
 def test_plan_uses_the_given_heights_and_model(ipsys: Ipsys, fitted: Path) -> None:
     found = planned(ipsys, fitted, "--height-m", "0.12", "--places", 2)
     assert {place["height_m"] for place in found["places"]} == {0.12}

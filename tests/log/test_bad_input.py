@@ -261,6 +261,7 @@ def test_any_byte_changed(log: Path) -> None:
     assert faults > 100
 
 
+@pytest.mark.slow
 def test_any_byte_changed_and_repaired(log: Path) -> None:
     append(log, [("/runs/a", k, k, b"x") for k in range(9)])
     whole = log.read_bytes()

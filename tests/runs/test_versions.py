@@ -18,6 +18,7 @@ from ipsys_log.runs.provenance import recorded_version
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
 from tests.conftest import ROOT, Ipsys
+from tests.tiers import first_fast
 
 Rows = dict[tuple[str, str], dict[str, Any]]
 
@@ -84,7 +85,9 @@ def test_changed_stage_is_done_again_beside_the_old_run(
     assert not any(new for _, new in made(ipsys, log).values())
 
 
-@pytest.mark.parametrize("changed", ["camera-frame", "perimeter", "fit", "evaluate", "locate", "fuse"])
+@pytest.mark.parametrize(
+    "changed", first_fast(3, ["camera-frame", "perimeter", "fit", "evaluate", "locate", "fuse"])
+)
 def test_replay_leaves_its_runs_current(
     changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.simulation.render import expose
 from ipsys_log.simulation.settings import LabSettings
+from tests.tiers import first_fast
 
 Array = NDArray[np.float64]
 
@@ -85,14 +86,17 @@ def edge_shift_px(found: Array, wanted: Array) -> float:
 
 @pytest.mark.parametrize(
     ("shutter", "gamma", "where_m", "towards_rad"),
-    [
-        ("rolling", 1.0, MIDDLE, 1.9),
-        ("blurred", 1.0, MIDDLE, 1.9),
-        ("both", 1.0, MIDDLE, 1.9),
-        ("both", 2.2, MIDDLE, -0.6),
-        ("rolling", 1.0, CORNER, 1.9),
-        ("rolling", 1.0, BELOW, np.pi / 2),
-    ],
+    first_fast(
+        3,
+        [
+            ("rolling", 1.0, MIDDLE, 1.9),
+            ("blurred", 1.0, MIDDLE, 1.9),
+            ("both", 1.0, MIDDLE, 1.9),
+            ("both", 2.2, MIDDLE, -0.6),
+            ("rolling", 1.0, CORNER, 1.9),
+            ("rolling", 1.0, BELOW, np.pi / 2),
+        ],
+    ),
 )
 def test_a_moving_marker_equals_one_drawn_by_brute_force(
     camera: Camera, shutter: str, gamma: float, where_m: tuple[float, float], towards_rad: float

@@ -45,6 +45,7 @@ from tests.stages.drawing import (
     tiles,
     vignette,
 )
+from tests.tiers import first_fast
 
 LAB = LabSettings(stations=0)
 CAMERAS = dict(zip(LAB.cameras, mount_cameras(LAB), strict=True))
@@ -84,7 +85,8 @@ def check(score: Score, rms_px: float, max_px: float, found: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "camera", "starts_s"), [(1, "red", (0,)), (3, "red", (1, 6)), (8, "black", (2, 9))]
+    ("count", "camera", "starts_s"),
+    first_fast(1, [(1, "red", (0,)), (3, "red", (1, 6)), (8, "black", (2, 9))]),
 )
 def test_corners_along_a_drive(count: int, camera: str, starts_s: Sequence[float]) -> None:
     check(filmed(replace(LAB, markers=count), camera, starts_s, 4), 0.06, 0.5, 0.995)
@@ -245,7 +247,7 @@ def scored(row: Row, frames: int, per_frame: int) -> Score:
     return strew(row.lens, row.look, frames, per_frame, row.quality, row.change, length_m=row.length_m)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", first_fast(10, ROWS))
 def test_corners_of_another_renderer(name: str) -> None:
     # One frame gives less information than many.
     row = ROWS[name]
@@ -298,13 +300,14 @@ def test_glare_on_a_marker_gives_no_wrong_one() -> None:
 # --- covariance ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("look", "frames"),
     [
         (Look(), 3),
-        pytest.param(Look(), 50, marks=pytest.mark.slow),
-        pytest.param(Look(noise=6.0), 30, marks=pytest.mark.slow),
-        pytest.param(Look(black=60, white=110, floor=90), 30, marks=pytest.mark.slow),
+        (Look(), 50),
+        (Look(noise=6.0), 30),
+        (Look(black=60, white=110, floor=90), 30),
     ],
 )
 def test_corner_covariance_is_consistent(look: Look, frames: int) -> None:

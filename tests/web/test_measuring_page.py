@@ -309,6 +309,7 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
     assert [tape.reference for tape in scene.done[0].distances] == ["A", "B", "C"]
 
 
+@pytest.mark.slow
 def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, "127.0.0.1", 0) as page:

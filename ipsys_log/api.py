@@ -28,6 +28,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import CHANNELS, EVALUATION, Channel
 from ipsys_log.models.table import AppliedModel
+from ipsys_log.player import Player
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome, newest_run
 from ipsys_log.runs.states import recorded_stages
@@ -35,6 +36,8 @@ from ipsys_log.tracker import LiveTracks, Tracker
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ipsys_log.capture.frames import Clock
 
 __all__ = [
     "CalibrationResult",
@@ -46,12 +49,14 @@ __all__ = [
     "Log",
     "ModelEvaluation",
     "Outcome",
+    "Player",
     "ReplayResult",
     "Tracker",
     "calibrate",
     "live",
     "load_model",
     "open",
+    "play",
     "replay",
     "verify",
 ]
@@ -575,3 +580,61 @@ def live(
             return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=[tracker])
 
     return Tracker(track)
+
+
+def play(
+    *paths: StrPath,
+    rate: float = 1.0,
+    loop: bool = False,
+    start_paused: bool = False,
+    start_offset_s: float = 0.0,
+    run: str | None = None,
+    topics: Sequence[str] = (),
+    restamp: bool = False,
+    udp: Sequence[str] = (),
+    key: StrPath | None = None,
+    host: str | None = None,
+    robots: Sequence[str] = (),
+    clock: Clock | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Player:
+    """Play logs as if they were live, to a loop and to streams. The logs are not changed.
+
+    Parameters
+    ----------
+    rate : seconds of the log in a second.
+    loop : begin again at the end.
+    start_paused : wait for ``resume()`` or ``step()``.
+    start_offset_s : begin so long after the first message, in s.
+    run : the run of the tracks; None: the newest.
+    topics : topics of the logs instead, one of them with tracks.
+    restamp : replace the capture times with the present.
+    udp : destinations of datagrams, such as ``192.168.1.20:9870``.
+    key : the file with the key that signs the datagrams.
+    host : the address of this machine that other computers can reach; None: only this machine.
+    robots : only these robots.
+    clock : the clock of the playback; None: the system's.
+    say : called with the messages that a stream dropped.
+
+    Returns
+    -------
+    Player : enter it to start.
+
+    Raises
+    ------
+    IpsysError
+        A log has no tracks, or a stream cannot be opened.
+
+    Examples
+    --------
+    >>> with play("monday.mcap", rate=2) as player:  # doctest: +SKIP
+    ...     for tracks in player:
+    ...         print(tracks.time_ns, tracks.tracks)
+    """
+    from ipsys_log.sinks.playback import PlaybackOptions
+    from ipsys_log.sinks.streams.settings import StreamSettings
+
+    options = PlaybackOptions(rate, loop, start_paused, start_offset_s, restamp)
+    path = None if key is None else Path(key)
+    settings = StreamSettings(host, tuple(udp), path, tuple(robots))
+    return Player([Path(path) for path in paths], run, topics, options, settings, clock, say)

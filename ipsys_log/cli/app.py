@@ -22,6 +22,7 @@ from ipsys_log.cli import (
     record,
     setup,
     stages,
+    stream,
 )
 from ipsys_log.cli.signals import interruptible
 from ipsys_log.stages import ENTRIES
@@ -35,7 +36,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
     ),
     "Accuracy, and the next points to measure": ("evaluate", "plan", "report"),
-    "Inspect a log": ("info", "runs", "view", "verify", "diff", "latency", "repair"),
+    "Inspect a log": ("info", "runs", "view", "stream", "verify", "diff", "latency", "repair"),
     _STAGES: (),
     "Without cameras": ("simulate", "import"),
 }
@@ -93,6 +94,7 @@ ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
     "live": """
 ipsys live --model-from calibration.mcap -o monday.mcap
 ipsys live --model-from calibration.mcap --model best --view -o b.mcap
+ipsys live --model-from calibration.mcap -o monday.mcap --udp 9870
 """,
     "evaluate": """
 ipsys evaluate calibration.mcap                    # all models
@@ -107,6 +109,10 @@ ipsys report calibration.mcap                      # calibration.html
 """,
     "info": """
 ipsys info monday.mcap
+""",
+    "stream": """
+ipsys stream monday.mcap --udp 127.0.0.1:9870 --rate 2
+ipsys stream monday.mcap --udp 192.168.1.20:9870 --host 0.0.0.0 --loop
 """,
     "verify": """
 ipsys verify monday.mcap                           # all of its runs
@@ -175,7 +181,7 @@ app = typer.Typer(
 )
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure, stages),
-    *(plan, inspect, compare),
+    *(plan, inspect, stream, compare),
 )
 for module in _MODULES:
     module.add_commands(app)

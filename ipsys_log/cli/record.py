@@ -22,6 +22,7 @@ from ipsys_log.cli.options import (
     RigNow,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
+from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, choose_streams
 
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
@@ -129,6 +130,10 @@ def live(
     corners: Corners = None,
     method: Method = "perimeter",
     view: View = False,
+    udp: Udp = None,
+    key: Key = None,
+    host: StreamHost = None,
+    robot: Robots = None,
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
@@ -137,7 +142,9 @@ def live(
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.extras import check_installed
+    from ipsys_log.messages.channels import TRACKS
     from ipsys_log.runs.options import Request
+    from ipsys_log.sinks.streams.settings import check_streams, open_streams
 
     if view:
         check_installed("--view needs", "rerun")
@@ -147,15 +154,33 @@ def live(
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         remarks.print(line, style="yellow", markup=False)
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
-        sinks = [_viewer(settings, cameras, request)] if view else []
-        pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
+    streamed = choose_streams(lab.rig, rig.parent, host=host, udp=udp, key=key, robots=robot)
+    for line in check_streams(streamed):
+        say(line)
+    if streamed and not any(marker.robot for marker in lab.rig.markers):
+        text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
+        remarks.print(text, style="yellow", markup=False)
+    shown_run = _first_run(request)
+    with (
+        open_cameras(lab, output, seconds) as (cameras, settings, status),
+        open_streams(
+            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event
+        ) as streams,
+    ):
+        viewer = [_viewer(settings, cameras, shown_run)] if view else []
+        pipeline.live(cameras, settings, output, request, None, [status], force, [*viewer, *streams])
 
 
-def _viewer(settings: list[Message], cameras: LiveCameras, request: Request) -> LiveView:
+def _first_run(request: Request) -> str:
+    """Return the run of the first model: streams and the viewer show one run."""
     from ipsys_log.runs.select import wanted_models
-    from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.stages.fit import model_run
 
     first, *_ = wanted_models(request)
-    return LiveView(settings[0].payload, cameras.states, model_run(first), say)
+    return model_run(first)
+
+
+def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView:
+    from ipsys_log.sinks.rerun.live import LiveView
+
+    return LiveView(settings[0].payload, cameras.states, run, say)

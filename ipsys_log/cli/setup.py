@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -132,7 +133,8 @@ def _rig_of(log: Path) -> str:
     from ipsys_log.runs.select import rig_with_offsets
 
     with Session([log]) as session:
-        return rig_toml(rig_with_offsets(session))
+        # A log opens no socket: its streams are left out.
+        return rig_toml(replace(rig_with_offsets(session), stream=None))
 
 
 def simulate(output: Path, **settings: Any) -> None:

@@ -42,7 +42,15 @@ from ipsys_log.messages.models import (
     Residual,
     Suspect,
 )
-from ipsys_log.messages.rig import CameraCalibration, Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.messages.rig import (
+    CameraCalibration,
+    Floor,
+    ReferencePoint,
+    Rig,
+    RigCamera,
+    RigMarker,
+    RigStream,
+)
 from ipsys_log.messages.runs import ChannelRead, ChannelWritten, Lens, Run
 from ipsys_log.messages.tracks import (
     FrameTransform,
@@ -110,6 +118,7 @@ __all__ = [
     "Rig",
     "RigCamera",
     "RigMarker",
+    "RigStream",
     "Run",
     "SkippedVideo",
     "Suspect",

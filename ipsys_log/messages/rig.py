@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, Mat34, TimeNs
 
-__all__ = ["CameraCalibration", "Floor", "ReferencePoint", "Rig", "RigCamera", "RigMarker"]
+__all__ = ["CameraCalibration", "Floor", "ReferencePoint", "Rig", "RigCamera", "RigMarker", "RigStream"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,24 @@ class Floor:
 
 
 @dataclass(frozen=True, slots=True)
+class RigStream:
+    """The streams of positions to robots and other programs.
+
+    ``host`` is the address of this machine that other computers can reach; None: only this machine. ``udp``
+    are destinations, as ``HOST:PORT``. ``key`` names the file with the key of their signature. ``vrpn`` is
+    the port of the VRPN server. ``robots`` are the streamed robots; empty: all. A position that is older than
+    ``stale_s`` is marked or withheld.
+    """
+
+    host: str | None = None
+    udp: tuple[str, ...] = ()
+    key: str | None = None
+    vrpn: int | None = None
+    robots: tuple[str, ...] = ()
+    stale_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
     """The lab, as in ``lab.toml`` and in the channel ``/rig`` (see :mod:`ipsys_log.rig.file`)."""
 
@@ -69,6 +87,7 @@ class Rig:
     floor: Floor | None = None
     marker_height_m: float | None = None
     tape_sigma_m: float | None = None
+    stream: RigStream | None = None
 
     def camera(self, name: str) -> RigCamera:
         """Return the entry of a camera; an empty entry for a camera that is not in the rig."""

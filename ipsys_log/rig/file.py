@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker, RigStream
 from ipsys_log.rig.checks import check_units
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "check_name",
     "check_rig",
     "check_rig_cameras",
+    "check_robots",
     "example_toml",
     "hide_password",
     "hide_passwords",
@@ -38,6 +39,8 @@ _FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
 _LARGEST_INT = {"_ns": 2**62}  # by the last three characters of a name
 _LARGEST_ID = 2**31 - 1
 _LARGEST_FILE = 1 << 18  # bytes
+_LARGEST_PORT = 65535
+_MARKER = re.compile(r"marker_\d{1,4}")
 _LONGEST_LINE = 120  # characters of a line that an error repeats
 
 # Meaning of the time that a driver gives to a frame: start or end of the exposure.
@@ -127,6 +130,8 @@ def rig_toml(rig: Rig) -> str:
     lines = _toml_rows(rig)
     if rig.floor is not None:
         lines += ["", "[floor]", *_toml_rows(rig.floor)]
+    if rig.stream is not None:
+        lines += ["", "[stream]", *_toml_rows(rig.stream)]
     for key in _ITEMS:
         for item in getattr(rig, key):
             lines += ["", f"[[{key}]]", *_toml_rows(item)]
@@ -158,8 +163,16 @@ def hide_passwords(rig: Rig) -> Rig:
 
 def _toml_rows(item: Any) -> list[str]:
     values = [(f.name, getattr(item, f.name)) for f in fields(item)]
-    # A JSON string is a TOML string, and a JSON number is a TOML number.
-    return [f"{name} = {json.dumps(value)}" for name, value in values if isinstance(value, (str, int, float))]
+    # A JSON string is a TOML string, and a JSON number is a TOML number; so is a list of strings.
+    return [
+        f"{name} = {json.dumps(value)}"
+        for name, value in values
+        if isinstance(value, (str, int, float)) or (value and _are_texts(value))
+    ]
+
+
+def _are_texts(value: object) -> bool:
+    return isinstance(value, (tuple, list)) and all(isinstance(text, str) for text in value)
 
 
 def load_rig(path: Path) -> Rig:
@@ -195,6 +208,8 @@ def load_rig(path: Path) -> Rig:
         )
     if "floor" in table:
         table["floor"] = _build(Floor, table["floor"], f"{path}: [floor]")
+    if "stream" in table:
+        table["stream"] = _build(RigStream, table["stream"], f"{path}: [stream]")
     rig = check_rig(_build(Rig, table, str(path)), str(path))
     check_units(rig, str(path))
     return rig
@@ -242,6 +257,8 @@ def check_rig(rig: Rig, where: str) -> Rig:
     _check_cameras(rig, where)
     _check_tape(rig, where)
     _check_heights(rig, where)
+    if rig.stream is not None:
+        _check_stream(rig.stream, rig, f"{where}: [stream]")
     for item in (rig, rig.floor, *rig.markers, *rig.cameras, *rig.reference_points):
         _check_numbers(item, where)
     return rig
@@ -298,6 +315,31 @@ def _check_heights(rig: Rig, where: str) -> None:
             )
 
 
+def _check_stream(stream: RigStream, rig: Rig, where: str) -> None:
+    if stream.vrpn is not None and not 0 < stream.vrpn <= _LARGEST_PORT:
+        raise IpsysError(f"{where}: vrpn is {stream.vrpn}; give a port from 1024 to {_LARGEST_PORT}")
+    if stream.stale_s is not None and not stream.stale_s > 0:
+        raise IpsysError(f"{where}: stale_s is {stream.stale_s:g}; give a time in s above 0")
+    check_robots(rig, stream.robots, f"{where} robots")
+
+
+def check_robots(rig: Rig, robots: Collection[str], where: str) -> None:
+    """Check that a rig has some robots; a rig without markers has a robot ``marker_<id>`` for each id.
+
+    Raises
+    ------
+    IpsysError
+        The rig has no robot of a name.
+    """
+    known = {rig.robot_of(marker.id) for marker in rig.markers}
+    for robot in robots:
+        if robot not in known if known else not _MARKER.fullmatch(robot):
+            named = (
+                f"the rig has {', '.join(sorted(known))}" if known else "the rig names none: use marker_<id>"
+            )
+            raise IpsysError(f"{where}: robot {robot!r} is not known; {named}")
+
+
 def _check_unique(names: Iterable[object], what: str) -> None:
     seen: set[object] = set()
     for name in names:
@@ -336,6 +378,10 @@ def _value(kind: str, value: Any, where: str) -> Any:
             raise IpsysError(f"{where} is {_shown(value)}; give a whole number of at most {largest}")
     elif kind.startswith("str") and not isinstance(value, str):
         raise IpsysError(f"{where} must be text in quotes, found {_shown(value)}")
+    elif kind.startswith("tuple[str"):
+        if not _are_texts(value):
+            raise IpsysError(f'{where} must be a list of texts, such as ["a", "b"], found {_shown(value)}')
+        return tuple(value)
     return value
 
 

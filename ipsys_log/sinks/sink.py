@@ -7,12 +7,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from types import TracebackType
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
 
-__all__ = ["Consumer", "Consumers", "LiveQueue", "LiveSinks", "Sink"]
+__all__ = ["Consumer", "Consumers", "DropReport", "LiveQueue", "LiveSinks", "SelectiveSink", "Sink", "Warn"]
 
 # Limits of a sink's queue: above the first limit images are dropped, above the second all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
@@ -22,6 +22,9 @@ _IMAGES = (CompressedImage, CompressedVideo, RawImage, SkippedVideo)
 # Gets messages after they were written, and None if nothing comes. This type is for parts of the recorder
 # that return at once, such as its status; everything else is a sink.
 Consumer = Callable[[Message | None], None]
+
+# Makes an event of a kind and a text, and prints it; called from any thread.
+Warn = Callable[[str, str], None]
 
 
 class Sink(Protocol):
@@ -35,6 +38,44 @@ class Sink(Protocol):
 
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Process all messages; None means that no message waits: then flush the buffers."""
+
+
+@runtime_checkable
+class SelectiveSink(Sink, Protocol):
+    """A sink that gets only messages with payloads of some types: images do not fill its queue."""
+
+    payloads: tuple[type, ...]
+
+
+class DropReport:
+    """The number of messages that a sink lost. Events report the 1st, the 10th, the 100th loss, and so on.
+
+    Parameters
+    ----------
+    name : the name of the sink in the events.
+    """
+
+    def __init__(self, name: str, warn: Warn) -> None:
+        self.count = 0
+        self._name, self._warn = name, warn
+        self._reported, self._next = 0, 1
+
+    def add(self, reason: str) -> None:
+        """Count one lost message."""
+        self.count += 1
+        if self.count >= self._next:
+            self._next *= 10
+            self._report(reason)
+
+    def finish(self) -> None:
+        """Report the total, unless it is reported already."""
+        if self.count > self._reported:
+            self._report("in all")
+
+    def _report(self, reason: str) -> None:
+        self._reported = self.count
+        lost = "1 message" if self.count == 1 else f"{self.count} messages"
+        self._warn("sink_dropped", f"{self._name}: {lost} dropped ({reason})")
 
 
 class LiveQueue:
@@ -59,18 +100,19 @@ class LiveQueue:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def put(self, message: Message) -> None:
-        """Enqueue a message, or drop it."""
+    def put(self, message: Message) -> bool:
+        """Enqueue a message; return False if it is dropped."""
         if isinstance(message.payload, SkippedVideo):
             message = replace(message, payload=message.payload.frame)
         with self._changed:
             if self._closed:
-                return
+                return True
             if self._is_dropped(message):
                 self.dropped[message.topic.rpartition("/")[2]] += 1
-                return
+                return False
             self._waiting.append(message)
             self._changed.notify()
+            return True
 
     def close(self) -> None:
         """End the queue: the sink gets the messages that wait, and no more."""
@@ -113,8 +155,10 @@ class LiveSinks:
     warn : makes an event of a kind and a text, and prints it; called from any thread.
     """
 
-    def __init__(self, sinks: Sequence[Sink], warn: Callable[[str, str], None]) -> None:
+    def __init__(self, sinks: Sequence[Sink], warn: Warn) -> None:
         self.queues = {sink.name: LiveQueue() for sink in sinks}
+        self._payloads = {sink.name: sink.payloads for sink in sinks if isinstance(sink, SelectiveSink)}
+        self._drops = {sink.name: DropReport(sink.name, warn) for sink in sinks}
         self._warn = warn
         self._fault: Exception | None = None
         self._threads = [
@@ -134,12 +178,17 @@ class LiveSinks:
             waiting.close()
         for thread in self._threads:
             thread.join(_JOIN_TIMEOUT_S)  # a window stays open as long as its user wants
+        for drops in self._drops.values():
+            drops.finish()
 
     def __call__(self, message: Message | None) -> None:
         """Hand a message to each sink."""
-        if message is not None:
-            for waiting in self.queues.values():
-                waiting.put(message)
+        if message is None:
+            return
+        for name, waiting in self.queues.items():
+            wanted = name not in self._payloads or isinstance(message.payload, self._payloads[name])
+            if wanted and not waiting.put(message):
+                self._drops[name].add("the sink is too slow")
 
     def check(self) -> None:
         """Raise the error of the first sink that failed, if one did."""
@@ -168,9 +217,7 @@ class Consumers:
     sinks : each gets every message that is not dropped for it, in its own thread.
     """
 
-    def __init__(
-        self, consumers: Sequence[Consumer], warn: Callable[[str, str], None], sinks: Sequence[Sink] = ()
-    ) -> None:
+    def __init__(self, consumers: Sequence[Consumer], warn: Warn, sinks: Sequence[Sink] = ()) -> None:
         self._sinks = LiveSinks(sinks, warn)
         self._consumers: list[Consumer] = [*consumers, self._sinks]
         self._warn = warn

@@ -1,0 +1,96 @@
+"""The player: ``ipsys stream``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from ipsys_log.cli.console import say
+from ipsys_log.cli.options import Logs, RigFile
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, choose_streams
+
+__all__ = ["add_commands"]
+
+Rate = Annotated[
+    float, typer.Option("--rate", metavar="FACTOR", help="Play faster or slower: 2 is twice as fast.")
+]
+Loop = Annotated[bool, typer.Option("--loop", help="Begin again at the end.")]
+StartPaused = Annotated[bool, typer.Option("--start-paused", help="Wait for a key at the start.")]
+StartOffset = Annotated[
+    float,
+    typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first position."),
+]
+Run = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--run", metavar="NAME", help="Play the tracks of this run. Default: the newest."),
+]
+Topics = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        "--topics",
+        metavar="TOPIC",
+        help="Play this topic instead, such as /truth/tracks; repeat it for several.",
+    ),
+]
+Restamp = Annotated[
+    str,
+    typer.Option(
+        "--restamp",
+        metavar="original|now",
+        help="Give the positions their capture times, or the present time.",
+    ),
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(stream)
+
+
+@runs_until_stopped
+def stream(
+    logs: Logs,
+    udp: Udp = None,
+    key: Key = None,
+    host: StreamHost = None,
+    robot: Robots = None,
+    rig: RigFile = None,
+    rate: Rate = 1.0,
+    loop: Loop = False,
+    start_paused: StartPaused = False,
+    start_offset: StartOffset = 0.0,
+    run: Run = None,
+    topics: Topics = None,
+    restamp: Restamp = "original",
+) -> None:
+    """Play logs as if they were live: send their positions to robots and other programs.
+
+    The positions are those of a run; the command computes none. Keys: space pauses, . plays the next
+    position, left and right move by 5 s, + and - change the rate, l loops, q ends. With --rig lab.toml, the
+    streams are those of its [stream]; a log itself opens no stream.
+    """
+    allow_interrupt("stopped before the first position was sent")
+    from ipsys_log.cli.keys import read_keys
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.player import Player
+    from ipsys_log.rig.file import load_rig
+    from ipsys_log.sinks.playback import PlaybackOptions
+
+    if restamp not in ("original", "now"):
+        raise IpsysError(f"--restamp {restamp}: is not known; use original or now")
+    described = None if rig is None else load_rig(rig)
+    folder = Path() if rig is None else rig.parent
+    settings = choose_streams(described, folder, host=host, udp=udp, key=key, robots=robot)
+    if not settings:
+        raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870")
+    options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")
+    player = Player(logs, run, topics or (), options, settings, say=say)
+    stop_on_signal(player.stop)
+    with player:
+        for line in player.lines:
+            say(line)
+        say(f"playing {', '.join(player.runs) or 'ground truth'}: {player.duration_s:.1f} s")
+        with read_keys(player, say):
+            player.wait()

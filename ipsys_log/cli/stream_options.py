@@ -1,0 +1,86 @@
+"""Options of the streams, which ``ipsys live`` and ``ipsys stream`` share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from ipsys_log.messages import Rig
+    from ipsys_log.sinks.streams.settings import StreamSettings
+
+__all__ = ["Key", "Robots", "StreamHost", "Udp", "choose_streams"]
+
+_PANEL = "Streams of positions"
+
+Udp = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        "--udp",
+        metavar="HOST:PORT",
+        help="Send positions as JSON datagrams to this address; repeat it for several. 239.255.0.1:9870 is a "
+        "multicast group. docs/streams.md has receivers in Python and for ESP32.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Key = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--key",
+        metavar="FILE",
+        help="Sign the datagrams with the key in this file (HMAC-SHA256).",
+        rich_help_panel=_PANEL,
+    ),
+]
+StreamHost = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        "--host",
+        metavar="ADDRESS",
+        help="Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. "
+        "Default: only this machine.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Robots = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        "--robot",
+        metavar="NAME",
+        help="Send only this robot; repeat it for several. Default: all.",
+        rich_help_panel=_PANEL,
+    ),
+]
+
+
+def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSettings:
+    """Return the streams of the options; where an option is missing, those of the rig file.
+
+    Parameters
+    ----------
+    rig : the rig of a file, never of a log: a log opens no socket.
+    folder : the folder of the rig file.
+    options : fields of `StreamSettings`; None and empty lists are missing.
+
+    Raises
+    ------
+    IpsysError
+        There is no stream for an option, or the rig has no such robot.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.rig.file import check_robots
+    from ipsys_log.sinks.streams.settings import settings_of_rig
+
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in options.items() if value
+    }
+    settings = replace(settings_of_rig(None if rig is None else rig.stream, folder), **given)
+    if given and not settings:
+        name = {"robots": "robot"}.get(next(iter(given)), next(iter(given)))
+        raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
+    if rig is not None:
+        check_robots(rig, settings.robots, "--robot")
+    return settings

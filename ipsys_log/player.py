@@ -1,0 +1,179 @@
+"""The player: it plays logs in a thread, to streams and to a loop of the user."""
+
+from __future__ import annotations
+
+import heapq
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+
+from ipsys_log.capture.frames import Clock
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Message
+from ipsys_log.rig.file import check_robots
+from ipsys_log.runs.provenance import Outcome
+from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
+from ipsys_log.sinks.played_topics import PlayedTopics, choose_topics
+from ipsys_log.sinks.selection import rig_in_force
+from ipsys_log.sinks.sink import LiveSinks
+from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
+from ipsys_log.tracker import LiveTracks, Tracker
+
+__all__ = ["Player"]
+
+_TURN_S = 0.1
+
+
+class Player:
+    """A playback of logs in a thread. A context manager, made by :func:`ipsys_log.api.play`.
+
+    Iterate over the newest tracks, each at its time. The end of the block ends the playback.
+
+    Attributes
+    ----------
+    runs : the runs of the played tracks; none: ground truth.
+    lines : a line for each stream about its receivers.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        run: str | None = None,
+        topics: Sequence[str] = (),
+        options: PlaybackOptions | None = None,
+        settings: StreamSettings | None = None,
+        clock: Clock | None = None,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        if not paths:
+            raise IpsysError("no log is given; name at least one")
+        self._say, self._ended, self._stack = say, threading.Event(), ExitStack()
+        try:
+            # Each log by itself: two logs may have runs of one name.
+            sessions = [self._stack.enter_context(Session([path])) for path in paths]
+            logs = [(session, choose_topics(session, run, topics)) for session in sessions]
+            settings = settings or StreamSettings()
+            for session, chosen in logs:
+                _check_robots(session, chosen, settings)
+            playback = self._playback = _open_playback(logs, options, clock)
+            tracks = {chosen.tracks for _, chosen in logs}
+            self._streams: Sequence[Stream] = self._stack.enter_context(
+                open_streams(settings, tracks, playback.now_ns, self._warn, playback.session)
+            )
+        except BaseException:
+            self._stack.close()
+            raise
+        self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
+        self.lines = tuple(stream.describe() for stream in self._streams)
+        self._tracker = Tracker(self._play)
+
+    def __enter__(self) -> Player:
+        self._tracker.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            self._tracker.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[LiveTracks]:
+        return iter(self._tracker)
+
+    @property
+    def duration_s(self) -> float:
+        """The time from the first to the last message, in s."""
+        return self._playback.duration_s
+
+    @property
+    def position_s(self) -> float:
+        """The time since the first message, in s; set by :meth:`seek`."""
+        return self._playback.position_s
+
+    @property
+    def session(self) -> int:
+        """The number of the session; a start, a seek and a loop increase it."""
+        return self._playback.session
+
+    @property
+    def is_paused(self) -> bool:
+        """True while the player waits for :meth:`resume` or :meth:`step`."""
+        return self._playback.is_paused
+
+    @property
+    def rate(self) -> float:
+        """The seconds of the log in a second; set it to play faster or slower."""
+        return self._playback.rate
+
+    @rate.setter
+    def rate(self, rate: float) -> None:
+        self._playback.rate = rate
+
+    @property
+    def loop(self) -> bool:
+        """True to begin again at the end; it can be set."""
+        return self._playback.loop
+
+    @loop.setter
+    def loop(self, loop: bool) -> None:
+        self._playback.loop = loop
+
+    def pause(self) -> None:
+        """Hold the playback."""
+        self._playback.pause()
+
+    def resume(self) -> None:
+        """Continue after a pause."""
+        self._playback.resume()
+
+    def step(self) -> None:
+        """Pause, and play the messages of the next capture time."""
+        self._playback.step()
+
+    def seek(self, position_s: float) -> None:
+        """Continue at a time since the first message, in s."""
+        self._playback.seek(position_s)
+
+    def stop(self) -> None:
+        """End the playback."""
+        self._playback.stop()
+
+    def wait(self) -> None:
+        """Wait until the log has ended, or until :meth:`stop`."""
+        while not self._ended.wait(_TURN_S):
+            pass
+
+    def _play(self, tracker: Tracker) -> list[Outcome]:
+        try:
+            tracker.begin(self._playback.stop)
+            with LiveSinks([*self._streams, tracker], self._warn) as show:
+                for message in self._playback:
+                    show(message)
+            show.check()
+        finally:
+            self._ended.set()
+        return []
+
+    def _warn(self, _: str, text: str) -> None:
+        self._say(text)
+
+
+def _check_robots(session: Session, chosen: PlayedTopics, settings: StreamSettings) -> None:
+    rig = rig_in_force(session, [] if chosen.run is None else [chosen.run])
+    if rig is not None:
+        check_robots(rig, settings.robots, str(session))
+
+
+def _open_playback(
+    logs: Sequence[tuple[Session, PlayedTopics]], options: PlaybackOptions | None, clock: Clock | None
+) -> Playback:
+    def read(start_ns: int | None = None) -> Iterator[Message]:
+        streams = (session.messages(chosen.topics, start_ns) for session, chosen in logs)
+        return heapq.merge(*streams, key=lambda message: message.log_time_ns)
+
+    first_ns = next(in_capture_order(read())).publish_time_ns
+    last_ns = max(session.last(chosen.topics)[1] for session, chosen in logs)
+    return Playback(read, first_ns, last_ns, options, clock)

@@ -1,0 +1,63 @@
+"""Choice of the topics that a playback sends: the tracks of a run, or topics that the user names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
+from ipsys_log.runs.provenance import newest_run
+
+__all__ = ["PlayedTopics", "choose_topics"]
+
+
+class PlayedTopics(NamedTuple):
+    """The topics of a playback, the topic of the tracks among them, and their run (None: ground truth)."""
+
+    topics: tuple[str, ...]
+    tracks: str
+    run: str | None
+
+
+def choose_topics(session: Session, run: str | None = None, names: Sequence[str] = ()) -> PlayedTopics:
+    """Choose the topics of a playback.
+
+    Parameters
+    ----------
+    run : the run of the tracks; None: the newest complete one.
+    names : topics of the log instead, one of them with tracks.
+
+    Raises
+    ------
+    IpsysError
+        The log has no tracks, no such run or no such topic, or two of the topics have tracks.
+    """
+    runs = {topic: name for name in sorted(session.run_names()) for topic in session.topics(TRACKS, name)}
+    tracks: dict[str, str | None] = {**runs, **dict.fromkeys(session.topics(TRUTH))}
+    if not runs and not (names and tracks):
+        raise IpsysError(f"{session}: has no tracks to play; {_command(session)}")
+    if not names:
+        chosen = run or newest_run(session, TRACKS) or runs[max(runs)]
+        if chosen not in runs.values():
+            raise IpsysError(f"{session}: run {chosen!r} has no tracks; {', '.join(runs.values())} has")
+        topic = TRACKS.topic_of(chosen)
+        return PlayedTopics((topic,), topic, chosen)
+    known = {topic for reader in session.readers for topic in reader.channels}
+    for name in names:
+        if name not in known:
+            raise IpsysError(
+                f"--topics {name}: the log has no such topic; to list them: ipsys info {session}"
+            )
+    of_tracks = [name for name in dict.fromkeys(names) if name in tracks]
+    if len(of_tracks) != 1:
+        raise IpsysError(f"--topics: name one topic with tracks: {', '.join(sorted(tracks))}")
+    return PlayedTopics(tuple(dict.fromkeys(names)), of_tracks[0], tracks[of_tracks[0]])
+
+
+def _command(session: Session) -> str:
+    """Return the command that makes the tracks."""
+    logs = " ".join(map(str, session.paths))
+    model = "" if session.topics(MEASUREMENTS) else " --model-from calibration.mcap"
+    return f"to make them: ipsys replay {logs}{model}"

@@ -1,0 +1,1 @@
+"""Streams: sinks that send poses of robots to other programs."""

@@ -1,0 +1,166 @@
+"""The poses that streams send: position, velocity, covariance, age, and the number of the session."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from ipsys_log.messages import Message, Track, Tracks
+from ipsys_log.messages.message import Mat33
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["STALE_S", "NewSession", "PoseSource", "StreamPose", "Velocity", "first_session"]
+
+# A robot of 0.26 m/s moves 13 cm in this time.
+STALE_S = 0.5
+# The duration of the poses that give a velocity. A longer one is more precise, and later by half of it.
+_WINDOW_NS, _SHORTEST_NS = NS_PER_S // 5, NS_PER_S // 20
+_FEWEST_POSES = 3
+_NS_PER_MS = NS_PER_S // 1000
+
+
+@dataclass(frozen=True, slots=True)
+class NewSession:
+    """The payload that begins a session: from here on, times may be earlier than before."""
+
+    number: int
+
+
+def first_session(now_ns: int) -> int:
+    """Return the number of a session that begins now: it is larger than those of earlier programs."""
+    return now_ns // _NS_PER_MS
+
+
+@dataclass(frozen=True, slots=True)
+class Velocity:
+    """The velocity of a robot in m/s, and the rate of its heading in rad/s (None: headings are missing)."""
+
+    x_m_s: float
+    y_m_s: float
+    z_m_s: float
+    yaw_rad_s: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamPose:
+    """The pose of a robot at one instant.
+
+    Attributes
+    ----------
+    session, sequence : both increase; the sequence begins with 1 in each session.
+    time_ns, age_s : the capture time, and the time since then by the clock of the stream.
+    is_stale : the pose is older than the limit.
+    is_outside : the position is an extrapolation outside the calibrated volume; None if this is unknown.
+    """
+
+    session: int
+    sequence: int
+    time_ns: int
+    age_s: float
+    track: Track
+    velocity: Velocity | None
+    is_stale: bool
+
+    @property
+    def is_outside(self) -> bool | None:
+        return None if self.track.inside is None else not self.track.inside
+
+    @property
+    def is_good(self) -> bool:
+        """Return whether a protocol without flags may send the pose."""
+        return not self.is_stale and not self.is_outside
+
+    @property
+    def covariance_m2(self) -> Mat33 | None:
+        covariance_m2 = self.track.covariance_m2
+        return covariance_m2 if covariance_m2 is None or np.isfinite(covariance_m2).all() else None
+
+
+class PoseSource:
+    """The poses of robots from messages of tracks. Each stream has its own source.
+
+    A pose that is older than the last one of its robot is left out: it arrived late.
+
+    Parameters
+    ----------
+    topics : the topics of the tracks.
+    robots : the names of the robots; empty: all.
+    now_ns : the clock of the ages.
+    session : the number of the first session.
+    stale_s : the age from which a pose is stale.
+    """
+
+    def __init__(
+        self,
+        topics: Collection[str],
+        now_ns: Callable[[], int],
+        session: int,
+        robots: Collection[str] = (),
+        stale_s: float = STALE_S,
+    ) -> None:
+        self._topics, self._robots, self._now_ns = frozenset(topics), frozenset(robots), now_ns
+        self._session, self._sequence, self._stale_s = session, 0, stale_s
+        self._recent: dict[str, _Recent] = {}
+
+    def read(self, message: Message) -> Iterator[StreamPose]:
+        """Yield the poses of a message; a new session forgets all earlier poses."""
+        if isinstance(message.payload, NewSession):
+            self._session, self._sequence = message.payload.number, 0
+            self._recent.clear()
+        elif message.topic in self._topics and isinstance(message.payload, Tracks):
+            for track in message.payload.tracks:
+                if (not self._robots or track.robot in self._robots) and _is_finite(track):
+                    yield from self._poses(track, message.payload.timestamp)
+
+    def _poses(self, track: Track, time_ns: int) -> Iterator[StreamPose]:
+        recent = self._recent.setdefault(track.robot, _Recent())
+        if not recent.add(time_ns, track):
+            return
+        self._sequence += 1
+        age_s = (self._now_ns() - time_ns) / NS_PER_S
+        yield StreamPose(
+            self._session, self._sequence, time_ns, age_s, track, recent.velocity(), age_s > self._stale_s
+        )
+
+
+def _is_finite(track: Track) -> bool:
+    """Return whether a pose is a number; a log of another program may hold others."""
+    return all(map(isfinite, (track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0)))
+
+
+class _Recent:
+    """The recent poses of one robot, and their velocity: the slope of straight lines (least squares)."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[int, Track]] = deque()
+
+    def add(self, time_ns: int, track: Track) -> bool:
+        """Add a pose; return False if it is older than the last one. One of the same time replaces it."""
+        poses = self._poses
+        if poses and time_ns < poses[-1][0]:
+            return False
+        if poses and time_ns == poses[-1][0]:
+            poses.pop()
+        poses.append((time_ns, track))
+        while time_ns - poses[0][0] > _WINDOW_NS:
+            poses.popleft()
+        return True
+
+    def velocity(self) -> Velocity | None:
+        """Return the velocity; None if the poses are too few, or their time is too short."""
+        first_ns, last_ns = self._poses[0][0], self._poses[-1][0]
+        if len(self._poses) < _FEWEST_POSES or last_ns - first_ns < _SHORTEST_NS:
+            return None
+        times_s = np.array([time_ns - first_ns for time_ns, _ in self._poses]) / NS_PER_S
+        tracks = [track for _, track in self._poses]
+        headings = [track.heading_rad for track in tracks if track.heading_rad is not None]
+        columns = [[track.x_m for track in tracks], [track.y_m for track in tracks], [t.z_m for t in tracks]]
+        if len(headings) == len(tracks):
+            columns.append(np.unwrap(headings).tolist())
+        centred_s = times_s - times_s.mean()
+        slopes = (np.array(columns) @ centred_s / (centred_s @ centred_s)).tolist()
+        return Velocity(slopes[0], slopes[1], slopes[2], slopes[3] if len(slopes) > 3 else None)

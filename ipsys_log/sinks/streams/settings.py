@@ -1,0 +1,101 @@
+"""The streams of a command: their settings, their check before any work, and the open streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from ipsys_log.messages import RigStream
+from ipsys_log.sinks.sink import SelectiveSink, Warn
+from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
+from ipsys_log.sinks.streams.udp import UdpStream, read_key
+
+__all__ = ["Stream", "StreamSettings", "check_streams", "open_streams", "settings_of_rig"]
+
+
+class Stream(SelectiveSink, Protocol):
+    """A sink with open sockets."""
+
+    def describe(self) -> str:
+        """Return one line about the receivers of the positions."""
+
+    def close(self) -> None:
+        """Close the sockets."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """The streams to open, as in `RigStream`; ``key`` is the path of the key file."""
+
+    host: str | None = None
+    udp: tuple[str, ...] = ()
+    key: Path | None = None
+    robots: tuple[str, ...] = ()
+    stale_s: float = STALE_S
+
+    def __bool__(self) -> bool:
+        return bool(self.udp)
+
+
+def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
+    """Return the settings of a rig file; the path of its key is relative to the folder of the file."""
+    if stream is None:
+        return StreamSettings()
+    return StreamSettings(
+        stream.host,
+        stream.udp,
+        None if stream.key is None else folder / stream.key,
+        stream.robots,
+        STALE_S if stream.stale_s is None else stream.stale_s,
+    )
+
+
+@contextmanager
+def open_streams(
+    settings: StreamSettings,
+    topics: Collection[str],
+    now_ns: Callable[[], int],
+    warn: Warn,
+    session: int | None = None,
+) -> Iterator[Sequence[Stream]]:
+    """Open streams; their sockets are closed after the block.
+
+    Parameters
+    ----------
+    topics : the topics of the tracks.
+    now_ns : the clock of the ages.
+    warn : makes an event for lost messages.
+    session : the number of the first session; None: from the clock.
+
+    Raises
+    ------
+    IpsysError
+        An address, a port or the key has a fault.
+    """
+    number = first_session(now_ns()) if session is None else session
+
+    def poses() -> PoseSource:
+        return PoseSource(topics, now_ns, number, settings.robots, settings.stale_s)
+
+    key = None if settings.key is None else read_key(settings.key)
+    with ExitStack() as stack:
+        streams: list[Stream] = []
+        for target in dict.fromkeys(settings.udp):
+            stream = UdpStream(target, settings.host, poses(), warn, key)
+            streams.append(stack.enter_context(closing(stream)))
+        yield streams
+
+
+def check_streams(settings: StreamSettings) -> list[str]:
+    """Open all sockets and close them again; return a line for each stream about its receivers.
+
+    Raises
+    ------
+    IpsysError
+        The errors of :func:`open_streams`.
+    """
+    with open_streams(settings, (), lambda: 0, lambda kind, text: None, 0) as streams:
+        return [stream.describe() for stream in streams]

@@ -1,0 +1,190 @@
+"""UDP stream: one JSON object in each datagram, optionally signed (HMAC-SHA256)."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Message, Tracks
+from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, refuse_bind
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
+
+__all__ = ["FORMAT", "UdpStream", "encode_pose", "read_key"]
+
+# The version of the datagram: a receiver drops other versions.
+FORMAT = 1
+_FEWEST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
+_DECIMALS = 6  # of m, rad and s
+
+
+def encode_pose(pose: StreamPose, key: bytes | None = None) -> bytes:
+    """Return the datagram of a pose: a JSON object, and with a key a newline and the signature in hex.
+
+    Fields without a value are left out. docs/streams.md lists the fields.
+    """
+    track, velocity = pose.track, pose.velocity
+    fields: dict[str, Any] = {
+        "ipsys": FORMAT,
+        "session": pose.session,
+        "seq": pose.sequence,
+        "robot": track.robot,
+        "id": track.id,
+        "time_ns": pose.time_ns,
+        "age_s": round(pose.age_s, _DECIMALS),
+        "stale": pose.is_stale,
+        "outside": pose.is_outside,
+        "x_m": round(track.x_m, _DECIMALS),
+        "y_m": round(track.y_m, _DECIMALS),
+        "z_m": round(track.z_m, _DECIMALS),
+        "heading_rad": _rounded(track.heading_rad),
+    }
+    if velocity is not None:
+        fields |= {"vx_m_s": _rounded(velocity.x_m_s), "vy_m_s": _rounded(velocity.y_m_s)}
+        fields |= {"vz_m_s": _rounded(velocity.z_m_s), "yaw_rad_s": _rounded(velocity.yaw_rad_s)}
+    if pose.covariance_m2 is not None:
+        fields["covariance_m2"] = [float(f"{value:.4g}") for value in pose.covariance_m2.ravel().tolist()]
+    if track.cameras:
+        fields["cameras"] = list(track.cameras)
+    present = {name: value for name, value in fields.items() if value is not None}
+    body = json.dumps(present, separators=(",", ":"), allow_nan=False).encode()
+    if key is None:
+        return body
+    return body + b"\n" + hmac.new(key, body, hashlib.sha256).hexdigest().encode()
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, _DECIMALS)
+
+
+def read_key(path: Path) -> bytes:
+    """Read the key of signatures from a file, without spaces and newlines at its ends.
+
+    Raises
+    ------
+    IpsysError
+        The file cannot be read, or the key is too short or too long.
+    """
+    try:
+        with path.open("rb") as file:
+            key = file.read(_MOST_KEY_BYTES + 1).strip()
+    except OSError as error:
+        raise IpsysError(f"--key {path}: cannot be read: {error.strerror}") from error
+    if not _FEWEST_KEY_BYTES <= len(key) <= _MOST_KEY_BYTES:
+        raise IpsysError(
+            f"--key {path}: has {len(key)} bytes; write {_FEWEST_KEY_BYTES} to {_MOST_KEY_BYTES}, for "
+            f"example with: openssl rand -hex 32 > {path}"
+        )
+    return key
+
+
+class UdpStream:
+    """A :class:`~ipsys_log.sinks.sink.Sink` that sends each pose in a datagram. It never receives.
+
+    Datagrams for which the system has no room are dropped and counted.
+
+    Parameters
+    ----------
+    target : the destination, ``HOST:PORT``; datagrams to a multicast group pass no router (TTL 1).
+    host : the address of this machine to send from; None: datagrams stay on this machine.
+    poses : gives the poses of a message.
+    key : signs the datagrams.
+
+    Raises
+    ------
+    IpsysError
+        The destination is not known or cannot be reached, or is another machine and there is no host.
+    """
+
+    payloads: tuple[type, ...] = (Tracks, NewSession)
+
+    def __init__(
+        self, target: str, host: str | None, poses: PoseSource, warn: Warn, key: bytes | None = None
+    ) -> None:
+        self._destination = find_destination(target, "--udp")
+        self.name = f"UDP {target}"
+        self._poses, self._key = poses, key
+        self._drops = DropReport(self.name, warn)
+        self._local = local_address(self._destination, host, "--udp")
+        self._socket = self._open()
+
+    def describe(self) -> str:
+        """Return one line about the receivers of the positions."""
+        signed = "" if self._key is None else ", signed"
+        if is_loopback(self._local):
+            return f"{self.name}{signed}: only this machine"
+        if self._destination.is_multicast:
+            return f"{self.name}{signed}: every computer of this network can read the positions"
+        return f"{self.name}{signed}: sent into the network from {self._local}, not encrypted"
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        """Send the poses of the messages until they end."""
+        for message in messages:
+            for pose in () if message is None else self._poses.read(message):
+                self._send(encode_pose(pose, self._key))
+        self._drops.finish()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _open(self) -> socket.socket:
+        destination = self._destination
+        sending = socket.socket(destination.family, socket.SOCK_DGRAM)
+        try:
+            # No program reads this socket: the smallest buffer for datagrams that others send to it.
+            sending.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
+            if destination.is_multicast:
+                self._set_multicast(sending)
+            self._bind(sending)
+            self._check_route()
+        except BaseException:
+            sending.close()
+            raise
+        sending.setblocking(False)
+        return sending
+
+    def _set_multicast(self, sending: socket.socket) -> None:
+        if self._destination.family != socket.AF_INET:
+            raise IpsysError(
+                f"--udp {self._destination.name}: give a group of IPv4, such as 239.255.0.1:9870"
+            )
+        sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+        if self._local != "0.0.0.0":
+            interface = socket.inet_aton(self._local)
+            sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, interface)
+
+    def _bind(self, sending: socket.socket) -> None:
+        try:
+            sending.bind((self._local, 0))
+        except OSError as error:
+            raise refuse_bind(error, self._local, 0, "--udp") from error
+
+    def _check_route(self) -> None:
+        """Check that a route leads to the destination; a connected socket of UDP sends nothing."""
+        destination = self._destination
+        if destination.is_multicast:
+            return
+        with socket.socket(destination.family, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind((self._local, 0))
+                probe.connect(destination.address)
+            except OSError as error:
+                raise IpsysError(
+                    f"--udp {destination.name}: cannot be reached from {self._local} "
+                    f"({error.strerror}); correct the address, or --host"
+                ) from error
+
+    def _send(self, datagram: bytes) -> None:
+        try:
+            self._socket.sendto(datagram, self._destination.address)
+        except BlockingIOError:
+            self._drops.add("the system has no room for more datagrams")
+        except OSError as error:
+            self._drops.add(str(error.strerror))

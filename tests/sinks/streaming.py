@@ -1,0 +1,58 @@
+"""Logs with tracks for tests of streams, and a clock that advances only while a playback waits."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ipsys_log.capture.frames import Clock
+from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
+from ipsys_log.runs.output import write_log
+from ipsys_log.units import NS_PER_S
+
+START_NS = 1_700_000_000 * NS_PER_S
+STEP_NS = NS_PER_S // 25
+TOPIC = "/runs/poly/tracks"
+RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(0, robot="ada"), RigMarker(1, robot="bob")))
+
+
+def track(robot: str, x_m: float, heading_rad: float | None = 0.0, inside: bool | None = True) -> Track:
+    number = {"ada": 0, "bob": 1}[robot]
+    return Track(robot, number, x_m, 2.0, 0.1, heading_rad, np.eye(3) * 1e-4, ("red",), inside)
+
+
+def tracks(number: int, *rows: Track, late_ns: int = 30_000_000) -> Message:
+    """Return the tracks of one instant; ada moves with 0.25 m/s."""
+    time_ns = START_NS + number * STEP_NS
+    rows = rows or (track("ada", 1 + 0.01 * number), track("bob", 3.0))
+    return Message(TOPIC, time_ns + late_ns, time_ns, Tracks(time_ns, rows))
+
+
+def write_tracks(path: Path, count: int = 50, first: int = 0, rig: Rig = RIG) -> Path:
+    """Write a log with tracks at 25 Hz."""
+
+    def messages() -> Iterator[Message]:
+        yield Message("/rig", START_NS, START_NS, rig)
+        yield from (tracks(first + number) for number in range(count))
+
+    write_log(path, messages())
+    return path
+
+
+class WaitingClock(Clock):
+    """A clock that advances only by waiting, without delay: each message has its exact time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time_ns = 5_000 * NS_PER_S
+        self.waits = 0
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+    def wait(self, _: threading.Condition, seconds: float | None) -> None:
+        self.waits += 1
+        self.time_ns += round((seconds or 0.0) * NS_PER_S)

@@ -56,12 +56,11 @@ class Player:
             sessions = [self._stack.enter_context(Session([path])) for path in paths]
             logs = [(session, choose_topics(session, run, topics)) for session in sessions]
             settings = settings or StreamSettings()
-            for session, chosen in logs:
-                _check_robots(session, chosen, settings)
+            robots = [robot for session, chosen in logs for robot in _robots(session, chosen, settings)]
             playback = self._playback = _open_playback(logs, options, clock)
             tracks = {chosen.tracks for _, chosen in logs}
             self._streams: Sequence[Stream] = self._stack.enter_context(
-                open_streams(settings, tracks, playback.now_ns, self._warn, playback.session)
+                open_streams(settings, tracks, playback.now_ns, self._warn, playback.session, robots)
             )
         except BaseException:
             self._stack.close()
@@ -161,10 +160,13 @@ class Player:
         self._say(text)
 
 
-def _check_robots(session: Session, chosen: PlayedTopics, settings: StreamSettings) -> None:
+def _robots(session: Session, chosen: PlayedTopics, settings: StreamSettings) -> list[str]:
+    """Return the robots of a log's rig; check that it has those of the settings."""
     rig = rig_in_force(session, [] if chosen.run is None else [chosen.run])
-    if rig is not None:
-        check_robots(rig, settings.robots, str(session))
+    if rig is None:
+        return []
+    check_robots(rig, settings.robots, str(session))
+    return [marker.robot for marker in rig.markers if marker.robot]
 
 
 def _open_playback(

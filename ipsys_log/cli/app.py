@@ -113,6 +113,7 @@ ipsys info monday.mcap
     "stream": """
 ipsys stream monday.mcap --udp 127.0.0.1:9870 --rate 2
 ipsys stream monday.mcap --udp 192.168.1.20:9870 --host 0.0.0.0 --loop
+ipsys stream monday.mcap --vrpn --start-offset 20    # port 3883
 """,
     "verify": """
 ipsys verify monday.mcap                           # all of its runs

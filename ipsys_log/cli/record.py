@@ -22,7 +22,7 @@ from ipsys_log.cli.options import (
     RigNow,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
-from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, choose_streams
+from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
 
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
@@ -132,6 +132,8 @@ def live(
     view: View = False,
     udp: Udp = None,
     key: Key = None,
+    vrpn: Vrpn = False,
+    vrpn_port: VrpnPort = None,
     host: StreamHost = None,
     robot: Robots = None,
     seconds: Seconds = None,
@@ -154,17 +156,20 @@ def live(
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         remarks.print(line, style="yellow", markup=False)
-    streamed = choose_streams(lab.rig, rig.parent, host=host, udp=udp, key=key, robots=robot)
+    streamed = choose_streams(
+        lab.rig, rig.parent, is_vrpn=vrpn, vrpn=vrpn_port, host=host, udp=udp, key=key, robots=robot
+    )
     for line in check_streams(streamed):
         say(line)
-    if streamed and not any(marker.robot for marker in lab.rig.markers):
+    robots = [marker.robot for marker in lab.rig.markers if marker.robot]
+    if streamed and not robots:
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
         remarks.print(text, style="yellow", markup=False)
     shown_run = _first_run(request)
     with (
         open_cameras(lab, output, seconds) as (cameras, settings, status),
         open_streams(
-            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event
+            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, robots=robots
         ) as streams,
     ):
         viewer = [_viewer(settings, cameras, shown_run)] if view else []

@@ -8,12 +8,16 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import say
-from ipsys_log.cli.options import Logs, RigFile
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
-from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, choose_streams
+from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
 
 __all__ = ["add_commands"]
 
+Logs = Annotated[list[Path], typer.Argument(help="Logs to play, merged by time.", metavar="LOG")]
+RigFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),
+]
 Rate = Annotated[
     float, typer.Option("--rate", metavar="FACTOR", help="Play faster or slower: 2 is twice as fast.")
 ]
@@ -54,6 +58,8 @@ def stream(
     logs: Logs,
     udp: Udp = None,
     key: Key = None,
+    vrpn: Vrpn = False,
+    vrpn_port: VrpnPort = None,
     host: StreamHost = None,
     robot: Robots = None,
     rig: RigFile = None,
@@ -69,7 +75,7 @@ def stream(
 
     The positions are those of a run; the command computes none. Keys: space pauses, . plays the next
     position, left and right move by 5 s, + and - change the rate, l loops, q ends. With --rig lab.toml, the
-    streams are those of its [stream]; a log itself opens no stream.
+    command opens the streams of this file; a log itself opens no stream.
     """
     allow_interrupt("stopped before the first position was sent")
     from ipsys_log.cli.keys import read_keys
@@ -82,7 +88,9 @@ def stream(
         raise IpsysError(f"--restamp {restamp}: is not known; use original or now")
     described = None if rig is None else load_rig(rig)
     folder = Path() if rig is None else rig.parent
-    settings = choose_streams(described, folder, host=host, udp=udp, key=key, robots=robot)
+    settings = choose_streams(
+        described, folder, is_vrpn=vrpn, vrpn=vrpn_port, host=host, udp=udp, key=key, robots=robot
+    )
     if not settings:
         raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870")
     options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-__all__ = ["Key", "Robots", "StreamHost", "Udp", "choose_streams"]
+__all__ = ["Key", "Robots", "StreamHost", "Udp", "Vrpn", "VrpnPort", "choose_streams"]
 
 _PANEL = "Streams of positions"
 
@@ -32,6 +32,25 @@ Key = Annotated[
         "--key",
         metavar="FILE",
         help="Sign the datagrams with the key in this file (HMAC-SHA256).",
+        rich_help_panel=_PANEL,
+    ),
+]
+Vrpn = Annotated[
+    bool,
+    typer.Option(
+        "--vrpn",
+        help="Serve positions over VRPN on port 3883, as a motion-capture system: for ROS 2, MATLAB, Unity.",
+        rich_help_panel=_PANEL,
+    ),
+]
+VrpnPort = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--vrpn-port",
+        metavar="PORT",
+        min=1,
+        max=65535,
+        help="Serve VRPN on another port.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -63,7 +82,8 @@ def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSetti
     ----------
     rig : the rig of a file, never of a log: a log opens no socket.
     folder : the folder of the rig file.
-    options : fields of `StreamSettings`; None and empty lists are missing.
+    options : fields of `StreamSettings`, and ``is_vrpn`` for the usual port; None and empty lists are
+        missing.
 
     Raises
     ------
@@ -73,7 +93,10 @@ def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSetti
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import check_robots
     from ipsys_log.sinks.streams.settings import settings_of_rig
+    from ipsys_log.sinks.streams.vrpn import PORT
 
+    if options.pop("is_vrpn", False):
+        options["vrpn"] = options.get("vrpn") or PORT
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in options.items() if value
     }

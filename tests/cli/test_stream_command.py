@@ -73,11 +73,14 @@ def test_stream_sends_a_log_and_ends(ipsys: Ipsys, log: Path, listening: socket.
 def test_no_socket_is_open_beyond_loopback_without_host(
     log: Path, listening: socket.socket, host: str | None
 ) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        vrpn = port_of(free)
     options = ["--udp", f"127.0.0.1:{port_of(listening)}", "--udp", "239.255.0.1:9870", "--loop"]
+    options += ["--vrpn-port", str(vrpn)]
     program = started("stream", log, *options, *(["--host", host] if host else []))
     try:
         listening.recv(2048)
-        assert len(open_sockets(program.pid)) == 2
+        assert len(open_sockets(program.pid)) == 4
         assert bool(exposed(program.pid)) is (host is not None)
     finally:
         text = stop(program)
@@ -128,6 +131,13 @@ def test_streams_of_a_rig_file_are_opened_and_those_of_a_log_are_not(
     assert logged.stream == rig.stream
     assert ipsys("init", tmp_path / "new.toml", "--from", log).code == 0
     assert load_rig(tmp_path / "new.toml").stream is None
+
+
+def test_second_server_names_the_port(ipsys: Ipsys, log: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = port_of(other)
+        line = refused(ipsys, log, "stream", log, "--vrpn-port", port)
+    assert f"--vrpn: port {port} is in use, perhaps by another ipsys" in line
 
 
 REFUSED = {

@@ -12,6 +12,7 @@ from ipsys_log.messages import RigStream
 from ipsys_log.sinks.sink import SelectiveSink, Warn
 from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
 from ipsys_log.sinks.streams.udp import UdpStream, read_key
+from ipsys_log.sinks.streams.vrpn import VrpnStream
 
 __all__ = ["Stream", "StreamSettings", "check_streams", "open_streams", "settings_of_rig"]
 
@@ -33,11 +34,12 @@ class StreamSettings:
     host: str | None = None
     udp: tuple[str, ...] = ()
     key: Path | None = None
+    vrpn: int | None = None
     robots: tuple[str, ...] = ()
     stale_s: float = STALE_S
 
     def __bool__(self) -> bool:
-        return bool(self.udp)
+        return bool(self.udp) or self.vrpn is not None
 
 
 def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
@@ -48,6 +50,7 @@ def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
         stream.host,
         stream.udp,
         None if stream.key is None else folder / stream.key,
+        stream.vrpn,
         stream.robots,
         STALE_S if stream.stale_s is None else stream.stale_s,
     )
@@ -60,6 +63,7 @@ def open_streams(
     now_ns: Callable[[], int],
     warn: Warn,
     session: int | None = None,
+    robots: Sequence[str] = (),
 ) -> Iterator[Sequence[Stream]]:
     """Open streams; their sockets are closed after the block.
 
@@ -69,6 +73,7 @@ def open_streams(
     now_ns : the clock of the ages.
     warn : makes an event for lost messages.
     session : the number of the first session; None: from the clock.
+    robots : all robots of the rig, announced before they are seen.
 
     Raises
     ------
@@ -86,6 +91,10 @@ def open_streams(
         for target in dict.fromkeys(settings.udp):
             stream = UdpStream(target, settings.host, poses(), warn, key)
             streams.append(stack.enter_context(closing(stream)))
+        if settings.vrpn is not None:
+            named = [robot for robot in robots if not settings.robots or robot in settings.robots]
+            server = VrpnStream(settings.vrpn, settings.host, poses(), warn, named)
+            streams.append(stack.enter_context(closing(server)))
         yield streams
 
 

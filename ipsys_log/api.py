@@ -594,6 +594,7 @@ def play(
     udp: Sequence[str] = (),
     key: StrPath | None = None,
     vrpn: int | None = None,
+    mavlink: Sequence[str] = (),
     host: str | None = None,
     robots: Sequence[str] = (),
     clock: Clock | None = None,
@@ -613,6 +614,7 @@ def play(
     udp : destinations of datagrams, such as ``192.168.1.20:9870``.
     key : the file with the key that signs the datagrams.
     vrpn : the port of a VRPN server, usually 3883; None: no server.
+    mavlink : autopilots, such as ``ada=192.168.1.30:14550``.
     host : the address of this machine that other computers can reach; None: only this machine.
     robots : only these robots.
     clock : the clock of the playback; None: the system's.
@@ -638,5 +640,5 @@ def play(
 
     options = PlaybackOptions(rate, loop, start_paused, start_offset_s, restamp)
     path = None if key is None else Path(key)
-    settings = StreamSettings(host, tuple(udp), path, vrpn, tuple(robots))
+    settings = StreamSettings(host, tuple(udp), path, vrpn, tuple(mavlink), robots=tuple(robots))
     return Player([Path(path) for path in paths], run, topics, options, settings, clock, say)

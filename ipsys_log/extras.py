@@ -25,6 +25,7 @@ LIBRARIES = {
     "jinja2": Library("Jinja2", "report"),
     "starlette": Library("Starlette", "web"),
     "uvicorn": Library("Uvicorn", "web"),
+    "pymavlink": Library("pymavlink", "mavlink"),
 }
 
 

@@ -165,7 +165,7 @@ def _robots(session: Session, chosen: PlayedTopics, settings: StreamSettings) ->
     rig = rig_in_force(session, [] if chosen.run is None else [chosen.run])
     if rig is None:
         return []
-    check_robots(rig, settings.robots, str(session))
+    check_robots(rig, settings.named_robots, str(session))
     return [marker.robot for marker in rig.markers if marker.robot]
 
 

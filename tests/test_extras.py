@@ -50,7 +50,7 @@ for command in commands:
     results.append([code, out.getvalue(), err.getvalue()])
 print(json.dumps(results))
 """
-HIDDEN = [*LIBRARIES, "PIL", "anyio", "h11", "markupsafe", "pyarrow"]
+HIDDEN = [*LIBRARIES, "PIL", "fastcrc", "lxml", "anyio", "h11", "markupsafe", "pyarrow"]
 
 RIG = """name = "lab"
 dictionary = "DICT_4X4_100"
@@ -105,6 +105,8 @@ REFUSED = {
     "view lab.mcap": "view needs Rerun: pip install 'ipsys_log[view]'",
     "view lab.mcap --save lab.rrd": "view needs Rerun: pip install 'ipsys_log[view]'",
     "live --view --model-from model.mcap -o x.mcap": "--view needs Rerun: pip install 'ipsys_log[view]'",
+    "live --mavlink marker_0=127.0.0.1:14550 --model-from model.mcap -o x.mcap": "--mavlink needs pymavlink: "
+    "pip install 'ipsys_log[mavlink]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",
     "evaluate lab.mcap --plots x": "--plots needs Matplotlib: pip install 'ipsys_log[report]'",

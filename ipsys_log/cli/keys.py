@@ -40,7 +40,7 @@ def read_keys(player: Player, say: Callable[[str], None]) -> Iterator[None]:
     ended = threading.Event()
     reader = threading.Thread(target=_read, args=(terminal, player, say, ended), name="keys", daemon=True)
     try:
-        tty.setcbreak(terminal)
+        tty.setcbreak(terminal, termios.TCSANOW)  # keys that wait are kept
         reader.start()
         yield
     finally:

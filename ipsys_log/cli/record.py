@@ -22,7 +22,7 @@ from ipsys_log.cli.options import (
     RigNow,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
-from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
+from ipsys_log.cli.stream_options import Key, Mavlink, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
 
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
@@ -134,6 +134,7 @@ def live(
     key: Key = None,
     vrpn: Vrpn = False,
     vrpn_port: VrpnPort = None,
+    mavlink: Mavlink = None,
     host: StreamHost = None,
     robot: Robots = None,
     seconds: Seconds = None,
@@ -157,7 +158,15 @@ def live(
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         remarks.print(line, style="yellow", markup=False)
     streamed = choose_streams(
-        lab.rig, rig.parent, is_vrpn=vrpn, vrpn=vrpn_port, host=host, udp=udp, key=key, robots=robot
+        lab.rig,
+        rig.parent,
+        is_vrpn=vrpn,
+        vrpn=vrpn_port,
+        mavlink=mavlink,
+        host=host,
+        udp=udp,
+        key=key,
+        robots=robot,
     )
     for line in check_streams(streamed):
         say(line)

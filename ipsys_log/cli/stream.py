@@ -9,7 +9,7 @@ import typer
 
 from ipsys_log.cli.console import say
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
-from ipsys_log.cli.stream_options import Key, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
+from ipsys_log.cli.stream_options import Key, Mavlink, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
 
 __all__ = ["add_commands"]
 
@@ -60,6 +60,7 @@ def stream(
     key: Key = None,
     vrpn: Vrpn = False,
     vrpn_port: VrpnPort = None,
+    mavlink: Mavlink = None,
     host: StreamHost = None,
     robot: Robots = None,
     rig: RigFile = None,
@@ -89,7 +90,15 @@ def stream(
     described = None if rig is None else load_rig(rig)
     folder = Path() if rig is None else rig.parent
     settings = choose_streams(
-        described, folder, is_vrpn=vrpn, vrpn=vrpn_port, host=host, udp=udp, key=key, robots=robot
+        described,
+        folder,
+        is_vrpn=vrpn,
+        vrpn=vrpn_port,
+        mavlink=mavlink,
+        host=host,
+        udp=udp,
+        key=key,
+        robots=robot,
     )
     if not settings:
         raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870")
@@ -99,6 +108,6 @@ def stream(
     with player:
         for line in player.lines:
             say(line)
-        say(f"playing {', '.join(player.runs) or 'ground truth'}: {player.duration_s:.1f} s")
         with read_keys(player, say):
+            say(f"playing {', '.join(player.runs) or 'ground truth'}: {player.duration_s:.1f} s")
             player.wait()

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-__all__ = ["Key", "Robots", "StreamHost", "Udp", "Vrpn", "VrpnPort", "choose_streams"]
+__all__ = ["Key", "Mavlink", "Robots", "StreamHost", "Udp", "Vrpn", "VrpnPort", "choose_streams"]
 
 _PANEL = "Streams of positions"
 
@@ -51,6 +51,16 @@ VrpnPort = Annotated[
         min=1,
         max=65535,
         help="Serve VRPN on another port.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Mavlink = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        "--mavlink",
+        metavar="ROBOT=HOST:PORT",
+        help="Send the pose of a robot to its autopilot (PX4, ArduPilot); repeat it for several. With "
+        "/vision at the end, the message is VISION_POSITION_ESTIMATE instead of ODOMETRY.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -105,5 +115,5 @@ def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSetti
         name = {"robots": "robot"}.get(next(iter(given)), next(iter(given)))
         raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
     if rig is not None:
-        check_robots(rig, settings.robots, "--robot")
+        check_robots(rig, settings.named_robots, "--robot")
     return settings

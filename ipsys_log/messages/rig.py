@@ -62,8 +62,9 @@ class RigStream:
 
     ``host`` is the address of this machine that other computers can reach; None: only this machine. ``udp``
     are destinations, as ``HOST:PORT``. ``key`` names the file with the key of their signature. ``vrpn`` is
-    the port of the VRPN server. ``robots`` are the streamed robots; empty: all. A position that is older than
-    ``stale_s`` is marked or withheld.
+    the port of the VRPN server. ``mavlink`` are autopilots, as ``ROBOT=HOST:PORT``; ``north_rad`` is the
+    direction of north, from the x axis of the lab to its y axis. ``robots`` are the streamed robots; empty:
+    all. A position that is older than ``stale_s`` is marked or withheld.
     """
 
     host: str | None = None
@@ -72,6 +73,8 @@ class RigStream:
     vrpn: int | None = None
     robots: tuple[str, ...] = ()
     stale_s: float | None = None
+    mavlink: tuple[str, ...] = ()
+    north_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

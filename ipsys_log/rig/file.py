@@ -320,6 +320,9 @@ def _check_stream(stream: RigStream, rig: Rig, where: str) -> None:
         raise IpsysError(f"{where}: vrpn is {stream.vrpn}; give a port from 1024 to {_LARGEST_PORT}")
     if stream.stale_s is not None and not stream.stale_s > 0:
         raise IpsysError(f"{where}: stale_s is {stream.stale_s:g}; give a time in s above 0")
+    if stream.north_rad is not None and not abs(stream.north_rad) <= 2 * math.pi:
+        degrees = f"; {math.radians(stream.north_rad):.4f} if it is in degrees"
+        raise IpsysError(f"{where}: north_rad is {stream.north_rad:g}; give an angle in rad{degrees}")
     check_robots(rig, stream.robots, f"{where} robots")
 
 

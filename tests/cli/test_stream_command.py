@@ -27,7 +27,7 @@ from tests.sinks.streaming import RIG as LAB
 from tests.sinks.streaming import START_NS, STEP_NS, write_tracks
 from tests.test_bad_input import refused
 
-_LIMIT_S = 240.0
+_LIMIT_S = 60.0
 
 
 @pytest.fixture

@@ -9,7 +9,15 @@ from dataclasses import dataclass
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["LOOPBACK", "Destination", "find_destination", "is_loopback", "local_address", "refuse_bind"]
+__all__ = [
+    "LOOPBACK",
+    "Destination",
+    "find_destination",
+    "is_loopback",
+    "local_address",
+    "open_datagrams",
+    "refuse_bind",
+]
 
 LOOPBACK = "127.0.0.1"
 _LOOPBACK_6 = "::1"
@@ -100,3 +108,51 @@ def refuse_bind(error: OSError, host: str, port: int, option: str) -> IpsysError
     if error.errno == errno.EACCES:
         return IpsysError(f"{option}: port {port} is not allowed; give one from 1024 to {_LARGEST_PORT}")
     return IpsysError(f"--host {host}: is not an address of this machine; use 0.0.0.0 for all its addresses")
+
+
+def open_datagrams(destination: Destination, local: str, option: str) -> socket.socket:
+    """Return a socket that sends datagrams to a destination; those to a group pass no router (TTL 1).
+
+    Raises
+    ------
+    IpsysError
+        ``local`` is not an address of this machine, or no route leads to the destination.
+    """
+    sending = socket.socket(destination.family, socket.SOCK_DGRAM)
+    try:
+        if destination.is_multicast:
+            _set_multicast(sending, destination, local, option)
+        try:
+            sending.bind((local, 0))
+        except OSError as error:
+            raise refuse_bind(error, local, 0, option) from error
+        if not destination.is_multicast:
+            _check_route(destination, local, option)
+    except BaseException:
+        sending.close()
+        raise
+    return sending
+
+
+def _set_multicast(sending: socket.socket, destination: Destination, local: str, option: str) -> None:
+    if destination.family != socket.AF_INET:
+        raise IpsysError(f"{option} {destination.name}: give a group of IPv4, such as 239.255.0.1:9870")
+    sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+    if local != "0.0.0.0":
+        try:
+            sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(local))
+        except OSError as error:
+            raise refuse_bind(error, local, 0, option) from error
+
+
+def _check_route(destination: Destination, local: str, option: str) -> None:
+    """Check that a route leads to a destination; to connect a socket of UDP sends nothing."""
+    with socket.socket(destination.family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((local, 0))
+            probe.connect(destination.address)
+        except OSError as error:
+            raise IpsysError(
+                f"{option} {destination.name}: cannot be reached from {local} ({error.strerror}); correct "
+                "the address, or --host"
+            ) from error

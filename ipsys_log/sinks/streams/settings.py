@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from math import pi
 from pathlib import Path
 from typing import Protocol
 
+from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigStream
 from ipsys_log.sinks.sink import SelectiveSink, Warn
 from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
@@ -35,11 +37,18 @@ class StreamSettings:
     udp: tuple[str, ...] = ()
     key: Path | None = None
     vrpn: int | None = None
+    mavlink: tuple[str, ...] = ()
+    north_rad: float = pi / 2
     robots: tuple[str, ...] = ()
     stale_s: float = STALE_S
 
+    @property
+    def named_robots(self) -> tuple[str, ...]:
+        """The robots that the settings name."""
+        return (*self.robots, *(text.partition("=")[0] for text in self.mavlink))
+
     def __bool__(self) -> bool:
-        return bool(self.udp) or self.vrpn is not None
+        return bool(self.udp or self.mavlink) or self.vrpn is not None
 
 
 def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
@@ -51,6 +60,8 @@ def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
         stream.udp,
         None if stream.key is None else folder / stream.key,
         stream.vrpn,
+        stream.mavlink,
+        pi / 2 if stream.north_rad is None else stream.north_rad,
         stream.robots,
         STALE_S if stream.stale_s is None else stream.stale_s,
     )
@@ -82,8 +93,8 @@ def open_streams(
     """
     number = first_session(now_ns()) if session is None else session
 
-    def poses() -> PoseSource:
-        return PoseSource(topics, now_ns, number, settings.robots, settings.stale_s)
+    def poses(named: Sequence[str] = settings.robots) -> PoseSource:
+        return PoseSource(topics, now_ns, number, named, settings.stale_s)
 
     key = None if settings.key is None else read_key(settings.key)
     with ExitStack() as stack:
@@ -95,7 +106,25 @@ def open_streams(
             named = [robot for robot in robots if not settings.robots or robot in settings.robots]
             server = VrpnStream(settings.vrpn, settings.host, poses(), warn, named)
             streams.append(stack.enter_context(closing(server)))
+        for autopilot in _autopilots(settings, poses, now_ns, warn):
+            streams.append(stack.enter_context(closing(autopilot)))
         yield streams
+
+
+def _autopilots(
+    settings: StreamSettings,
+    poses: Callable[[Sequence[str]], PoseSource],
+    now_ns: Callable[[], int],
+    warn: Warn,
+) -> Iterator[Stream]:
+    """Yield a stream for each autopilot; its library is optional, and loaded only here."""
+    if settings.mavlink:
+        check_installed("--mavlink needs", "pymavlink")
+        from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
+
+        for endpoint in [parse_endpoint(text) for text in dict.fromkeys(settings.mavlink)]:
+            source = poses([endpoint.robot])
+            yield MavlinkStream(endpoint, settings.host, source, now_ns, warn, settings.north_rad)
 
 
 def check_streams(settings: StreamSettings) -> list[str]:

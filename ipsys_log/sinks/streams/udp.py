@@ -13,7 +13,7 @@ from typing import Any
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
-from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, refuse_bind
+from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 
 __all__ = ["FORMAT", "UdpStream", "encode_pose", "read_key"]
@@ -112,7 +112,10 @@ class UdpStream:
         self._poses, self._key = poses, key
         self._drops = DropReport(self.name, warn)
         self._local = local_address(self._destination, host, "--udp")
-        self._socket = self._open()
+        self._socket = open_datagrams(self._destination, self._local, "--udp")
+        # No program reads this socket: the smallest buffer for datagrams that others send to it.
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
+        self._socket.setblocking(False)
 
     def describe(self) -> str:
         """Return one line about the receivers of the positions."""
@@ -133,53 +136,6 @@ class UdpStream:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-    def _open(self) -> socket.socket:
-        destination = self._destination
-        sending = socket.socket(destination.family, socket.SOCK_DGRAM)
-        try:
-            # No program reads this socket: the smallest buffer for datagrams that others send to it.
-            sending.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
-            if destination.is_multicast:
-                self._set_multicast(sending)
-            self._bind(sending)
-            self._check_route()
-        except BaseException:
-            sending.close()
-            raise
-        sending.setblocking(False)
-        return sending
-
-    def _set_multicast(self, sending: socket.socket) -> None:
-        if self._destination.family != socket.AF_INET:
-            raise IpsysError(
-                f"--udp {self._destination.name}: give a group of IPv4, such as 239.255.0.1:9870"
-            )
-        sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
-        if self._local != "0.0.0.0":
-            interface = socket.inet_aton(self._local)
-            sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, interface)
-
-    def _bind(self, sending: socket.socket) -> None:
-        try:
-            sending.bind((self._local, 0))
-        except OSError as error:
-            raise refuse_bind(error, self._local, 0, "--udp") from error
-
-    def _check_route(self) -> None:
-        """Check that a route leads to the destination; a connected socket of UDP sends nothing."""
-        destination = self._destination
-        if destination.is_multicast:
-            return
-        with socket.socket(destination.family, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind((self._local, 0))
-                probe.connect(destination.address)
-            except OSError as error:
-                raise IpsysError(
-                    f"--udp {destination.name}: cannot be reached from {self._local} "
-                    f"({error.strerror}); correct the address, or --host"
-                ) from error
 
     def _send(self, datagram: bytes) -> None:
         try:

@@ -1,0 +1,185 @@
+"""MAVLink stream: pymavlink as the autopilot gets poses in its own axes, and disturbs nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from math import isnan, pi
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink import mavutil
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Message
+from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
+
+_LIMIT_S = 60.0
+NOW_NS = START_NS + 7
+
+
+class Autopilot:
+    """The receiving side, with the library of MAVLink; it listens on a port of its own."""
+
+    def __init__(self) -> None:
+        self.link: Any = mavutil.mavlink_connection("udpin:127.0.0.1:0", dialect="common", source_component=1)
+        self.target = f"127.0.0.1:{self.link.port.getsockname()[1]}"
+
+    @property
+    def sender(self) -> Any:
+        """The address of the stream."""
+        (address,) = self.link.clients
+        return address
+
+    def close(self) -> None:
+        self.link.close()
+
+    def next(self, kind: str) -> Any:
+        end_s = time.monotonic() + _LIMIT_S
+        while time.monotonic() < end_s:
+            message = self.link.recv_match(type=kind, blocking=True, timeout=1)
+            if message is not None:
+                return message
+        raise AssertionError(f"no {kind}")
+
+
+@pytest.fixture
+def autopilot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Autopilot]:
+    monkeypatch.setenv("MAVLINK20", "1")
+    with closing(Autopilot()) as receiving:
+        yield receiving
+
+
+@contextmanager
+def streaming(
+    autopilot: Autopilot, message: str = "", north_rad: float = pi / 2
+) -> Iterator[tuple[MavlinkStream, list[str]]]:
+    events: list[str] = []
+    poses = PoseSource({TOPIC}, lambda: START_NS, 300, ["ada"])
+    endpoint = parse_endpoint(f"ada={autopilot.target}{message}")
+    stream = MavlinkStream(
+        endpoint, None, poses, lambda: NOW_NS, lambda kind, text: events.append(text), north_rad
+    )
+    with closing(stream):
+        yield stream, events
+
+
+def test_pose_arrives_in_the_axes_of_the_autopilot(autopilot: Autopilot) -> None:
+    """The robot is 1 m east and 2 m north, 0.1 m up, faces east, and drives to the east."""
+    with streaming(autopilot) as (stream, _):
+        stream.consume(iter([tracks(n, track("ada", 1 + 0.02 * (n - 3), 0.0)) for n in range(4)]))
+        *_, last = [autopilot.next("ODOMETRY") for _ in range(4)]
+    assert last.time_usec == (START_NS + 3 * STEP_NS) // 1000
+    assert (last.frame_id, last.child_frame_id) == (
+        mavutil.mavlink.MAV_FRAME_LOCAL_FRD,
+        mavutil.mavlink.MAV_FRAME_BODY_FRD,
+    )
+    assert [last.x, last.y, last.z] == pytest.approx([2.0, 1.0, -0.1])
+    # A yaw of 90 degrees, clockwise from north.
+    assert list(last.q) == pytest.approx([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], abs=1e-6)
+    assert [last.vx, last.vy, last.vz] == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
+    assert last.yawspeed == pytest.approx(0.0, abs=1e-6)
+    assert isnan(last.rollspeed)
+    assert isnan(last.velocity_covariance[0])
+    assert last.reset_counter == 300 % 256
+
+
+@pytest.mark.parametrize(("north_rad", "expected"), [(0.0, [1.0, -2.0]), (pi, [-1.0, 2.0]), (pi / 4, None)])
+def test_direction_of_north_is_a_setting(
+    autopilot: Autopilot, north_rad: float, expected: list[float] | None
+) -> None:
+    with streaming(autopilot, "/vision", north_rad) as (stream, _):
+        stream.consume(iter([tracks(0, track("ada", 1.0, 0.3))]))
+        message = autopilot.next("VISION_POSITION_ESTIMATE")
+    if expected is not None:
+        assert [message.x, message.y] == pytest.approx(expected, abs=1e-6)
+    assert np.hypot(message.x, message.y) == pytest.approx(np.sqrt(5))
+    assert message.yaw == pytest.approx(north_rad - 0.3)
+    assert (message.roll, message.pitch) == (0.0, 0.0)
+
+
+def test_turn_to_the_left_is_a_negative_yaw_rate(autopilot: Autopilot) -> None:
+    with streaming(autopilot) as (stream, _):
+        stream.consume(iter([tracks(n, track("ada", 1.0, 0.04 * n)) for n in range(4)]))
+        *_, last = [autopilot.next("ODOMETRY") for _ in range(4)]
+    assert last.yawspeed == pytest.approx(-1.0, abs=1e-5)
+
+
+def test_covariance_is_turned_and_unknown_values_are_nan(autopilot: Autopilot) -> None:
+    known = replace(track("ada", 1.0), covariance_m2=np.diag([1e-4, 4e-4, 9e-4]))
+    unknown = replace(track("ada", 1.0), covariance_m2=None)
+    with streaming(autopilot) as (stream, _):
+        stream.consume(iter([tracks(0, known), tracks(1, unknown)]))
+        first, second = [autopilot.next("ODOMETRY").pose_covariance for _ in range(2)]
+    # The upper triangle by rows: x, y and z are at 0, 6 and 11; x is north, the y of the lab.
+    assert [first[n] for n in (0, 6, 11)] == pytest.approx([4e-4, 1e-4, 9e-4])
+    assert all(isnan(first[n]) for n in (3, 15, 18, 20))
+    assert all(map(isnan, second))
+
+
+def test_new_session_raises_the_reset_counter(autopilot: Autopilot) -> None:
+    with streaming(autopilot) as (stream, _):
+        restart = Message("", 0, 0, NewSession(301))
+        stream.consume(iter([tracks(5, track("ada", 1.0)), restart, tracks(0, track("ada", 2.0))]))
+        counters = [autopilot.next("ODOMETRY").reset_counter for _ in range(2)]
+    assert counters == [300 % 256, 301 % 256]
+
+
+def test_only_good_poses_of_the_robot_are_sent(autopilot: Autopilot) -> None:
+    rows = [
+        tracks(-30, track("ada", 1.0)),
+        tracks(0, track("bob", 2.0)),
+        tracks(1, track("ada", 3.0, inside=False)),
+        tracks(2, track("ada", 4.0, None)),
+        tracks(3, track("ada", 5.0)),
+    ]
+    with streaming(autopilot) as (stream, _):
+        stream.consume(iter(rows))
+        assert autopilot.next("ODOMETRY").y == 5.0
+
+
+def test_time_is_answered_and_garbage_is_not(autopilot: Autopilot) -> None:
+    with streaming(autopilot) as (stream, events):
+        beat = autopilot.next("HEARTBEAT")
+        assert beat.type == mavutil.mavlink.MAV_TYPE_ONBOARD_CONTROLLER
+        for data in (b"", b"\xfd", b"\xfd" * 300, bytes(range(256)) * 5, b"\xfe\x09\x00"):
+            autopilot.link.port.sendto(data, autopilot.sender)
+        autopilot.link.mav.command_long_send(
+            1, 197, mavutil.mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, *[0] * 8
+        )
+        autopilot.link.mav.timesync_send(5, 6)  # an answer, not a request
+        autopilot.link.mav.timesync_send(0, 123456789)
+        answer = autopilot.next("TIMESYNC")
+        assert (answer.tc1, answer.ts1) == (NOW_NS, 123456789)
+        assert autopilot.link.recv_match(type="COMMAND_ACK", blocking=False) is None
+        stream.consume(iter([tracks(0, track("ada", 1.0))]))
+        assert autopilot.next("ODOMETRY").y == 1.0
+    assert events == []
+
+
+def test_other_addresses_are_not_answered(autopilot: Autopilot) -> None:
+    with streaming(autopilot), closing(Autopilot()) as other:
+        autopilot.next("HEARTBEAT")
+        other.link.port.settimeout(0.5)
+        data = other.link.mav.timesync_encode(0, 5).pack(other.link.mav)
+        other.link.port.sendto(data, autopilot.sender)
+        with pytest.raises(TimeoutError):
+            other.link.port.recv(100)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("127.0.0.1:14550", "write ROBOT=HOST:PORT"),
+        ("ada=", "write ROBOT=HOST:PORT"),
+        ("ada=127.0.0.1:14550/pose", "message 'pose' is not known; use odometry or vision"),
+    ],
+)
+def test_wrong_endpoints_are_refused(text: str, words: str) -> None:
+    with pytest.raises(IpsysError, match=words):
+        parse_endpoint(text)

@@ -17,6 +17,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig, RigCamera, Tracks
+from ipsys_log.messages.channels import EVENTS
 from ipsys_log.sinks.player import play
 from ipsys_log.sinks.sink import LiveQueue, Sink
 from tests.stages.drawing import jpeg
@@ -153,6 +154,22 @@ def test_sink_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
     finally:
         stuck.released.set()
     assert frames_in(tmp_path / "x.mcap") == {"red": 40, "white": 40}
+
+
+@pytest.mark.usefixtures("source_of_one_row")
+def test_drops_of_a_sink_are_events_in_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sinks.sink._MOST_WITH_IMAGES", 5)
+    stuck = Stuck()
+    try:
+        recorded(tmp_path / "x.mcap", stuck)
+    finally:
+        stuck.released.set()
+    with Session([tmp_path / "x.mcap"]) as session:
+        events = session.payloads(session.topics(EVENTS))
+    texts = [event.text for event in events if event.kind == "sink_dropped"]
+    assert texts[:2] == [
+        f"stuck: {count} dropped (the sink is too slow)" for count in ("1 message", "10 messages")
+    ]
 
 
 def test_player_drops_nothing_and_keeps_the_order() -> None:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipsys_log.capture.frames import Clock
+    from ipsys_log.sinks.sink import Sink
 
 __all__ = [
     "CalibrationResult",
@@ -526,7 +527,7 @@ def live(
 
     Parameters
     ----------
-    rig : the rig file, ``lab.toml``.
+    rig : the rig file, ``lab.toml``; the streams of its ``[stream]`` are opened.
     record : the new log.
     model_from : the log with the fitted models.
     models : names of models; none: ``poly`` if there is one, else the newest.
@@ -563,6 +564,10 @@ def live(
         from ipsys_log.capture.multiplexer import LiveCameras
         from ipsys_log.capture.recorder import first_messages, fitting_lenses
         from ipsys_log.exchange.lab_files import load_cameras, load_lenses
+        from ipsys_log.messages.channels import TRACKS
+        from ipsys_log.runs.select import wanted_models
+        from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
+        from ipsys_log.stages.fit import model_run
 
         lab, wanted = load_cameras(Path(rig), cameras)
         lenses = load_lenses(Path(rig), wanted, calibrations or {})
@@ -573,11 +578,22 @@ def live(
             say(line)
         if Path(record).exists() and not force:
             raise IpsysError(f"{record}: exists already; give another name, or force=True to overwrite it")
-        with LiveCameras(wanted, open_source, Clock(), say) as attached:
+        streamed = settings_of_rig(lab.stream, Path(rig).parent)
+        for line in check_streams(streamed):
+            say(line)
+        topic = TRACKS.topic_of(model_run(wanted_models(request)[0]))
+        robots = [marker.robot for marker in lab.markers if marker.robot]
+        with (
+            LiveCameras(wanted, open_source, Clock(), say) as attached,
+            open_streams(
+                streamed, {topic}, attached.clock.now_ns, attached.add_event, robots=robots
+            ) as streams,
+        ):
             sizes_px = {name: state.size_px for name, state in attached.states.items()}
             settings = first_messages(lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns)
             tracker.begin(attached.stop)
-            return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=[tracker])
+            sinks: list[Sink] = [tracker, *streams]
+            return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=sinks)
 
     return Tracker(track)
 

@@ -35,7 +35,7 @@ class Player:
     Attributes
     ----------
     runs : the runs of the played tracks; none: ground truth.
-    lines : a line for each stream about its receivers.
+    lines : a line for each stream about its receivers, and one if the rig names no robots.
     """
 
     def __init__(
@@ -66,7 +66,10 @@ class Player:
             self._stack.close()
             raise
         self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
-        self.lines = tuple(stream.describe() for stream in self._streams)
+        lines = [stream.describe() for stream in self._streams]
+        if lines and not robots:
+            lines.append("the rig names no robots; the streams name them marker_<id>")
+        self.lines = tuple(lines)
         self._tracker = Tracker(self._play)
 
     def __enter__(self) -> Player:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+import ipsys_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigMarker, RigStream
 from ipsys_log.messages.channels import RIG, TRACKS
@@ -240,6 +241,27 @@ def test_live_positions_are_streamed_and_recorded(
     assert set(sent) <= in_log
     assert len(sent) >= 0.9 * len(in_log)
     assert all(pose["age_s"] > 0 for pose in poses)
+
+
+def test_live_loop_of_python_opens_the_streams_of_its_rig(
+    tmp_path: Path, calibration: Path, listening: socket.socket
+) -> None:
+    rig, log = tmp_path / "lab.toml", tmp_path / "live.mcap"
+    stream = f'[stream]\nudp = ["127.0.0.1:{port_of(listening)}"]\n'
+    rig.write_text(SIMULATED + "".join(CAMERA.format(name) for name in ("red", "white")) + stream)
+    lines: list[str] = []
+    with ipsys_log.live(rig, record=log, model_from=calibration, say=lines.append) as tracker:
+        assert next(iter(tracker)).tracks
+        assert json.loads(listening.recv(4096))["robot"].startswith("marker_")
+    assert f"UDP 127.0.0.1:{port_of(listening)}: only this machine" in lines
+
+
+def test_log_of_a_rig_without_robots_gives_a_remark(
+    ipsys: Ipsys, tmp_path: Path, listening: socket.socket
+) -> None:
+    log = write_tracks(tmp_path / "x.mcap", 3, rig=replace(LAB, markers=()))
+    done = ipsys("stream", log, "--udp", port_of(listening), "--rate", 50)
+    assert (done.code, "the rig names no robots; the streams name them marker_<id>" in done.err) == (0, True)
 
 
 def test_live_refuses_a_stream_before_it_opens_a_camera(

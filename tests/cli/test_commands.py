@@ -19,7 +19,7 @@ from tests.conftest import ROOT, Ipsys
 COMMANDS = [
     "init", "simulate", "cameras", "calibrate", "align", "import imsel", "import images", "import videos",
     "record", "live", "measure", "replay", "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
-    "report", "plan", "info", "runs", "repair", "verify", "diff", "latency", "view",
+    "report", "plan", "info", "runs", "repair", "verify", "diff", "latency", "view", "stream",
 ]  # fmt: skip
 
 

@@ -192,6 +192,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("info", "a.mcap")
     day("runs", "a.mcap")
     day("view", "a.mcap", "--save", "a.rrd")
+    day("stream", "a.mcap", "--udp", "9870", "--rate", 10)
     day("evaluate", "session.mcap", "--model", "poly", "--model", "best")
     day("plan", "session.mcap", "--places", 2)
     day("report", "session.mcap")

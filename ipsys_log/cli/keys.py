@@ -28,11 +28,11 @@ _RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 @contextmanager
 def read_keys(player: Player, say: Callable[[str], None]) -> Iterator[None]:
-    """Let the keys of the terminal control a player; without a terminal, do nothing.
+    """Let the keys of the terminal control a player; without a terminal, or in the background, do nothing.
 
     The terminal gets its settings back at the end of the block.
     """
-    if not sys.stdin.isatty():
+    if not (sys.stdin.isatty() and _is_in_foreground(sys.stdin.fileno())):
         yield
         return
     terminal = sys.stdin.fileno()
@@ -47,6 +47,14 @@ def read_keys(player: Player, say: Callable[[str], None]) -> Iterator[None]:
         ended.set()
         reader.join()
         termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def _is_in_foreground(terminal: int) -> bool:
+    """Return False for a background job: the system stops one that changes or reads its terminal."""
+    try:
+        return os.tcgetpgrp(terminal) == os.getpgrp()
+    except OSError:  # the terminal of no other job
+        return True
 
 
 def _read(terminal: int, player: Player, say: Callable[[str], None], ended: threading.Event) -> None:

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ from pathlib import Path
 import pytest
 
 import ipsys_log
+from ipsys_log.cli.keys import read_keys
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigMarker, RigStream
 from ipsys_log.messages.channels import RIG, TRACKS
@@ -115,6 +117,21 @@ def test_keys_of_the_terminal_control_the_player(log: Path, listening: socket.so
         program.communicate()
         os.close(terminal)
         os.close(theirs)
+
+
+def test_background_job_leaves_the_terminal_alone(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, theirs = pty.openpty()
+    with os.fdopen(theirs) as stdin, ipsys_log.play(log, start_paused=True) as player:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+        before = termios.tcgetattr(stdin)
+        with read_keys(player, print):
+            assert termios.tcgetattr(stdin) == before
+        monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+        with read_keys(player, print):
+            assert termios.tcgetattr(stdin) != before
+        assert termios.tcgetattr(stdin) == before
+    os.close(terminal)
 
 
 def test_streams_of_a_rig_file_are_opened_and_those_of_a_log_are_not(

@@ -12,11 +12,12 @@ from ipsys_log.errors import FitError
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State, make_layout
+from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
 from ipsys_log.joint.problem import Problem
 from ipsys_log.joint.rotations import level_turns
 from ipsys_log.joint.settings import JointSettings
-from ipsys_log.joint.sighting_factors import SightingFactors, make_sighting_factors
+from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import Solution, solve
 from ipsys_log.joint.start import PlacedCamera, place_cameras
 from ipsys_log.joint.trajectories import Trajectories
@@ -71,6 +72,11 @@ def fit_jointly(
     observations = _without_unseen(observations)
     placed = place_cameras(observations)
     problem, state = _build(observations, settings, placed)
+    if len(problem.trajectories.paths):
+        # The wobble of a robot acts on its corners by the poses, so that these come first.
+        problem = problem.reweighted(state, settings.wobble_sigma_rad)
+        state = solve(problem, state, progress).state
+        problem = problem.reweighted(state, settings.wobble_sigma_rad)
     solution = solve(problem, state, progress)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
 
@@ -103,31 +109,29 @@ def _without_unseen(observations: Observations) -> Observations:
 def _build(
     observations: Observations, settings: JointSettings, placed: list[PlacedCamera]
 ) -> tuple[Problem, State]:
-    floor = _floor(placed, settings)
-    layout = make_layout(observations, settings, floor, moving=False)
-    factors: list[SightingFactors] = []
-    for camera, sightings in enumerate(observations.sightings):
-        still = sightings.select(sightings.point >= 0)
-        if len(still):
-            factors.append(
-                make_sighting_factors(
-                    camera, still, still.point, False, observations.bodies, settings.corner_floor_px
+    """Return the problem and its start."""
+    paths, knots, numbers = start_paths(observations, placed, settings)
+    layout = make_layout(observations, settings, _floor(placed, settings), len(paths) > 0)
+    factors = []
+    for camera, (sightings, path) in enumerate(zip(observations.sightings, numbers, strict=True)):
+        for moving, rows in enumerate((sightings.point >= 0, path >= 0)):
+            if rows.any():
+                trajectory = path[rows] if moving else sightings.point[rows]
+                own = sightings.select(rows), trajectory, bool(moving)
+                factors.append(
+                    make_sighting_factors(camera, *own, observations.bodies, settings.corner_floor_px)
                 )
-            )
-    points = make_point_factors(observations.points, settings.point_tilt_sigma_rad)
     trajectories = Trajectories(
-        len(observations.points),
-        acceleration_sigma=settings.acceleration_sigma,
-        turn_sigma=settings.turn_sigma,
+        len(observations.points), paths, settings.acceleration_sigma, settings.turn_sigma
     )
-    problem = Problem(layout, trajectories, tuple(factors), points)
+    points = make_point_factors(observations.points, settings.point_tilt_sigma_rad)
     values = layout.mean.copy()
     for block, camera_pose in zip(layout.cameras, placed, strict=True):
         values[block.start + 3 : block.start + 6] = camera_pose.origin_m
     turns = np.stack([camera_pose.camera_from_world for camera_pose in placed])
     positions_m, headings_rad = _point_starts(observations, placed)
-    state = State(values, turns, positions_m, level_turns(headings_rad), np.zeros((0, 3)))
-    return problem, state
+    state = State(values, turns, positions_m, level_turns(headings_rad), knots)
+    return Problem(layout, trajectories, tuple(factors), points), state
 
 
 def _floor(placed: list[PlacedCamera], settings: JointSettings) -> FloorField:

@@ -34,7 +34,7 @@ class Problem:
         for factors in self.sightings:
             chi2 = (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1)
             total += float(robust_loss(chi2, factors.limit * ease)[0].sum()) / 2
-        total += float((self.trajectories.acceleration_residuals(state) ** 2).sum()) / 2
+        total += float((self.trajectories.acceleration_residuals(state.knots) ** 2).sum()) / 2
         return total + float((self.prior_residuals(state) ** 2).sum()) / 2
 
     def prior_residuals(self, state: State) -> Array:
@@ -50,7 +50,7 @@ class Problem:
         for factors in self.sightings:
             factors.add_to(normal, state, layout, trajectories, ease)
         self.points.add_to(normal, state, layout, ease)
-        trajectories.add_accelerations(normal, state)
+        trajectories.add_accelerations(normal, state.knots)
         residuals = self.prior_residuals(state)
         normal.cost += float((residuals**2).sum()) / 2
         sigma = layout.sigma

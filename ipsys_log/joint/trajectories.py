@@ -126,24 +126,21 @@ class Trajectories:
             layout.floor.modes(flat),
         )
 
-    def add_accelerations(self, normal: NormalEquations, state: State) -> None:
-        """Add the prior on accelerations of the paths."""
+    def add_accelerations(self, normal: NormalEquations, knots: Array) -> None:
+        """Add the prior on accelerations of paths with ``knots`` (k, 3)."""
         middles, scales = self._accelerations()
         if not len(middles):
             return
         pattern = np.array([1.0, -2.0, 1.0])
-        slopes = (scales[:, :, None, None] * pattern[:, None] * np.eye(_KNOT)[:, None, :]).reshape(
-            len(middles), _KNOT, -1
-        )
-        residuals = self.acceleration_residuals(state)
+        slopes = scales[:, :, None, None] * pattern[:, None] * np.eye(_KNOT)[:, None, :]
+        residuals = self.acceleration_residuals(knots)
         normal.cost += float((residuals**2).sum()) / 2
         starts = _POSE * self.stationary + _KNOT * (middles - 1)
-        normal.add_local(starts, slopes, residuals)
+        normal.add_local(starts, slopes.reshape(len(middles), _KNOT, -1), residuals)
 
-    def acceleration_residuals(self, state: State) -> Array:
-        """Return second differences of the knots, (n, 3), in units of the usual acceleration."""
+    def acceleration_residuals(self, knots: Array) -> Array:
+        """Return second differences (n, 3) of knots (k, 3), in units of the usual acceleration."""
         middles, scales = self._accelerations()
-        knots = state.knots
         return np.asarray((knots[middles - 1] - 2 * knots[middles] + knots[middles + 1]) * scales)
 
     def _accelerations(self) -> tuple[Indices, Array]:

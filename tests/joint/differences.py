@@ -29,7 +29,7 @@ def residuals_of(problem: Problem, state: State, ease: float = 1.0) -> Array:
         _robust(points.heights[:, None], one),
         _robust(points.places, two),
         points.tilts.ravel(),
-        trajectories.acceleration_residuals(state).ravel(),
+        trajectories.acceleration_residuals(state.knots).ravel(),
         problem.prior_residuals(state),
     ]
     return np.concatenate(parts)

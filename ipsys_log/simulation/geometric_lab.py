@@ -325,7 +325,7 @@ def _tape_sine(poses: Array) -> Array:
 
 def _whole(camera: Camera, poses: Array, lab: LabSettings) -> NDArray[np.bool_]:
     """Return the poses (n, 4) whose print, with its white margin, is wholly in the image."""
-    side_m = marker_print_m(lab)
+    side_m = _print_m(lab)
     turn = poses[:, 3] - np.pi / 2
     flat = marker_corners(side_m)[:, :2]
     cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
@@ -336,7 +336,7 @@ def _whole(camera: Camera, poses: Array, lab: LabSettings) -> NDArray[np.bool_]:
     return np.asarray(sees(camera, corners_m.reshape(-1, 3)).reshape(-1, 4).all(axis=1))
 
 
-def marker_print_m(lab: LabSettings) -> float:
+def _print_m(lab: LabSettings) -> float:
     """Return the side of a print, with its white margin of one cell."""
     cells = len(black_cells(lab.dictionary, 0))
     return lab.marker_length_m * cells / (cells - 2)

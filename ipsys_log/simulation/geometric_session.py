@@ -31,7 +31,7 @@ from ipsys_log.messages.channels import MARKERS, RECORD
 from ipsys_log.simulation.calibration_points import SimulatedPose, measure
 from ipsys_log.simulation.cameras import Camera, sees
 from ipsys_log.simulation.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
-from ipsys_log.simulation.geometric_lab import GeometricLab, PlacedMarkers, camera_poses, marker_print_m
+from ipsys_log.simulation.geometric_lab import GeometricLab, PlacedMarkers, camera_poses
 from ipsys_log.simulation.lab import EPOCH_NS, build_rig
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.units import NS_PER_S
@@ -49,6 +49,8 @@ _LATENCY_NS, _MEASURED_NS = 50_000_000, 200_000_000
 _STILL_MARGIN_NS = 100_000_000
 # ``detect`` misses markers with smaller cells than this.
 _LEAST_CELL_PX = 3.0
+# In rendered labs, it detects every marker if a square of this multiple of its side is in the image.
+_SEEN_SIDES = 1.03
 _CELLS = 6
 
 
@@ -208,7 +210,7 @@ def simulate_sightings(lab: GeometricLab, camera: Camera) -> CameraSightings:
     """
     settings, parts = lab.settings.lab, [*_still_parts(lab, camera), *_drive_parts(lab, camera)]
     everything = _Part.join(parts)
-    seen = everything.select(_visible(camera, everything, marker_print_m(settings)))
+    seen = everything.select(_visible(camera, everything, _SEEN_SIDES * settings.marker_length_m))
     seen = seen.select(np.lexsort((seen.ids, seen.frames_ns)))
     true_px = _project(camera, seen.corners_m)
     large = _cell_px(true_px) >= _LEAST_CELL_PX
@@ -317,9 +319,9 @@ def _project(camera: Camera, corners_m: Array) -> Array:
     return project(points_c, camera.lens).reshape(-1, 4, 2)
 
 
-def _visible(camera: Camera, part: _Part, print_m: float) -> NDArray[np.bool_]:
-    """Return the markers (n,) whose print, with its white margin, is wholly in the image."""
-    corners_m = part.placed.corners_m(print_m)
+def _visible(camera: Camera, part: _Part, side_m: float) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the markers around which a square is wholly in the image."""
+    corners_m = part.placed.corners_m(side_m)
     return np.asarray(sees(camera, corners_m.reshape(-1, 3)).reshape(-1, 4).all(axis=1))
 
 

@@ -23,10 +23,10 @@ from ipsys_log.models.table import AppliedModel
 
 __all__ = [
     "FloorError",
-    "SightingErrors",
     "KnownSightings",
     "Locator",
     "RegionShares",
+    "SightingErrors",
     "align_rigidly",
     "compute_errors",
     "grid_nodes",
@@ -304,7 +304,10 @@ def locate_with_model(
     applied = {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
 
     def locate(
-        camera: str, corners_px: Array, heights_m: Array, covariances_px2: Array | None = None
+        camera: str,
+        corners_px: Array,
+        heights_m: Array,
+        covariances_px2: Array | None = None,  # noqa: ARG001 - these models estimate the noise in their fit
     ) -> tuple[Array, Array | None]:
         if camera not in applied:
             return np.full((len(corners_px), 3), np.nan), None

@@ -22,6 +22,7 @@ from ipsys_log.messages import CameraCalibration, Model
 from ipsys_log.models.table import AppliedModel
 
 __all__ = [
+    "GRID_M",
     "FloorError",
     "KnownSightings",
     "Locator",

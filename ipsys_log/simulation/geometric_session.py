@@ -286,32 +286,45 @@ def _still_parts(lab: GeometricLab, camera: Camera) -> Iterator[_Part]:
 def _drive_parts(lab: GeometricLab, camera: Camera) -> Iterator[_Part]:
     frames_ns = _drive_times(lab) + lab.frame_delays_ns[camera.name]
     since_s = (frames_ns - _start_ns(lab, len(lab.points))) / NS_PER_S
-    count, length_m = len(frames_ns), lab.settings.lab.marker_length_m
+    count = len(frames_ns)
     first = sum(map(len, lab.points))
     for marker_id in lab.drive.ahead_s:
         late_s = _exposures(lab, camera, marker_id, since_s)
         placed = lab.drive_poses(marker_id, since_s + late_s.mean(axis=1))
-        corners_m = placed.corners_m(length_m)
-        if not lab.settings.row_time_in_rig and lab.settings.lab.row_time_ns:
-            for n in range(4):
-                own = lab.drive_poses(marker_id, since_s + late_s[:, n])
-                corners_m[:, n] = own.corners_m(length_m)[:, n]
+        if lab.settings.lab.row_time_ns:
+            corners_m = _corners_at(lab, marker_id, since_s[:, None] + late_s)
+        else:
+            corners_m = placed.corners_m(lab.settings.lab.marker_length_m)
         placements = first + np.arange(count)
         yield _Part(frames_ns, np.full(count, marker_id), placements, placed, corners_m)
         first += count
 
 
 def _exposures(lab: GeometricLab, camera: Camera, marker_id: int, since_s: Array) -> Array:
-    """Return the exposure of each corner after that of the first row, (n, 4) in s."""
+    """Return the exposure of each corner after that of the first row, (n, 4) in s.
+
+    With a known row time, detect fits the motion: its corners are those at the mean time of the marker.
+    Otherwise the image shows each corner at its own time.
+    """
     settings, late_s = lab.settings.lab, np.zeros((len(since_s), 4))
     if not settings.row_time_ns:
         return late_s
-    # A robot moves by a few pixels during a frame: the second repetition changes less than a nanosecond.
-    for _ in range(3):
-        placed = lab.drive_poses(marker_id, since_s + late_s.mean(axis=1))
-        rows = _project(camera, placed.corners_m(settings.marker_length_m))[..., 1]
-        late_s = np.clip(np.nan_to_num(rows), 0, settings.height) * settings.row_time_ns / NS_PER_S
+    # A robot moves by a few pixels during a frame: the last repetition changes less than a nanosecond.
+    for _ in range(4):
+        rows = _project(camera, _corners_at(lab, marker_id, since_s[:, None] + late_s))[..., 1]
+        rows = np.clip(np.nan_to_num(rows), 0, settings.height)
+        if lab.settings.row_time_in_rig:
+            rows = np.repeat(rows.mean(axis=1, keepdims=True), 4, axis=1)
+        late_s = rows * settings.row_time_ns / NS_PER_S
     return late_s
+
+
+def _corners_at(lab: GeometricLab, marker_id: int, times_s: Array) -> Array:
+    """Return the corners (n, 4, 3) of a robot's marker, each at its own time (n, 4) in s."""
+    placed = lab.drive_poses(marker_id, times_s.reshape(-1))
+    corners_m = placed.corners_m(lab.settings.lab.marker_length_m).reshape(-1, 4, 4, 3)
+    own = np.arange(4)
+    return np.asarray(corners_m[:, own, own])
 
 
 def _project(camera: Camera, corners_m: Array) -> Array:

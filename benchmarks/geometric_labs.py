@@ -1,0 +1,172 @@
+"""Geometric labs for the benchmark of calibration: their scenes, and the calibrations that are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.floor_error import KnownSightings, Locator, grid_nodes, locate_with_model
+from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Pair, Rig
+from ipsys_log.simulation.cameras import FLOOR_M
+from ipsys_log.simulation.corner_noise import WHITE_SHARE, corner_covariances, edge_sigma_px
+from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, camera_poses
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.stages.fit import fit_model
+
+__all__ = ["CONTENDERS", "SCENES", "Scene", "Session", "make_session", "nodes_of", "standing_robots"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The settings of a lab by its name; ``flat`` scenes have a limit, the others are only reported."""
+
+    name: str
+    settings: GeometricSettings
+    flat: bool = True
+
+    @property
+    def drives(self) -> bool:
+        return self.settings.lab.drive_s > 0
+
+    def seeded(self, seed: int) -> GeometricSettings:
+        """Return the settings of the scene's lab with a seed."""
+        return replace(self.settings, lab=replace(self.settings.lab, seed=seed))
+
+
+_STILL = LabSettings(rate_hz=10.0, drive_s=0.0)
+_DRIVE = LabSettings(rate_hz=10.0, drive_s=120.0, markers=1)
+_ROLLING = replace(_DRIVE, row_time_ns=31_000)
+_CLOCKS, _DELAYS_S = 0.025, (0.0, 0.011, 0.022)
+
+# ``points`` are taped points, ``drive`` is a robot that drives for 120 s at 10 Hz. ``exact`` and ``nominal``
+# are kinds of intrinsics; the others have an error of calibration. ``1.5 mm`` is the unevenness of the floor,
+# ``tilted`` means cameras with 20 to 30 degrees, and ``clocks`` offsets of up to 25 ms.
+SCENES = (
+    Scene("75 points", GeometricSettings(lab=_STILL)),
+    Scene("75 points, exact", GeometricSettings(lab=_STILL, intrinsics="true")),
+    Scene("75 points, nominal", GeometricSettings(lab=_STILL, intrinsics="nominal")),
+    Scene("16 points", GeometricSettings(lab=_STILL, points=16)),
+    Scene("16 points, nominal", GeometricSettings(lab=_STILL, points=16, intrinsics="nominal")),
+    Scene("drive and 4", GeometricSettings(lab=_DRIVE, points=4)),
+    Scene("drive and 8", GeometricSettings(lab=_DRIVE, points=8)),
+    Scene("drive and 16", GeometricSettings(lab=_DRIVE, points=16)),
+    Scene("drive and 75", GeometricSettings(lab=_DRIVE, points=75)),
+    Scene(
+        "drive and 16, clocks",
+        GeometricSettings(lab=_DRIVE, points=16, clock_offset_s=_CLOCKS, frame_delays_s=_DELAYS_S),
+    ),
+    Scene("75 points, 1.5 mm", GeometricSettings(lab=_STILL, floor_rms_m=0.0015), flat=False),
+    Scene("75 points, 3 mm", GeometricSettings(lab=_STILL, floor_rms_m=0.003), flat=False),
+    Scene("16 points, 3 mm", GeometricSettings(lab=_STILL, points=16, floor_rms_m=0.003), flat=False),
+    Scene("75 points, tilted", GeometricSettings(lab=replace(_STILL, tilt_deg=(20.0, 30.0)))),
+    Scene(
+        "drive and 16, 1.5 mm",
+        GeometricSettings(
+            lab=_DRIVE,
+            points=16,
+            floor_rms_m=0.0015,
+            wobble_deg=0.2,
+            clock_offset_s=_CLOCKS,
+            frame_delays_s=_DELAYS_S,
+        ),
+        flat=False,
+    ),
+    Scene(
+        "drive and 16, wobble",
+        GeometricSettings(lab=_DRIVE, points=16, wobble_deg=0.6),
+        flat=False,
+    ),
+    Scene("drive and 16, rolling", GeometricSettings(lab=_ROLLING, points=16), flat=False),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A session of a lab: its messages, and the pairs of camera points for the models of the table."""
+
+    lab: GeometricLab
+    messages: Sequence[Message]
+    rig: Rig
+    pairs: dict[str, list[Pair]]
+
+
+def make_session(lab: GeometricLab) -> Session:
+    """Simulate a session, and convert its markers to camera points."""
+    messages, stage = list(simulate_session(lab)), CameraFrame()
+    points: list[Message] = []
+    for message in messages:
+        if isinstance(message.payload, (Rig, CameraCalibration, Markers)):
+            payloads = [one for one in stage(message) if isinstance(one, CameraPoints)]
+            points.extend(replace(message, payload=payload) for payload in payloads)
+    rig = next(message.payload for message in messages if isinstance(message.payload, Rig))
+    pairs = build_pairs(gather_sightings(points), valid_measurements(messages, None))
+    return Session(lab, messages, rig, pairs)
+
+
+def nodes_of(lab: GeometricLab) -> list[KnownSightings]:
+    """Return the nodes of the floor that each camera sees, at the height of the robots' markers."""
+    settings = lab.settings.lab
+
+    def place(poses: Array, side_m: float) -> Array:
+        return lab.place(poses).corners_m(side_m)
+
+    size_m, height_m, length_m = (FLOOR_M, FLOOR_M), settings.drive_height_m, settings.marker_length_m
+    return [
+        grid_nodes(camera.lens, camera.camera_from_world, place, size_m, height_m, length_m)
+        for camera in lab.cameras
+    ]
+
+
+def standing_robots(
+    lab: GeometricLab, nodes: Sequence[KnownSightings], frames: int, every: int
+) -> list[KnownSightings]:
+    """Return noisy sightings of robots that stand at every n-th node: all frames of one, then the next."""
+    rng, settings = np.random.default_rng(lab.settings.lab.seed), lab.settings.lab
+    standing = []
+    for camera, seen in zip(lab.cameras, nodes, strict=True):
+        truth_m = seen.truth_m[::every]
+        heights_m = np.full(len(truth_m), settings.drive_height_m)
+        poses = np.column_stack([truth_m, heights_m, np.zeros(len(truth_m))])
+        rotations, centres_m = camera_poses(camera, lab.place(poses))
+        sigma_px = edge_sigma_px(settings)
+        covariances = corner_covariances(
+            camera.lens, rotations, centres_m, settings.marker_length_m, sigma_px
+        )
+        variances, axes = np.linalg.eigh(covariances)
+        roots = axes * np.sqrt(WHITE_SHARE * np.maximum(variances, 0.0))[:, None, :]
+        noise_px = np.einsum("nij,nfj->nfi", roots, rng.standard_normal((len(roots), frames, 8)))
+        corners_px = seen.corners_px[::every, None] + noise_px.reshape(-1, frames, 4, 2)
+        standing.append(
+            KnownSightings(
+                camera.name,
+                np.repeat(truth_m, frames, axis=0),
+                corners_px.reshape(-1, 4, 2),
+                np.repeat(heights_m, frames),
+                np.repeat(covariances, frames, axis=0),
+            )
+        )
+    return standing
+
+
+def _by_table(name: str) -> Callable[[Session], Locator]:
+    def calibrate(session: Session) -> Locator:
+        model = fit_model(name, session.pairs, 0)
+        return locate_with_model(model, session.lab.calibrations, session.rig.marker_length_m)
+
+    return calibrate
+
+
+# Calibrations by name, from a session to a locator. They raise FitError if there are too few points.
+CONTENDERS: dict[str, Callable[[Session], Locator]] = {
+    name: _by_table(name) for name in ("rayplane", "best", "poly")
+}
+# These calibrations use the sightings of a drive; the others get no scene that differs only by its drive.
+USE_DRIVES = frozenset({"joint"})

@@ -1,0 +1,80 @@
+"""Poses of single markers in level camera coordinates: the raw material of the start of the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.lenses import undistort
+from ipsys_log.geometry.square_pose import solve_squares
+from ipsys_log.joint.observations import Body, Sightings
+from ipsys_log.messages import CameraCalibration
+
+__all__ = ["MarkerViews", "view_markers"]
+
+Array = NDArray[np.float64]
+
+# Normals of markers that lie on one floor agree within this angle, in one of the two poses of each marker.
+_ALIKE_RAD = np.radians(8.0)
+_CANDIDATES = 200
+_ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerViews:
+    """Markers as one camera sees them, in coordinates with the camera's position and z up.
+
+    ``level_from_camera`` is (3, 3). ``points_m`` (n, 3) are the centres, ``headings_rad`` (n,) the headings,
+    ``rays`` (n, 3) the directions to the centres. A marker that the lens model cannot reach is NaN.
+    """
+
+    level_from_camera: Array
+    points_m: Array
+    headings_rad: Array
+    rays: Array
+
+
+def view_markers(sightings: Sightings, bodies: tuple[Body, ...], lens: CameraCalibration) -> MarkerViews:
+    """Return the markers in level coordinates; the normals of the markers define the vertical."""
+    count = len(sightings)
+    uv = undistort(sightings.pixels.reshape(-1, 2), lens).reshape(count, 4, 2)
+    valid = np.isfinite(uv).all(axis=(1, 2))
+    sides_m = np.array([np.linalg.norm(body.points_m[1] - body.points_m[0]) for body in bodies])
+    rotations = np.full((count, 2, 3, 3), np.nan)
+    centres_m = np.full((count, 2, 3), np.nan)
+    rotations[valid], centres_m[valid] = solve_squares(uv[valid], sides_m[sightings.body[valid]])
+    up = _common_normal(rotations[valid][..., 2])
+    level = _level_from_up(up)
+    best = (rotations[..., 2] @ up).argmax(axis=1)
+    row = np.arange(count)
+    sides = rotations[row, best][:, :, 1] @ level.T
+    rays = np.concatenate([uv.mean(axis=1), np.ones((count, 1))], axis=1) @ level.T
+    return MarkerViews(level, centres_m[row, best] @ level.T, np.arctan2(sides[:, 1], sides[:, 0]), rays)
+
+
+def _common_normal(normals: Array) -> Array:
+    """Return the direction (3,) that most markers share, from two candidates each, (n, 2, 3)."""
+    if not len(normals):
+        return np.array([0.0, 0.0, -1.0])
+    every = normals.reshape(-1, 3)
+    candidates = every[:: max(1, len(every) // _CANDIDATES)]
+    angles = np.arccos(np.clip(np.einsum("nkd,cd->cnk", normals, candidates), -1, 1)).min(axis=2)
+    losses = np.minimum(angles / _ALIKE_RAD, 1.0) ** 2
+    up = candidates[losses.sum(axis=1).argmin()]
+    for _ in range(_ROUNDS):
+        cosines = normals @ up
+        own = normals[np.arange(len(normals)), cosines.argmax(axis=1)]
+        near = cosines.max(axis=1) > np.cos(_ALIKE_RAD)
+        up = own[near].sum(axis=0) if near.any() else up
+        up = up / np.linalg.norm(up)
+    return np.asarray(up)
+
+
+def _level_from_up(up: Array) -> Array:
+    """Return a rotation (3, 3) that turns the direction ``up`` to z."""
+    across = np.eye(3)[np.abs(up).argmin()]
+    x = np.cross(across, up)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])

@@ -1,0 +1,348 @@
+"""A simulated session without images: exact geometry, and markers with the noise of ``detect``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.marker_cells import black_cells
+from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.poses import transform
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.simulation.calibration_points import REFERENCES, SimulatedPose, overlap
+from ipsys_log.simulation.cameras import FLOOR_M, Camera, aim_cameras, mount_cameras, sees
+from ipsys_log.simulation.drive import Drive, plan_drive
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.simulation.smooth_fields import SmoothField, SmoothSignal
+from ipsys_log.units import NS_PER_S
+
+__all__ = [
+    "INTRINSICS",
+    "GeometricLab",
+    "GeometricSettings",
+    "IntrinsicsSigma",
+    "PlacedMarkers",
+    "build_lab",
+]
+
+Array = NDArray[np.float64]
+
+# Kinds of intrinsics that the user has.
+INTRINSICS = ("true", "calibrated", "nominal")
+# Tilts above this are for cameras that are aimed at the floor from the side.
+_MOST_TILT_DEG = 5.0
+_CANDIDATES, _BATCH, _BATCHES = 4, 64, 60
+_NOMINAL_FOCAL_ERROR = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class IntrinsicsSigma:
+    """Standard deviations of an intrinsic calibration: like those of a few dozen chessboard images.
+
+    ``focal`` is relative; ``principal_point_px`` is for 1920 px of width; ``distortion`` is that of k1..k4.
+    """
+
+    focal: float = 0.0005
+    principal_point_px: float = 0.5
+    distortion: tuple[float, float, float, float] = (0.0005, 0.0005, 0.0005, 0.0005)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GeometricSettings:
+    """The settings of a session without images.
+
+    Attributes
+    ----------
+    lab : settings of the lab. ``stations``, JPEG and grey levels of the floor have no effect.
+    points, held_out_points : number of all taped points for the fit, and of further points with the split
+        ``test``.
+    intrinsics : the calibration that the user has: ``true``, ``calibrated`` (true plus errors of
+        ``intrinsics_sigma``), or ``nominal``: focal length wrong by 5 %, principal point in the middle of the
+        image, no distortion.
+    floor_rms_m, floor_length_m : unevenness of the floor, and its correlation length. Markers follow the
+        height and the slope of the floor.
+    wobble_deg, wobble_s : tilt of a driving robot about each horizontal axis (RMS), and its correlation time.
+    clock_offset_s : the stamps of each camera are late by a constant, uniform between minus and plus this.
+    frame_delays_s : true delay of the frames of each camera after those of the first; repeated if short.
+    row_time_in_rig : whether the rig has the row time of the lab; otherwise markers have no time offset.
+    corner_noise : factor of the corner noise; 0 gives exact corners with the usual covariances.
+    """
+
+    lab: LabSettings = field(default_factory=lambda: LabSettings(rate_hz=10.0, drive_s=0.0))
+    points: int = 75
+    held_out_points: int = 0
+    intrinsics: str = "calibrated"
+    intrinsics_sigma: IntrinsicsSigma = IntrinsicsSigma()
+    floor_rms_m: float = 0.0
+    floor_length_m: float = 0.5
+    wobble_deg: float = 0.0
+    wobble_s: float = 0.5
+    clock_offset_s: float = 0.0
+    frame_delays_s: tuple[float, ...] = (0.0,)
+    row_time_in_rig: bool = True
+    corner_noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.intrinsics not in INTRINSICS:
+            raise IpsysError(
+                f"simulator: intrinsics {self.intrinsics!r} are not known; use one of {', '.join(INTRINSICS)}"
+            )
+        if not self.frame_delays_s:
+            raise IpsysError("simulator: frame_delays_s is empty; give at least one delay in s")
+        numbers = {
+            "points": self.points,
+            "held_out_points": self.held_out_points,
+            "floor_rms_m": self.floor_rms_m,
+            "wobble_deg": self.wobble_deg,
+            "clock_offset_s": self.clock_offset_s,
+            "corner_noise": self.corner_noise,
+        }
+        for name, value in numbers.items():
+            if not (math.isfinite(value) and value >= 0):
+                raise IpsysError(f"simulator setting {name} is {value!r}; give a number of at least 0")
+        if not self.points + self.held_out_points and not self.lab.drive_s:
+            raise IpsysError("simulator: nothing to see with points = 0 and drive_s = 0; set one of them")
+        for name, value in {"floor_length_m": self.floor_length_m, "wobble_s": self.wobble_s}.items():
+            if not (math.isfinite(value) and value >= 0.05):
+                raise IpsysError(f"simulator setting {name} is {value!r}; give a number of at least 0.05")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedMarkers:
+    """True poses of markers: ``centres_m`` (n, 3), ``rotations`` (n, 3, 3) from marker to world."""
+
+    centres_m: Array
+    rotations: Array
+
+    def corners_m(self, length_m: float) -> Array:
+        """Return the corners of squares with a side, in OpenCV's order, (n, 4, 3) in world m."""
+        corners: Array = marker_corners(length_m) @ self.rotations.swapaxes(1, 2) + self.centres_m[:, None]
+        return corners
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometricLab:
+    """A simulated lab with its ground truth.
+
+    Attributes
+    ----------
+    settings : of the session.
+    cameras : the true cameras.
+    calibrations : the intrinsics that the user has, by camera.
+    floor : the unevenness, in m.
+    clock_offsets_ns : by camera; a stamp is the true time plus this.
+    frame_delays_ns : by camera; true time of a frame after the instant of all cameras.
+    points : calibration points, in sets of simultaneous ones; z_m is the height above the uneven floor.
+    drive : the robots' path; its heights are above the uneven floor.
+    wobble : by marker, the tilts of a robot in rad about world x and y.
+    """
+
+    settings: GeometricSettings
+    cameras: tuple[Camera, ...]
+    calibrations: Mapping[str, CameraCalibration]
+    floor: SmoothField
+    clock_offsets_ns: Mapping[str, int]
+    frame_delays_ns: Mapping[str, int]
+    points: tuple[tuple[SimulatedPose, ...], ...]
+    drive: Drive
+    wobble: Mapping[int, SmoothSignal]
+
+    def camera(self, name: str) -> Camera:
+        """Return a true camera by its name."""
+        return next(camera for camera in self.cameras if camera.name == name)
+
+    def place(self, poses: Array, tilts_rad: Array | None = None) -> PlacedMarkers:
+        """Return markers that lie on the uneven floor, or on robots that stand on it.
+
+        Parameters
+        ----------
+        poses : (n, 4): x, y, height above the floor in m, and heading in rad.
+        tilts_rad : (n, 2), rotations about world x and y in addition to the slope of the floor.
+        """
+        from scipy.spatial.transform import Rotation
+
+        slopes = self.floor.gradient(poses[:, :2])
+        turns = np.zeros((len(poses), 3))
+        turns[:, 0], turns[:, 1] = slopes[:, 1], -slopes[:, 0]
+        if tilts_rad is not None:
+            turns[:, :2] += tilts_rad
+        upright = np.zeros((len(poses), 3))
+        upright[:, 2] = poses[:, 3] - np.pi / 2
+        rotations = (Rotation.from_rotvec(turns) * Rotation.from_rotvec(upright)).as_matrix()
+        centres_m = poses[:, :3].copy()
+        centres_m[:, 2] += self.floor.at(poses[:, :2])
+        return PlacedMarkers(centres_m, rotations)
+
+    def drive_poses(self, marker_id: int, times_s: Array) -> PlacedMarkers:
+        """Return the true poses of a robot's marker at times (n,) in s after the start of the drive."""
+        path = self.drive.poses_over(marker_id, times_s)
+        poses = np.insert(path, 2, self.drive.height_m, axis=1)
+        return self.place(poses, self.wobble[marker_id].at(times_s))
+
+
+def build_lab(settings: GeometricSettings) -> GeometricLab:
+    """Draw a lab: cameras, their calibrations, the floor, the clocks, the points and the drive.
+
+    Equal settings give equal labs.
+
+    Raises
+    ------
+    IpsysError
+        The field of view of a camera has no room for a point.
+    """
+    lab = settings.lab
+    mount = aim_cameras if lab.tilt_deg[1] > _MOST_TILT_DEG else mount_cameras
+    cameras = mount(lab)
+    names = [camera.name for camera in cameras]
+    clocks = random_stream(lab.seed, Purpose.CLOCK).uniform(-1, 1, len(names)) * settings.clock_offset_s
+    delays_s = [settings.frame_delays_s[n % len(settings.frame_delays_s)] for n in range(len(names))]
+    drive = plan_drive(lab, cameras)
+    return GeometricLab(
+        settings,
+        cameras,
+        _calibrations(settings, cameras),
+        SmoothField.draw(
+            settings.floor_rms_m,
+            settings.floor_length_m,
+            FLOOR_M,
+            random_stream(lab.seed, Purpose.UNEVENNESS),
+        ),
+        {name: round(offset * NS_PER_S) for name, offset in zip(names, clocks.tolist(), strict=True)},
+        {name: round(delay * NS_PER_S) for name, delay in zip(names, delays_s, strict=True)},
+        _choose_points(settings, cameras),
+        drive,
+        {
+            marker_id: SmoothSignal.draw(
+                np.radians(settings.wobble_deg),
+                settings.wobble_s,
+                lab.drive_s,
+                2,
+                random_stream(lab.seed, Purpose.WOBBLE, marker_id),
+            )
+            for marker_id in drive.ahead_s
+        },
+    )
+
+
+def _calibrations(settings: GeometricSettings, cameras: tuple[Camera, ...]) -> dict[str, CameraCalibration]:
+    rng = random_stream(settings.lab.seed, Purpose.INTRINSICS)
+    # All cameras of a lab are of the same make, so their nominal focal length has the same error.
+    nominal = 1 + _NOMINAL_FOCAL_ERROR * rng.choice([-1.0, 1.0])
+    calibrations = {}
+    for camera in cameras:
+        drawn = rng.standard_normal(7)
+        calibrations[camera.name] = _calibration(camera.lens, settings, nominal, drawn)
+    return calibrations
+
+
+def _calibration(
+    lens: CameraCalibration, settings: GeometricSettings, nominal: float, drawn: Array
+) -> CameraCalibration:
+    if settings.intrinsics == "true":
+        return lens
+    K, D = lens.K.copy(), lens.D.copy()
+    if settings.intrinsics == "nominal":
+        K[0, 0] = K[1, 1] = nominal * lens.K[0, 0]
+        K[:2, 2] = (lens.width - 1) / 2, (lens.height - 1) / 2
+        D = np.zeros(4)
+    else:
+        sigma = settings.intrinsics_sigma
+        K[0, 0] *= 1 + sigma.focal * drawn[0]
+        K[1, 1] *= 1 + sigma.focal * drawn[0]
+        K[:2, 2] += sigma.principal_point_px * lens.width / 1920 * drawn[1:3]
+        D += np.array(sigma.distortion) * drawn[3:]
+    return replace(lens, K=K, D=D, P=np.hstack([K, np.zeros((3, 1))]))
+
+
+def _choose_points(
+    settings: GeometricSettings, cameras: tuple[Camera, ...]
+) -> tuple[tuple[SimulatedPose, ...], ...]:
+    """Choose calibration points like the rendered lab: the next is for the camera with the fewest."""
+    lab, count = settings.lab, settings.points + settings.held_out_points
+    rng = random_stream(lab.seed, Purpose.PLACES)
+    seen: list[list[Array]] = [[] for _ in cameras]
+    sets: list[tuple[SimulatedPose, ...]] = []
+    while (left := count - sum(map(len, sets))) > 0:
+        taken: list[Array] = []
+        for marker_id in range(min(lab.markers, left)):
+            index = min(range(len(cameras)), key=lambda n: len(seen[n]))
+            pose = _choose_point(rng, settings, cameras, index, np.array(taken).reshape(-1, 4), seen[index])
+            if pose is None:
+                raise IpsysError(
+                    f"simulator: marker {marker_id} has no room beside {len(taken)} others in the view of "
+                    f"{cameras[index].name!r}; set fewer or smaller markers"
+                )
+            taken.append(pose)
+            for number, camera in enumerate(cameras):
+                if _whole(camera, pose[None], lab)[0]:
+                    seen[number].append(pose)
+        sets.append(tuple(SimulatedPose(n, *map(float, pose)) for n, pose in enumerate(taken)))
+    return tuple(sets)
+
+
+def _choose_point(
+    rng: np.random.Generator,
+    settings: GeometricSettings,
+    cameras: tuple[Camera, ...],
+    index: int,
+    taken: Array,
+    before: list[Array],
+) -> Array | None:
+    """Return x, y, height and heading of the candidate farthest from the points of a camera."""
+    lab, fitting = settings.lab, np.empty((0, 4))
+    for _ in range(_BATCHES):
+        poses = np.empty((_BATCH, 4))
+        poses[:, :2] = rng.uniform(0, FLOOR_M, (_BATCH, 2))
+        poses[:, 2] = rng.choice(lab.heights_m, _BATCH)
+        poses[:, 3] = rng.uniform(-np.pi, np.pi, _BATCH)
+        fits = (_tape_sine(poses) >= np.sin(np.radians(lab.tape_angle_deg))) & _whole(
+            cameras[index], poses, lab
+        )
+        for other in taken:
+            fits &= ~overlap(poses[:, :3], other[:3], cameras, lab)
+        fitting = np.vstack([fitting, poses[fits]])[:_CANDIDATES]
+        if len(fitting) == _CANDIDATES:
+            break
+    if not len(fitting):
+        return None
+    if not before:
+        return np.asarray(fitting[0])
+    apart_m = np.linalg.norm(fitting[:, None, :2] - np.array(before)[None, :, :2], axis=2).min(axis=1)
+    return np.asarray(fitting[apart_m.argmax()])
+
+
+def _tape_sine(poses: Array) -> Array:
+    to_a, to_b = (poses[:, :2] - [point.x_m, point.y_m] for point in REFERENCES)
+    cross = np.abs(to_a[:, 0] * to_b[:, 1] - to_a[:, 1] * to_b[:, 0])
+    sine: Array = cross / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
+    return sine
+
+
+def _whole(camera: Camera, poses: Array, lab: LabSettings) -> NDArray[np.bool_]:
+    """Return the poses (n, 4) whose print, with its white margin, is wholly in the image."""
+    side_m = _print_m(lab)
+    turn = poses[:, 3] - np.pi / 2
+    flat = marker_corners(side_m)[:, :2]
+    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    corners_m = np.empty((len(poses), 4, 3))
+    corners_m[..., 0] = poses[:, :1] + cos * flat[:, 0] - sin * flat[:, 1]
+    corners_m[..., 1] = poses[:, 1:2] + sin * flat[:, 0] + cos * flat[:, 1]
+    corners_m[..., 2] = poses[:, 2:3]
+    return np.asarray(sees(camera, corners_m.reshape(-1, 3)).reshape(-1, 4).all(axis=1))
+
+
+def _print_m(lab: LabSettings) -> float:
+    """Return the side of a print, with its white margin of one cell."""
+    cells = len(black_cells(lab.dictionary, 0))
+    return lab.marker_length_m * cells / (cells - 2)
+
+
+def camera_poses(camera: Camera, placed: PlacedMarkers) -> tuple[Array, Array]:
+    """Return rotations (n, 3, 3) and centres (n, 3) from marker coordinates to camera coordinates."""
+    rotations: Array = camera.camera_from_world[:3, :3] @ placed.rotations
+    return rotations, transform(camera.camera_from_world, placed.centres_m)

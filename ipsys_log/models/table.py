@@ -18,10 +18,12 @@ from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 __all__ = [
+    "CORNER_MODELS",
     "MODELS",
     "MODEL_VERSIONS",
     "AppliedModel",
     "CalibrationPoints",
+    "check_name",
     "create",
     "fit_cameras",
     "group_dependent_cameras",
@@ -29,6 +31,7 @@ __all__ = [
     "min_pairs",
     "parameters",
     "predict_array",
+    "reads_corners",
     "reads_height",
     "restore",
 ]
@@ -102,7 +105,30 @@ MODEL_VERSIONS = {
     "kriging-regression": 1,
     "rayplane": 1,
     "best": 1,
+    "joint": 1,
 }
+
+
+# Models of the corners of markers, and the least number of calibration points of each. The fit estimates all
+# cameras together, see ipsys_log.joint.
+CORNER_MODELS: dict[str, int] = {"joint": 0}
+
+
+def check_name(name: str) -> None:
+    """Check that a model is known.
+
+    Raises
+    ------
+    IpsysError
+        The name is not in a table.
+    """
+    if not reads_corners(name):
+        create(name)
+
+
+def reads_corners(name: str) -> bool:
+    """Return whether a model reads the corners of markers, and not their camera points."""
+    return name in CORNER_MODELS
 
 
 def create(name: str) -> Any:
@@ -114,18 +140,23 @@ def create(name: str) -> Any:
         The name is not in the table.
     """
     if name not in MODELS:
-        raise IpsysError(f"model {name!r} is not known; use one of {', '.join(MODELS)}")
+        known = ", ".join((*MODELS, *CORNER_MODELS))
+        raise IpsysError(f"model {name!r} is not known; use one of {known}")
     return MODELS[name]()
 
 
 def min_pairs(name: str) -> int:
     """Return the least number of calibration points that a model needs."""
+    if reads_corners(name):
+        return CORNER_MODELS[name]
     return max(int(step.min_pairs) for _, step in _steps(create(name)))
 
 
 @cache
 def reads_height(name: str) -> bool:
     """Return whether a model needs the height of a marker above the floor."""
+    if reads_corners(name):
+        return True
     return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.calibration_points import find_pairs, measured, split_ids
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import (
@@ -19,7 +20,7 @@ from ipsys_log.messages.channels import (
     RIG,
     Channel,
 )
-from ipsys_log.models.table import AppliedModel, min_pairs, reads_height
+from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.select import copied_run, fitted_in
@@ -64,7 +65,8 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
                 f"but the log has {len(train)} in all; measure more"
                 + ("" if model == "rigid" else ", or use --model rigid")
             )
-        check_different(model, str(session), train_m)
+        if not reads_corners(model):
+            check_different(model, str(session), train_m)
     _check_line(session, train_m)
 
 
@@ -112,7 +114,8 @@ def check_fits(
         for camera, seen in find_pairs(view, points).items()
     }
     for model in models:
-        check_pairs(model, pairs)
+        if not reads_corners(model):
+            check_pairs(model, pairs)
 
 
 def check_evaluated(session: Session, request: Request, models: Sequence[str]) -> None:
@@ -146,7 +149,7 @@ def check_models(
         for name in models:
             model, _ = fitted_in(other, name)
             for camera in model.cameras if {EVALUATION, POSITIONS} & {*written} else ():
-                AppliedModel(model.name, camera)
+                restore_joint(camera) if reads_corners(model.name) else AppliedModel(model.name, camera)
             fitted = {camera.camera for camera in model.cameras}
             if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(

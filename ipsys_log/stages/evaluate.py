@@ -182,7 +182,7 @@ STAGE = Stage(
     reads=(RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,
-    rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
+    rig_part=lambda rig, options: (rig.reference_points, {m.id for m in rig.markers}),
     method=model_read,
     causal=False,
 )

@@ -15,9 +15,10 @@ from ipsys_log.analysis.calibration_points import (
     split_parameters,
 )
 from ipsys_log.analysis.cross_validation import gather_points, make_folds, predict_without
+from ipsys_log.analysis.joint_calibration import READS, fit_joint_model
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
+from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
 from ipsys_log.models.table import (
@@ -27,6 +28,7 @@ from ipsys_log.models.table import (
     inputs,
     min_pairs,
     parameters,
+    reads_corners,
 )
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
 from ipsys_log.units import CM_PER_M
@@ -208,6 +210,9 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         if copied is not None:
             return copied
     notes: list[str] = []
+    parameters = {"model": name, **split_parameters(view, options)}
+    if reads_corners(name):
+        return _plan_joint(view, options, parameters)
 
     def compute(progress: Progress) -> Model:
         points = measured(view)
@@ -227,11 +232,19 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
     return Plan(
         run=model_run(name),
-        parameters={"model": name, **split_parameters(view, options)},
+        parameters=parameters,
         reads=(RIG, CAMERA_POINTS, MEASUREMENTS),
         compute=compute,
         notes=notes,
     )
+
+
+def _plan_joint(view: StageView, options: Mapping[str, str], parameters: Mapping[str, str]) -> Plan:
+    def compute(progress: Progress) -> Model:
+        train, _ = split_ids([point.measurement for point in measured(view)], options)
+        return fit_joint_model(view, train, view.last_ns(*READS), progress)
+
+    return Plan(run=model_run(parameters["model"]), parameters=parameters, reads=READS, compute=compute)
 
 
 def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:
@@ -252,13 +265,22 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str
     return lines
 
 
+def _rig_part(rig: Rig, options: Mapping[str, str]) -> object:
+    part = (rig.reference_points, {m.id for m in rig.markers})
+    if not reads_corners(options["model"]):
+        return part
+    markers = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
+    cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
+    return part, markers, cameras, rig.tape_sigma_m
+
+
 STAGE = Stage(
     name="fit",
     versions={"fit": 1, **MODEL_VERSIONS},
-    reads=(RIG, CAMERA_POINTS, MEASUREMENTS),
+    reads=READS,
     writes=(MODEL,),
     plan=_plan,
-    rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
+    rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("model", ""),
     causal=False,
     of_model=True,

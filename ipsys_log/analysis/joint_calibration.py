@@ -1,0 +1,62 @@
+"""The joint calibration of a log: its observations, and the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from ipsys_log.analysis.calibration_points import find_pairs, measured
+from ipsys_log.errors import FitError
+from ipsys_log.joint.fit import JointFit, fit_jointly
+from ipsys_log.joint.from_messages import gather_observations
+from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.payload import joint_payload
+from ipsys_log.joint.selection import seeing_cameras, without_points
+from ipsys_log.messages import Markers, Model
+from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
+from ipsys_log.messages.stage import Progress, StageView
+
+__all__ = ["READS", "fit_joint_model", "fit_without", "observe"]
+
+# The channels that a joint calibration reads.
+READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
+
+
+def observe(view: StageView) -> Observations:
+    """Return the observations of a log: all its calibration points, and the drives of its robots.
+
+    Raises
+    ------
+    FitError
+        The log has no rig, or no markers.
+    """
+    points = measured(view)
+    rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
+    markers: dict[str, list[Markers]] = {}
+    for message in view.messages(MARKERS):
+        markers.setdefault(str(message.camera), []).append(message.payload)
+    if rig is None or not markers:
+        raise FitError("joint needs the markers in the images, but the log has only camera points; use best")
+    return gather_observations(rig, view.calibrations(), markers, [point.measurement for point in points])
+
+
+def fit_without(
+    observations: Observations, left_out: Collection[str], progress: Progress = lambda done, total: None
+) -> JointFit:
+    """Fit the cameras that saw something, without some calibration points."""
+    # The number of steps is not known before; each brings the fit nearer to its end.
+    return fit_jointly(
+        seeing_cameras(without_points(observations, left_out)),
+        progress=lambda step, cost: progress(step, step + 1),
+    )
+
+
+def fit_joint_model(view: StageView, train: Collection[str], time_ns: int, progress: Progress) -> Model:
+    """Fit the joint model of a log to the calibration points ``train`` and to all drives."""
+    points = measured(view)
+    left_out = {point.measurement.id for point in points} - set(train)
+    fit = fit_without(observe(view), left_out, progress)
+    pairs = {
+        camera: [pair for pair in seen if pair.measurement in train]
+        for camera, seen in find_pairs(view, points).items()
+    }
+    return joint_payload(fit, pairs, time_ns)

@@ -152,8 +152,6 @@ def _without(model: Model, study: Study, names: set[str], notes: list[str]) -> t
     except FitError as error:
         notes.append(f"gross outliers are not excluded: {error}")
         return model, study
-    listed = ", ".join(sorted(names))
-    notes.append(f"gross outliers, without which errors and learning curves are computed: {listed}")
     clean = replace(study, pairs=pairs, held_out=study.held_out - names)
     return replace(model, cameras=cameras), clean
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
 from ipsys_log.messages import Evaluation, LearningPoint
-from ipsys_log.models.table import MODELS, reads_height
+from ipsys_log.models.table import MODELS, min_pairs, reads_height
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
@@ -255,6 +255,7 @@ def _sentences(
             f"The mean error of {name} is {means_cm[0]:.1f} cm with {min(table)} points per camera, "
             f"{means_cm[-1]:.1f} cm with {max(table)}."
         )
+        yield from _too_few(table)
         return
     simple = {c.model for row in table.values() for c in row if c.model in _SIMPLE}
     group, use = (SIMPLE, "Between rigid and poly, use") if len(simple) > 1 else (ALL_MODELS, "Use")
@@ -268,6 +269,27 @@ def _sentences(
     ):
         if SIMPLE in choices[most] and other in choices[most]:
             yield from _saving(start, choices[most][other].model, choices[most][SIMPLE], most, table)
+    yield from _too_few(table)
+
+
+# A polynomial with so many times the error of the largest number of points has too few points.
+_TOO_FEW = 5.0
+
+
+def _too_few(table: Mapping[int, Sequence[_Candidate]]) -> Iterable[str]:
+    """Yield the reason for a large error of the polynomial with hardly more points than coefficients."""
+    curve = [(n, c.mean_m) for n, row in sorted(table.items()) for c in row if c.model == "poly"]
+    if len(curve) < 2:
+        return
+    (fewest, first_m), (most, last_m) = curve[0], curve[-1]
+    terms = min_pairs("poly")
+    if fewest < 2 * terms and first_m > _TOO_FEW * last_m:
+        yield (
+            f"The error of poly with {fewest} points, {first_m * CM_PER_M:.0f} cm, is no fault of the lab: "
+            f"poly has {terms} coefficients for each coordinate, so it passes through {fewest} points with "
+            f"their errors and is wrong between and beyond them. With {most} points, it is "
+            f"{last_m * CM_PER_M:.1f} cm."
+        )
 
 
 def _by_number(models: Mapping[int, str]) -> str:

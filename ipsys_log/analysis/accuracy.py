@@ -18,6 +18,7 @@ __all__ = [
     "HELD_OUT",
     "POOLED",
     "count_repeats",
+    "error_rows",
     "error_statistics",
     "evaluate_cross_validated",
     "evaluate_held_out",
@@ -150,7 +151,7 @@ def evaluate_held_out(
             points_m, world_m = _arrays(pairs)
             predictions[camera.camera] = (pairs, applied.predict(points_m, world_m[:, 2])[None])
             covariances[camera.camera] = _covariances(applied, pairs)
-    return _rows(model, predictions, covariances, ground_truth, HELD_OUT)
+    return error_rows(model, predictions, covariances, ground_truth, HELD_OUT)
 
 
 def evaluate_cross_validated(
@@ -184,7 +185,7 @@ def evaluate_cross_validated(
     predicted = cross_validate(model.name, cameras, seed)
     predictions = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
     covariances = _fold_covariances(model.name, pairs, seed)
-    return _rows(model, predictions, covariances, ground_truth, CROSS_VALIDATION)
+    return error_rows(model, predictions, covariances, ground_truth, CROSS_VALIDATION)
 
 
 def _fold_covariances(name: str, pairs: Mapping[str, Sequence[Pair]], seed: int) -> dict[str, Array | None]:
@@ -239,14 +240,16 @@ def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:
     return np.array([pair.camera_m for pair in pairs]), np.array([pair.world_m for pair in pairs])
 
 
-def _rows(
+def error_rows(
     model: Model,
     found: Mapping[str, tuple[list[Pair], Array]],
     covariances: Mapping[str, Array | None],
     ground_truth: Mapping[str, Array],
     scheme: str,
 ) -> list[CameraEvaluation]:
-    """Return rows of errors; ``found`` has pairs and predictions (repeats, n, 3) of each camera.
+    """Return rows of errors for each camera, and for all; ``found`` has their pairs and predictions.
+
+    The predictions are (repeats, n, 3).
 
     ``covariances`` (n, 3, 3) are those of the first repeat.
     """

@@ -57,7 +57,7 @@ def locate(
     covariances_px2: Array,
     heights_m: Array,
     lengths_m: Array,
-    height_sigma_m: float = 0.001,
+    height_sigmas_m: Array | float = 0.001,
     tilt_sigma_rad: float = 0.005,
 ) -> Positions:
     """Return the positions of level markers at known heights above the floor.
@@ -72,7 +72,8 @@ def locate(
     covariances_px2 : (n, 8, 8), of x0 y0 .. x3 y3.
     heights_m : (n,), heights of the markers above the floor.
     lengths_m : (n,), nominal sides of the markers.
-    height_sigma_m, tilt_sigma_rad : standard deviations of a height, and of the tilt about either axis.
+    height_sigmas_m : standard deviation of the heights: a number, or (n,).
+    tilt_sigma_rad : standard deviation of the tilt about either axis.
 
     Returns
     -------
@@ -105,7 +106,8 @@ def locate(
     modes_m = -(gains @ now.by_camera) @ model.modes[:flat]
     modes_m += by_height * (floor_modes @ model.modes[flat:])[:, None]
     covariances = lift @ spread[:, :2, :2] @ lift.swapaxes(1, 2) + modes_m @ modes_m.swapaxes(1, 2)
-    covariances += height_sigma_m**2 * by_height @ by_height.swapaxes(1, 2)
+    by_height = by_height * np.reshape(height_sigmas_m, (-1, 1, 1))
+    covariances += by_height @ by_height.swapaxes(1, 2)
     headings_rad = (headings_rad - change[:, 2] + np.pi) % (2 * np.pi) - np.pi
     chi2 = (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0]
     return Positions(points_m, headings_rad, covariances, chi2, modes_m)

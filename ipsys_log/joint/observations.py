@@ -64,6 +64,11 @@ class Body:
     height_m: float | None = None
     height_sigma_m: float = 0.001
 
+    @property
+    def length_m(self) -> float:
+        """The nominal distance of its first two points."""
+        return float(np.linalg.norm(self.points_m[1] - self.points_m[0]))
+
 
 def marker_body(
     name: str,

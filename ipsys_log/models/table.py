@@ -28,6 +28,7 @@ __all__ = [
     "fit_cameras",
     "group_dependent_cameras",
     "inputs",
+    "is_known",
     "min_pairs",
     "parameters",
     "predict_array",
@@ -114,16 +115,22 @@ MODEL_VERSIONS = {
 CORNER_MODELS: dict[str, int] = {"joint": 0}
 
 
+def is_known(name: str) -> bool:
+    """Return whether this version has a model."""
+    return name in MODELS or reads_corners(name)
+
+
 def check_name(name: str) -> None:
     """Check that a model is known.
 
     Raises
     ------
     IpsysError
-        The name is not in a table.
+        This version does not have the model.
     """
-    if not reads_corners(name):
-        create(name)
+    if not is_known(name):
+        known = ", ".join((*MODELS, *CORNER_MODELS))
+        raise IpsysError(f"model {name!r} is not known; use one of {known}")
 
 
 def reads_corners(name: str) -> bool:
@@ -139,9 +146,7 @@ def create(name: str) -> Any:
     IpsysError
         The name is not in the table.
     """
-    if name not in MODELS:
-        known = ", ".join((*MODELS, *CORNER_MODELS))
-        raise IpsysError(f"model {name!r} is not known; use one of {known}")
+    check_name(name)
     return MODELS[name]()
 
 

@@ -18,7 +18,7 @@ from ipsys_log.messages import (
     Suspect,
 )
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
-from ipsys_log.models.table import MODELS, reads_height
+from ipsys_log.models.table import is_known, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
 from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
@@ -96,7 +96,7 @@ def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
 
 def _uses_heights(session: Session, run: str) -> bool:
     models = session.payloads(session.topics(MODEL, run))
-    return bool(models) and models[-1].name in MODELS and reads_height(models[-1].name)
+    return bool(models) and is_known(models[-1].name) and reads_height(models[-1].name)
 
 
 def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:

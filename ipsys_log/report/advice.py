@@ -28,7 +28,7 @@ import numpy as np
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
 from ipsys_log.messages import Evaluation, LearningPoint
-from ipsys_log.models.table import MODELS, min_pairs, reads_height
+from ipsys_log.models.table import is_known, min_pairs, reads_height
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
@@ -114,12 +114,12 @@ def _point(points: Sequence[LearningPoint], places: int, in_space: bool) -> Curv
 # The simplest model first, by free parameters per camera: 6 for a pose, some more for lens distortion, 30 for
 # a polynomial, one per point for kriging, and the weights of a network.
 _SIMPLE_FIRST = (
-    "rigid", "rayplane", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
+    "rigid", "rayplane", "joint", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
     "kriging-regression", "rigid+kriging-regression", "ann", "rigid+ann",
 )  # fmt: skip
 # The paper recommends one of these two, by the number of points.
 _SIMPLE = ("rigid", "poly")
-_OWN = ("rayplane", "best")
+_OWN = ("rayplane", "best", "joint")
 SIMPLE, PAPER, ALL_MODELS, HEIGHT_KNOWN = "simple", "paper", "any", "height_known"
 GROUPS = {
     SIMPLE: "rigid or poly",
@@ -183,7 +183,7 @@ class _Candidate:
 
 def uses_height(model: str) -> bool:
     """Return whether a model gets the height of a marker as input; then its 3D error is a 2D error."""
-    return model in MODELS and reads_height(model)
+    return is_known(model) and reads_height(model)
 
 
 def label(model: str) -> str:

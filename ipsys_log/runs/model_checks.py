@@ -16,6 +16,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
+    MARKERS,
     POSITIONS,
     RIG,
     Channel,
@@ -59,6 +60,8 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
     world_m = _check_places(places)
     train_m = np.array([world_m[name] for name in sorted(train)]).reshape(-1, 3)
     for model in models:
+        if reads_corners(model):
+            _check_corners(session, model)
         if len(train) < min_pairs(model):
             raise FitError(
                 f"{session}: {model} needs at least {min_pairs(model)} calibration points for each camera, "
@@ -68,6 +71,15 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
         if not reads_corners(model):
             check_different(model, str(session), train_m)
     _check_line(session, train_m)
+
+
+def _check_corners(session: Session, model: str) -> None:
+    """Check that the log has corners of markers, or images to detect them in."""
+    if not session.images and newest_run(session, MARKERS) is None:
+        raise FitError(
+            f"{session}: {model} is fitted to the corners of markers, but the log has only camera points; "
+            "use --model best"
+        )
 
 
 def _check_places(places: Sequence[RiggedMeasurement]) -> dict[str, NDArray[np.float64]]:

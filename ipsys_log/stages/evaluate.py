@@ -28,13 +28,15 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
+from ipsys_log.analysis.joint_calibration import READS, measured_part, observe
+from ipsys_log.analysis.joint_evaluation import evaluate_joint
 from ipsys_log.analysis.outliers import find_outliers, is_gross
 from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
-from ipsys_log.models.table import CalibrationPoints, min_pairs
+from ipsys_log.models.table import CalibrationPoints, min_pairs, reads_corners
 
 __all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
 
@@ -205,12 +207,24 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         return ""
     again = _is_fitted_here(view, options, model.name)
     seed = options.get("seed", "0")
-    reads = (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
+    joint = reads_corners(model.name)
+    reads = (*READS, MODEL, TRUTH) if joint else (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
     notes: list[str] = []
 
     def compute(progress: Progress) -> Evaluation:
         points = measured(view)
         measurements = [point.measurement for point in points]
+        if joint:
+            return evaluate_joint(
+                model,
+                observe(view),
+                find_pairs(view, points),
+                held_out_ids(measurements, options),
+                true_points(points, gather_tracks(view.messages(TRUTH))),
+                int(seed) if again else None,
+                notes,
+                progress,
+            )
         study = Study(
             points,
             find_pairs(view, points),
@@ -221,7 +235,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         )
         return evaluate_model(model, study, view.last_ns(*reads), notes, progress)
 
-    folds = {"folds": str(FOLDS), "repeats": str(REPEATS), "seed": seed}
+    folds = {"folds": str(FOLDS), "repeats": "1" if joint else str(REPEATS), "seed": seed}
     return Plan(
         run=view.run(MODEL),
         parameters={**split_parameters(view, options), **folds} if again else {},
@@ -234,10 +248,10 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 STAGE = Stage(
     name="evaluate",
     versions={"evaluate": 2},
-    reads=(RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH),
+    reads=(*READS, MODEL, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,
-    rig_part=lambda rig, options: (rig.reference_points, {m.id for m in rig.markers}),
+    rig_part=measured_part,
     method=model_read,
     causal=False,
 )

@@ -16,10 +16,10 @@ from ipsys_log.analysis.calibration_points import (
 )
 from ipsys_log.analysis.camera_models import fit_camera_models
 from ipsys_log.analysis.cross_validation import gather_points
-from ipsys_log.analysis.joint_calibration import READS, fit_joint_model
+from ipsys_log.analysis.joint_calibration import READS, fit_joint_model, measured_part
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
-from ipsys_log.messages import Model, Pair, Rig
+from ipsys_log.messages import Model, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
 from ipsys_log.models.table import MODEL_VERSIONS, CalibrationPoints, min_pairs, reads_corners
@@ -185,22 +185,13 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str
     return lines
 
 
-def _rig_part(rig: Rig, options: Mapping[str, str]) -> object:
-    part = (rig.reference_points, {m.id for m in rig.markers})
-    if not reads_corners(options["model"]):
-        return part
-    markers = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
-    cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
-    return part, markers, cameras, rig.tape_sigma_m
-
-
 STAGE = Stage(
     name="fit",
     versions={"fit": 1, **MODEL_VERSIONS},
     reads=READS,
     writes=(MODEL,),
     plan=_plan,
-    rig_part=_rig_part,
+    rig_part=measured_part,
     method=lambda parameters, view: parameters.get("model", ""),
     causal=False,
     of_model=True,

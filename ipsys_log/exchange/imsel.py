@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_opencv_calibration
 from ipsys_log.messages import (
+    IMPORTED,
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
     CameraPoint,
@@ -156,7 +157,7 @@ def read_imsel(folder: Path) -> Iterator[Message]:
         for number, (point_m, world_m, splits) in enumerate(_places(mats, camera)):
             time_ns += NS_PER_S
             yield from _place(camera, f"{camera}_{number:02d}", time_ns, point_m, world_m, splits)
-    run = Run(timestamp=time_ns, run="imsel", stage="import", parameters={"format": "imsel"})
+    run = Run(timestamp=time_ns, run="imsel", stage=IMPORTED, parameters={"format": "imsel"})
     yield Message("/runs/imsel/record", time_ns + 2, time_ns, run)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_opencv_calibration
 from ipsys_log.messages import (
+    IMPORTED,
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
     CameraPoint,
@@ -161,7 +162,7 @@ def read_imsel(folder: Path) -> Iterator[Message]:
             name = f"{camera}_{number:02d}"
             first = names.setdefault(world_m.tobytes(), name)
             yield from _place(camera, name, first, time_ns, point_m, world_m, splits)
-    run = Run(timestamp=time_ns, run="imsel", stage="import", parameters={"format": "imsel"})
+    run = Run(timestamp=time_ns, run="imsel", stage=IMPORTED, parameters={"format": "imsel"})
     yield Message("/runs/imsel/record", time_ns + 2, time_ns, run)
 
 

@@ -43,7 +43,7 @@ from ipsys_log.messages.models import (
     Suspect,
 )
 from ipsys_log.messages.rig import CameraCalibration, Floor, ReferencePoint, Rig, RigCamera, RigMarker
-from ipsys_log.messages.runs import ChannelRead, ChannelWritten, Lens, Run
+from ipsys_log.messages.runs import IMPORTED, ChannelRead, ChannelWritten, Lens, Run
 from ipsys_log.messages.tracks import (
     FrameTransform,
     FrameTransforms,
@@ -58,6 +58,7 @@ from ipsys_log.messages.tracks import (
 __all__ = [
     "EVENTS_TOPIC",
     "FRAME_SKIPPED",
+    "IMPORTED",
     "LATENCY_TOPIC",
     "MEASUREMENTS_TOPIC",
     "RIG_TOPIC",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import (
+    IMPORTED,
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
     TRUTH_TOPIC,
@@ -109,7 +110,7 @@ def simulate_session(lab: GeometricLab) -> Iterator[Message]:
     for arrival_ns, topic, payload, publish_ns, camera in rows:
         log_time_ns = max(arrival_ns, log_time_ns + 1)
         yield Message(topic, log_time_ns, publish_ns, payload, camera)
-    run = Run(publish_ns, MARKERS_RUN, "import", {"format": "geometric_lab"})
+    run = Run(publish_ns, MARKERS_RUN, IMPORTED, {"format": "geometric_lab"})
     yield Message(RECORD.topic_of(MARKERS_RUN), log_time_ns + 1, publish_ns, run)
 
 

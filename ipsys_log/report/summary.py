@@ -56,6 +56,8 @@ def _track_lines(accuracy: Accuracy, space: bool, several: bool) -> Iterator[str
     """Yield the errors of the tracks at the instants that count, and at the others."""
     tracks = accuracy.tracks
     assert tracks is not None
+    # A known height is no result of the model: its error is that of the input.
+    space = space and not uses_height(accuracy.model)
     own, whole = (tracks.space, tracks.whole[0]) if space else (tracks.floor, tracks.whole[1])
     of_model = f" of {name_cell(accuracy.model).plain}" if several else ""
     text = f"Tracks{of_model}, against the ground truth: {_figures(own, root_mean_square_m(own))}."

@@ -17,15 +17,15 @@ def drive(rng: np.random.Generator, height_m: float) -> np.ndarray:
     return np.column_stack([rng.uniform(0.6, 4.2, 200), rng.uniform(0.4, 1.4, 200), np.full(200, height_m)])
 
 
-def located(model: Model, points_m: np.ndarray, rig: Rig) -> list[bool | None]:
+def located(model: Model, points_m: np.ndarray, rig: Rig) -> list[bool]:
     """Return ``inside`` of the position of each camera point, of a marker at the height in the rig."""
     locate = Locate(model)
     list(locate(Message("/rig", 0, 0, rig)))
-    inside = []
+    inside: list[bool] = []
     for point_m in points_m:
         seen = CameraPoints(0, (CameraPoint(0, *point_m.tolist()),))
         (positions,) = locate(Message("/runs/lab/cameras/red/camera_points", 0, 0, seen, "red"))
-        inside += [position.inside for position in positions.positions]
+        inside += [bool(position.inside) for position in positions.positions]
     return inside
 
 

@@ -102,14 +102,16 @@ def test_session_is_a_log_in_order_with_a_valid_rig() -> None:
     assert messages[-1].topic == "/runs/geometric/record"
     measured = [m.payload for m in messages if isinstance(m.payload, Measurement)]
     assert [m.splits for m in measured] == [("train",)] * 4
-    # Each camera has a sighting of a measured marker in its stationary interval, by its own clock.
+    # All five frames of a camera are in the stationary interval, by its own clock.
+    seen = sightings_of(messages)
     for measurement in measured:
         assert measurement.still is not None
-        assert any(
-            measurement.still.start <= time_ns <= measurement.still.end
-            for _, time_ns, marker_id in sightings_of(messages)
-            if marker_id == measurement.marker_id
-        )
+        frames = {camera: 0 for camera, _, _ in seen}
+        for camera, time_ns, marker_id in seen:
+            inside = measurement.still.start <= time_ns <= measurement.still.end
+            frames[camera] += inside and marker_id == measurement.marker_id
+        assert 5 in frames.values()
+        assert set(frames.values()) <= {0, 5}
 
 
 def test_equal_settings_give_equal_bytes_and_other_seeds_others() -> None:

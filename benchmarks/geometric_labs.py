@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from rendered_labs import rendered_lab
 
 from ipsys_log.analysis.floor_error import KnownSightings, Locator, grid_nodes, locate_with_model
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
@@ -24,7 +25,13 @@ from ipsys_log.simulation.corner_noise import (
     draw_corner_noise,
     edge_sigma_px,
 )
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, PlacedMarkers, camera_poses
+from ipsys_log.simulation.geometric_lab import (
+    GeometricLab,
+    GeometricSettings,
+    PlacedMarkers,
+    build_lab,
+    camera_poses,
+)
 from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
@@ -51,11 +58,11 @@ _USUAL_PX = 0.012
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The settings of a lab by its name; ``flat`` scenes have a limit, the others are only reported."""
+    """The settings of a lab by its name. Markers of ``rendered`` labs come from images, through detect."""
 
     name: str
     settings: GeometricSettings
-    flat: bool = True
+    rendered: bool = False
 
     @property
     def drives(self) -> bool:
@@ -88,9 +95,9 @@ SCENES = (
         "drive and 16, clocks",
         GeometricSettings(lab=_DRIVE, points=16, clock_offset_s=_CLOCKS, frame_delays_s=_DELAYS_S),
     ),
-    Scene("75 points, 1.5 mm", GeometricSettings(lab=_STILL, floor_rms_m=0.0015), flat=False),
-    Scene("75 points, 3 mm", GeometricSettings(lab=_STILL, floor_rms_m=0.003), flat=False),
-    Scene("16 points, 3 mm", GeometricSettings(lab=_STILL, points=16, floor_rms_m=0.003), flat=False),
+    Scene("75 points, 1.5 mm", GeometricSettings(lab=_STILL, floor_rms_m=0.0015)),
+    Scene("75 points, 3 mm", GeometricSettings(lab=_STILL, floor_rms_m=0.003)),
+    Scene("16 points, 3 mm", GeometricSettings(lab=_STILL, points=16, floor_rms_m=0.003)),
     Scene("75 points, tilted", GeometricSettings(lab=replace(_STILL, tilt_deg=(20.0, 30.0)))),
     Scene(
         "drive and 16, 1.5 mm",
@@ -102,14 +109,14 @@ SCENES = (
             clock_offset_s=_CLOCKS,
             frame_delays_s=_DELAYS_S,
         ),
-        flat=False,
     ),
     Scene(
         "drive and 16, wobble",
         GeometricSettings(lab=_DRIVE, points=16, wobble_deg=0.6),
-        flat=False,
     ),
-    Scene("drive and 16, rolling", GeometricSettings(lab=_ROLLING, points=16), flat=False),
+    Scene("drive and 16, rolling", GeometricSettings(lab=_ROLLING, points=16)),
+    Scene("rendered, 75 points", GeometricSettings(lab=_STILL), rendered=True),
+    Scene("rendered, 16 points", GeometricSettings(lab=_STILL, points=16), rendered=True),
 )
 
 
@@ -123,9 +130,14 @@ class Session:
     pairs: dict[str, list[Pair]]
 
 
-def make_session(lab: GeometricLab) -> Session:
-    """Simulate a session, and convert its markers to camera points."""
-    messages, stage = list(simulate_session(lab)), CameraFrame()
+def make_session(scene: Scene, seed: int) -> Session:
+    """Simulate a session of a lab, and convert its markers to camera points."""
+    if scene.rendered:
+        lab, messages = rendered_lab(scene.seeded(seed))
+    else:
+        lab = build_lab(scene.seeded(seed))
+        messages = list(simulate_session(lab))
+    stage = CameraFrame()
     points: list[Message] = []
     for message in messages:
         if isinstance(message.payload, (Rig, CameraCalibration, Markers)):

@@ -4,10 +4,10 @@
     python benchmarks/joint.py --labs 5 --lab-scene 16     # scenes with this in their name
     python benchmarks/joint.py --picture floor.png       # also a map of the errors of one lab
 
-The labs have no images: markers have the noise that detect has in rendered labs (see
-ipsys_log/simulation/corner_noise.py). Each lab has another seed, and all calibrations get the same labs. The
-error over the floor is defined in ipsys_log/analysis/floor_error.py. The script prints a table, and writes
-JSON with -o.
+Most labs have no images: markers have the noise that detect has in rendered labs (see
+ipsys_log/simulation/corner_noise.py). Some labs are rendered, to confirm this. Each lab has another seed, and
+all calibrations get the same labs. The error over the floor is defined in ipsys_log/analysis/floor_error.py.
+The script prints a table, and writes JSON with -o.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.floor_error import KnownSightings, Locator, SightingErrors, compute_errors, summarize
 from ipsys_log.errors import FitError
-from ipsys_log.simulation.geometric_lab import build_lab
 
 __all__ = ["measure"]
 
@@ -68,6 +67,8 @@ def measure(options: argparse.Namespace) -> Report:
     """Calibrate the labs of every scene with every contender."""
     report = Report("joint")
     scenes = [scene for scene in SCENES if options.lab_scene in scene.name]
+    if not options.rendered_labs:
+        scenes = [scene for scene in scenes if not scene.rendered]
     if options.smoke:
         scenes = [scene for scene in scenes if not scene.drives][:1]
     names = options.models.split(",") if options.models else list(CONTENDERS)
@@ -89,8 +90,9 @@ def _measure_scene(
     scene: Scene, names: Sequence[str], options: argparse.Namespace, report: Report
 ) -> dict[str, list[Figures | None]]:
     figures: dict[str, list[Figures | None]] = defaultdict(list)
-    for number in range(1 if options.smoke else options.labs):
-        session = make_session(build_lab(scene.seeded(_FIRST_SEED + number)))
+    labs = options.rendered_labs if scene.rendered else options.labs
+    for number in range(1 if options.smoke else labs):
+        session = make_session(scene, _FIRST_SEED + number)
         nodes = nodes_of(session.lab)
         maps: dict[str, list[SightingErrors]] = {}
         for name in names:
@@ -209,15 +211,18 @@ def _covered(name: str, known: list[Figures]) -> str:
         cells = []
         for key in ("inside_68", "inside_95"):
             values = [100 * one[key] for one in shares]
-            error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-            cells.append(f"{np.mean(values):.0f}±{error:.0f}")
+            cell = f"{np.mean(values):.0f}"
+            if len(values) > 1:
+                cell += f"±{np.std(values, ddof=1) / np.sqrt(len(values)):.0f}"
+            cells.append(cell)
         cells.append(f"{np.mean([one['nees'] for one in shares]):.2f}")
         line += f"{' '.join(cells):>19}"
     return line
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
-    parser.add_argument("--labs", type=int, default=20, help="of each scene")
+    parser.add_argument("--labs", type=int, default=5, help="of each scene without images")
+    parser.add_argument("--rendered-labs", type=int, default=3, help="of each scene with images")
     parser.add_argument("--lab-scene", default="", help="only scenes with this in their name")
     parser.add_argument("--models", default="", help=f"of {', '.join(CONTENDERS)}, separated by commas")
     parser.add_argument("--picture", help="map of the errors in the first lab of the first scene")

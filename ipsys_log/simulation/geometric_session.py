@@ -278,7 +278,7 @@ def _still_parts(lab: GeometricLab, camera: Camera) -> Iterator[_Part]:
         placed = lab.place(np.repeat(_as_array(poses), count, axis=0))
         ids = np.repeat([pose.marker_id for pose in poses], count)
         placements = np.repeat(np.arange(index, index + len(poses)), count)
-        corners_m = placed.corners_m(lab.settings.lab.marker_length_m)
+        corners_m = placed.corners_m(np.array([lab.sides_m[n] for n in ids.tolist()]))
         yield _Part(np.tile(times_ns, len(poses)), ids, placements, placed, corners_m)
         index += len(poses)
 
@@ -319,7 +319,7 @@ def _exposures(lab: GeometricLab, camera: Camera, marker_id: int, since_s: Array
 def _corners_at(lab: GeometricLab, marker_id: int, times_s: Array) -> Array:
     """Return the corners (n, 4, 3) of a robot's marker at times (n, 1), or each at its own time (n, 4)."""
     placed = lab.drive_poses(marker_id, times_s.reshape(-1))
-    corners_m = placed.corners_m(lab.settings.lab.marker_length_m)
+    corners_m = placed.corners_m(lab.sides_m[marker_id])
     own = np.arange(4)
     return corners_m if times_s.shape[1] == 1 else np.asarray(corners_m.reshape(-1, 4, 4, 3)[:, own, own])
 

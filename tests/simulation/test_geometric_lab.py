@@ -202,6 +202,37 @@ def test_wobble_tilts_robots_by_the_stated_angle() -> None:
     assert still == pytest.approx(np.tile([0.0, 0.0, 1.0], (50, 1)), abs=1e-12)
 
 
+def test_prints_and_robots_differ_from_the_rig_by_their_sigmas() -> None:
+    many = replace(DRIVE, markers=100, drive_s=0.0)
+    varied = replace(SMALL, marker_scale_sigma=0.002, robot_height_sigma_m=0.001)
+    lab = build_lab(replace(varied, lab=many, points=0, held_out_points=1))
+    sides_m, heights_m = (np.array([*one.values()]) for one in (lab.sides_m, lab.robot_heights_m))
+    assert (sides_m / 0.2 - 1).std() == pytest.approx(0.002, rel=0.3)
+    assert (heights_m - 0.1).std() == pytest.approx(0.001, rel=0.3)
+    assert abs(np.corrcoef(sides_m, heights_m)[0, 1]) < 0.4
+
+
+def test_markers_of_another_size_and_height_are_seen_as_such() -> None:
+    lab = build_lab(replace(SMALL, marker_scale_sigma=0.05, robot_height_sigma_m=0.02))
+    messages = list(simulate_session(lab))
+    truth = {m.publish_time_ns: m.payload for m in messages if isinstance(m.payload, Tracks)}
+    for (camera, time_ns, marker_id), marker in sightings_of(messages).items():
+        track = next(one for one in truth[time_ns].tracks if one.id == marker_id)
+        centre_m = np.array([track.x_m, track.y_m, track.z_m])
+        nominal_m = square_at(track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0)
+        corners_m = centre_m + lab.sides_m[marker_id] / 0.2 * (nominal_m - centre_m)
+        assert marker.corners_px == pytest.approx(by_opencv(lab.camera(camera), corners_m), abs=1e-6)
+    end = max(truth)
+    driving_m = {track.id: track.z_m for track in truth[end].tracks}
+    assert driving_m == pytest.approx(dict(lab.robot_heights_m))
+
+
+def test_held_out_points_have_the_split_test() -> None:
+    messages = simulate_session(build_lab(replace(SMALL, held_out_points=3)))
+    splits = [m.payload.splits for m in messages if isinstance(m.payload, Measurement)]
+    assert splits == [("train",)] * 4 + [("test",)] * 3
+
+
 def test_intrinsics_of_the_user_have_the_stated_errors() -> None:
     def lenses(kind: str) -> list[tuple[CameraCalibration, CameraCalibration]]:
         lab = build_lab(replace(SMALL, intrinsics=kind))

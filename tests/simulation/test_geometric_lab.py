@@ -203,10 +203,10 @@ def test_wobble_tilts_robots_by_the_stated_angle() -> None:
 
 
 def test_prints_and_robots_differ_from_the_rig_by_their_sigmas() -> None:
-    many = replace(DRIVE, markers=100, drive_s=0.0)
-    varied = replace(SMALL, marker_scale_sigma=0.002, robot_height_sigma_m=0.001)
-    lab = build_lab(replace(varied, lab=many, points=0, held_out_points=1))
-    sides_m, heights_m = (np.array([*one.values()]) for one in (lab.sides_m, lab.robot_heights_m))
+    varied = replace(SMALL, points=1, marker_scale_sigma=0.002, robot_height_sigma_m=0.001)
+    labs = [build_lab(replace(varied, lab=LabSettings(seed=seed, drive_s=0.0))) for seed in range(40)]
+    sides_m = np.array([[*lab.sides_m.values()] for lab in labs]).ravel()
+    heights_m = np.array([[*lab.robot_heights_m.values()] for lab in labs]).ravel()
     assert (sides_m / 0.2 - 1).std() == pytest.approx(0.002, rel=0.3)
     assert (heights_m - 0.1).std() == pytest.approx(0.001, rel=0.3)
     assert abs(np.corrcoef(sides_m, heights_m)[0, 1]) < 0.4

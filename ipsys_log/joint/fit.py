@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 # The field of the floor reaches this far beyond the outermost place of a marker.
 _BEYOND_M = 1.0
+# Before the wobble of robots is known from their poses, a step need not be so exact.
+_ROUGH = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +77,7 @@ def fit_jointly(
     if len(problem.trajectories.paths):
         # The wobble of a robot acts on its corners by the poses, so that these come first.
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
-        state = solve(problem, state, progress).state
+        state = solve(problem, state, progress, _ROUGH).state
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
     solution = solve(problem, state, progress)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())

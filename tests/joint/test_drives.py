@@ -96,7 +96,7 @@ def test_slopes_of_paths_match_differences() -> None:
 
 
 def test_drive_without_two_measured_points_is_refused() -> None:
-    observations = observe(make_drive(5.0, points=4))
+    observations = observe(make_drive(25.0, points=4))
     with pytest.raises(FitError, match="1 measured points"):
         fit_jointly(
             replace(

@@ -80,7 +80,8 @@ _CLOCKS, _DELAYS_S = 0.025, (0.0, 0.011, 0.022)
 
 # ``points`` are taped points, ``drive`` is a robot that drives for 120 s at 10 Hz. ``exact`` and ``nominal``
 # are kinds of intrinsics; the others have an error of calibration. ``1.5 mm`` is the unevenness of the floor,
-# ``tilted`` means cameras with 20 to 30 degrees, and ``clocks`` offsets of up to 25 ms.
+# ``tilted`` means cameras with 20 to 30 degrees, ``clocks`` offsets of up to 25 ms, and ``all`` all of these
+# faults but tilts.
 SCENES = (
     Scene("75 points", GeometricSettings(lab=_STILL)),
     Scene("75 points, exact", GeometricSettings(lab=_STILL, intrinsics="true")),
@@ -113,6 +114,19 @@ SCENES = (
     Scene(
         "drive and 16, wobble",
         GeometricSettings(lab=_DRIVE, points=16, wobble_deg=0.6),
+    ),
+    Scene(
+        "drive and 16, all",
+        GeometricSettings(
+            lab=_ROLLING,
+            points=16,
+            floor_rms_m=0.0015,
+            wobble_deg=0.2,
+            clock_offset_s=_CLOCKS,
+            frame_delays_s=_DELAYS_S,
+            marker_scale_sigma=0.002,
+            robot_height_sigma_m=0.001,
+        ),
     ),
     Scene("drive and 16, rolling", GeometricSettings(lab=_ROLLING, points=16)),
     Scene("rendered, 75 points", GeometricSettings(lab=_STILL), rendered=True),
@@ -209,7 +223,9 @@ def driving_robots(lab: GeometricLab, count: int) -> list[KnownSightings]:
     """Return sightings of a robot at random times of a long drive."""
     rng, (marker_id, *_) = np.random.default_rng([lab.settings.lab.seed, 2]), lab.drive.ahead_s
     path = lab.drive.poses_over(marker_id, rng.uniform(0, lab.drive.times_s[-1], count))
-    return sight(lab, np.insert(path, 2, lab.drive.height_m, axis=1), rng)
+    sightings = sight(lab, np.insert(path, 2, lab.robot_heights_m[marker_id], axis=1), rng)
+    # The rig has the nominal height of the robots.
+    return [replace(seen, heights_m=np.full_like(seen.heights_m, lab.drive.height_m)) for seen in sightings]
 
 
 def standing_robots(
@@ -269,8 +285,8 @@ def _joint(session: Session) -> Locator:
         if covariances_px2 is None:
             covariances_px2 = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (len(corners_px), 8, 8))
         lengths_m = np.full(len(corners_px), session.rig.marker_length_m)
-        # The ground truth of the floor has markers at exactly these heights.
-        found = locate(models[camera], corners_px, covariances_px2, heights_m, lengths_m, height_sigma_m=0.0)
+        sigma_m = lab.settings.robot_height_sigma_m
+        found = locate(models[camera], corners_px, covariances_px2, heights_m, lengths_m, sigma_m)
         return found.points_m, found.covariances_m2
 
     return locator

@@ -18,7 +18,8 @@ from ipsys_log.messages import CameraCalibration, Marker, Markers, Measurement, 
 from ipsys_log.rig.file import check_rig
 from ipsys_log.simulation.cameras import Camera
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session, simulate_sightings
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.geometric_sightings import simulate_sightings
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 

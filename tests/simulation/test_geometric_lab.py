@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,8 +15,13 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import pose_facing_up
 from ipsys_log.log.codec import encode
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Measurement, Message, Rig, Tracks
+from ipsys_log.messages.channels import MODEL
+from ipsys_log.pipeline import replay
 from ipsys_log.rig.file import check_rig
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.cameras import Camera
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
@@ -261,23 +267,16 @@ def test_tilted_cameras_still_see_their_part_of_the_floor() -> None:
         assert len(np.unique(sightings.placements[sightings.placements < 30])) >= 8
 
 
-def test_markers_of_a_session_can_be_fitted() -> None:
-    from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
-    from ipsys_log.messages import CameraPoints
-    from ipsys_log.stages.camera_frame import CameraFrame
-
-    messages, stage = list(simulate_session(build_lab(GeometricSettings(points=12)))), CameraFrame()
-    points = [
-        replace(message, payload=payload)
-        for message in messages
-        if isinstance(message.payload, (Rig, CameraCalibration, Markers))
-        for payload in stage(message)
-        if isinstance(payload, CameraPoints)
-    ]
-    pairs = build_pairs(gather_sightings(points), valid_measurements(messages, None))
-    assert {name: len(own) >= 4 for name, own in pairs.items()} == dict.fromkeys(
-        ("red", "white", "black"), True
-    )
+def test_a_written_session_can_be_fitted_without_images(tmp_path: Path) -> None:
+    path = tmp_path / "lab.mcap"
+    write_log(path, simulate_session(build_lab(GeometricSettings(points=18))))
+    outcomes = replay([path], Request(models=("rayplane",)), until="fit")
+    assert [(one.stage, one.run) for one in outcomes] == [("camera-frame", "geometric"), ("fit", "rayplane")]
+    with Session([path]) as session:
+        (message,) = session.messages(session.topics(MODEL, "rayplane"))
+    pairs = {camera.camera: len(camera.pairs) for camera in message.payload.cameras}
+    assert set(pairs) == {"red", "white", "black"}
+    assert min(pairs.values()) >= 6
 
 
 @pytest.mark.parametrize(

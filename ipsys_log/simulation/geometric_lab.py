@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import black_cells
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.simulation.calibration_points import REFERENCES, SimulatedPose, overlap
-from ipsys_log.simulation.cameras import FLOOR_M, Camera, aim_cameras, mount_cameras, sees
+from ipsys_log.simulation.calibration_points import SimulatedPose
+from ipsys_log.simulation.cameras import FLOOR_M, Camera, aim_cameras, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
+from ipsys_log.simulation.geometric_points import choose_points
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.simulation.smooth_fields import SmoothField, SmoothSignal
 from ipsys_log.units import NS_PER_S
@@ -36,7 +36,6 @@ Array = NDArray[np.float64]
 INTRINSICS = ("true", "calibrated", "nominal")
 # Tilts above this are for cameras that are aimed at the floor from the side.
 _MOST_TILT_DEG = 5.0
-_CANDIDATES, _BATCH, _BATCHES = 4, 64, 60
 _NOMINAL_FOCAL_ERROR = 0.05
 
 
@@ -69,6 +68,10 @@ class GeometricSettings:
     wobble_deg, wobble_s : tilt of a driving robot about each horizontal axis (RMS), and its correlation time.
     clock_offset_s : the stamps of each camera are late by a constant, uniform between minus and plus this.
     frame_delays_s : true delay of the frames of each camera after those of the first; repeated if short.
+    marker_scale_sigma : relative standard deviation of the true side of each marker; the rig has the nominal
+        one.
+    robot_height_sigma_m : standard deviation of the true height of each robot's marker; the rig has
+        ``drive_height_m`` for all.
     row_time_in_rig : whether the rig has the row time of the lab; otherwise markers have no time offset.
     corner_noise : factor of the corner noise; 0 gives exact corners with the usual covariances.
     """
@@ -84,6 +87,8 @@ class GeometricSettings:
     wobble_s: float = 0.5
     clock_offset_s: float = 0.0
     frame_delays_s: tuple[float, ...] = (0.0,)
+    marker_scale_sigma: float = 0.0
+    robot_height_sigma_m: float = 0.0
     row_time_in_rig: bool = True
     corner_noise: float = 1.0
 
@@ -100,6 +105,8 @@ class GeometricSettings:
             "floor_rms_m": self.floor_rms_m,
             "wobble_deg": self.wobble_deg,
             "clock_offset_s": self.clock_offset_s,
+            "marker_scale_sigma": self.marker_scale_sigma,
+            "robot_height_sigma_m": self.robot_height_sigma_m,
             "corner_noise": self.corner_noise,
         }
         for name, value in numbers.items():
@@ -119,9 +126,10 @@ class PlacedMarkers:
     centres_m: Array
     rotations: Array
 
-    def corners_m(self, length_m: float) -> Array:
-        """Return the corners of squares with a side, in OpenCV's order, (n, 4, 3) in world m."""
-        corners: Array = marker_corners(length_m) @ self.rotations.swapaxes(1, 2) + self.centres_m[:, None]
+    def corners_m(self, length_m: float | Array) -> Array:
+        """Return the corners of squares in OpenCV's order, (n, 4, 3) in world m; one side, or (n,) sides."""
+        arms_m = marker_corners(1.0) * np.reshape(length_m, (-1, 1, 1))
+        corners: Array = arms_m @ self.rotations.swapaxes(1, 2) + self.centres_m[:, None]
         return corners
 
 
@@ -138,7 +146,8 @@ class GeometricLab:
     clock_offsets_ns : by camera; a stamp is the true time plus this.
     frame_delays_ns : by camera; true time of a frame after the instant of all cameras.
     points : calibration points, in sets of simultaneous ones; z_m is the height above the uneven floor.
-    drive : the robots' path; its heights are above the uneven floor.
+    drive : the robots' path; its height is that of the rig.
+    sides_m, robot_heights_m : true side of each marker, and its true height above the floor on its robot.
     wobble : by marker, the tilts of a robot in rad about world x and y.
     """
 
@@ -150,6 +159,8 @@ class GeometricLab:
     frame_delays_ns: Mapping[str, int]
     points: tuple[tuple[SimulatedPose, ...], ...]
     drive: Drive
+    sides_m: Mapping[int, float]
+    robot_heights_m: Mapping[int, float]
     wobble: Mapping[int, SmoothSignal]
 
     def camera(self, name: str) -> Camera:
@@ -181,7 +192,7 @@ class GeometricLab:
     def drive_poses(self, marker_id: int, times_s: Array) -> PlacedMarkers:
         """Return the true poses of a robot's marker at times (n,) in s after the start of the drive."""
         path = self.drive.poses_over(marker_id, times_s)
-        poses = np.insert(path, 2, self.drive.height_m, axis=1)
+        poses = np.insert(path, 2, self.robot_heights_m[marker_id], axis=1)
         return self.place(poses, self.wobble[marker_id].at(times_s))
 
 
@@ -196,37 +207,42 @@ def build_lab(settings: GeometricSettings) -> GeometricLab:
         The field of view of a camera has no room for a point.
     """
     lab = settings.lab
-    mount = aim_cameras if lab.tilt_deg[1] > _MOST_TILT_DEG else mount_cameras
-    cameras = mount(lab)
-    names = [camera.name for camera in cameras]
-    clocks = random_stream(lab.seed, Purpose.CLOCK).uniform(-1, 1, len(names)) * settings.clock_offset_s
-    delays_s = [settings.frame_delays_s[n % len(settings.frame_delays_s)] for n in range(len(names))]
+    cameras = (aim_cameras if lab.tilt_deg[1] > _MOST_TILT_DEG else mount_cameras)(lab)
+    clock_offsets_ns, frame_delays_ns = _clocks(settings)
+    rng = random_stream(lab.seed, Purpose.UNEVENNESS)
+    floor = SmoothField.draw(settings.floor_rms_m, settings.floor_length_m, FLOOR_M, rng)
+    prints = random_stream(lab.seed, Purpose.PRINTS).standard_normal((lab.markers, 2))
+    scales = 1 + settings.marker_scale_sigma * prints[:, 0]
+    heights_m = lab.drive_height_m + settings.robot_height_sigma_m * prints[:, 1]
     drive = plan_drive(lab, cameras)
     return GeometricLab(
         settings,
         cameras,
         _calibrations(settings, cameras),
-        SmoothField.draw(
-            settings.floor_rms_m,
-            settings.floor_length_m,
-            FLOOR_M,
-            random_stream(lab.seed, Purpose.UNEVENNESS),
-        ),
-        {name: round(offset * NS_PER_S) for name, offset in zip(names, clocks.tolist(), strict=True)},
-        {name: round(delay * NS_PER_S) for name, delay in zip(names, delays_s, strict=True)},
-        _choose_points(settings, cameras),
+        floor,
+        clock_offsets_ns,
+        frame_delays_ns,
+        choose_points(lab, cameras, settings.points + settings.held_out_points),
         drive,
-        {
-            marker_id: SmoothSignal.draw(
-                np.radians(settings.wobble_deg),
-                settings.wobble_s,
-                lab.drive_s,
-                2,
-                random_stream(lab.seed, Purpose.WOBBLE, marker_id),
-            )
-            for marker_id in drive.ahead_s
-        },
+        dict(enumerate((lab.marker_length_m * scales).tolist())),
+        dict(enumerate(heights_m.tolist())),
+        {marker_id: _wobble(settings, marker_id) for marker_id in drive.ahead_s},
     )
+
+
+def _clocks(settings: GeometricSettings) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the clock offset and the delay of the frames of each camera, in ns."""
+    names, delays_s = settings.lab.cameras, settings.frame_delays_s
+    drawn = random_stream(settings.lab.seed, Purpose.CLOCK).uniform(-1, 1, len(names))
+    offsets_s = (drawn * settings.clock_offset_s).tolist()
+    offsets_ns = {name: round(offset_s * NS_PER_S) for name, offset_s in zip(names, offsets_s, strict=True)}
+    return offsets_ns, {name: round(delays_s[n % len(delays_s)] * NS_PER_S) for n, name in enumerate(names)}
+
+
+def _wobble(settings: GeometricSettings, marker_id: int) -> SmoothSignal:
+    rng = random_stream(settings.lab.seed, Purpose.WOBBLE, marker_id)
+    rms_rad = float(np.radians(settings.wobble_deg))
+    return SmoothSignal.draw(rms_rad, settings.wobble_s, settings.lab.drive_s, 2, rng)
 
 
 def _calibrations(settings: GeometricSettings, cameras: tuple[Camera, ...]) -> dict[str, CameraCalibration]:
@@ -257,89 +273,6 @@ def _calibration(
         K[:2, 2] += sigma.principal_point_px * lens.width / 1920 * drawn[1:3]
         D += np.array(sigma.distortion) * drawn[3:]
     return replace(lens, K=K, D=D, P=np.hstack([K, np.zeros((3, 1))]))
-
-
-def _choose_points(
-    settings: GeometricSettings, cameras: tuple[Camera, ...]
-) -> tuple[tuple[SimulatedPose, ...], ...]:
-    """Choose calibration points like the rendered lab: the next is for the camera with the fewest."""
-    lab, count = settings.lab, settings.points + settings.held_out_points
-    rng = random_stream(lab.seed, Purpose.PLACES)
-    seen: list[list[Array]] = [[] for _ in cameras]
-    sets: list[tuple[SimulatedPose, ...]] = []
-    while (left := count - sum(map(len, sets))) > 0:
-        taken: list[Array] = []
-        for marker_id in range(min(lab.markers, left)):
-            index = min(range(len(cameras)), key=lambda n: len(seen[n]))
-            pose = _choose_point(rng, settings, cameras, index, np.array(taken).reshape(-1, 4), seen[index])
-            if pose is None:
-                raise IpsysError(
-                    f"simulator: marker {marker_id} has no room beside {len(taken)} others in the view of "
-                    f"{cameras[index].name!r}; set fewer or smaller markers"
-                )
-            taken.append(pose)
-            for number, camera in enumerate(cameras):
-                if _whole(camera, pose[None], lab)[0]:
-                    seen[number].append(pose)
-        sets.append(tuple(SimulatedPose(n, *map(float, pose)) for n, pose in enumerate(taken)))
-    return tuple(sets)
-
-
-def _choose_point(
-    rng: np.random.Generator,
-    settings: GeometricSettings,
-    cameras: tuple[Camera, ...],
-    index: int,
-    taken: Array,
-    before: list[Array],
-) -> Array | None:
-    """Return x, y, height and heading of the candidate farthest from the points of a camera."""
-    lab, fitting = settings.lab, np.empty((0, 4))
-    for _ in range(_BATCHES):
-        poses = np.empty((_BATCH, 4))
-        poses[:, :2] = rng.uniform(0, FLOOR_M, (_BATCH, 2))
-        poses[:, 2] = rng.choice(lab.heights_m, _BATCH)
-        poses[:, 3] = rng.uniform(-np.pi, np.pi, _BATCH)
-        fits = (_tape_sine(poses) >= np.sin(np.radians(lab.tape_angle_deg))) & _whole(
-            cameras[index], poses, lab
-        )
-        for other in taken:
-            fits &= ~overlap(poses[:, :3], other[:3], cameras, lab)
-        fitting = np.vstack([fitting, poses[fits]])[:_CANDIDATES]
-        if len(fitting) == _CANDIDATES:
-            break
-    if not len(fitting):
-        return None
-    if not before:
-        return np.asarray(fitting[0])
-    apart_m = np.linalg.norm(fitting[:, None, :2] - np.array(before)[None, :, :2], axis=2).min(axis=1)
-    return np.asarray(fitting[apart_m.argmax()])
-
-
-def _tape_sine(poses: Array) -> Array:
-    to_a, to_b = (poses[:, :2] - [point.x_m, point.y_m] for point in REFERENCES)
-    cross = np.abs(to_a[:, 0] * to_b[:, 1] - to_a[:, 1] * to_b[:, 0])
-    sine: Array = cross / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
-    return sine
-
-
-def _whole(camera: Camera, poses: Array, lab: LabSettings) -> NDArray[np.bool_]:
-    """Return the poses (n, 4) whose print, with its white margin, is wholly in the image."""
-    side_m = _print_m(lab)
-    turn = poses[:, 3] - np.pi / 2
-    flat = marker_corners(side_m)[:, :2]
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    corners_m = np.empty((len(poses), 4, 3))
-    corners_m[..., 0] = poses[:, :1] + cos * flat[:, 0] - sin * flat[:, 1]
-    corners_m[..., 1] = poses[:, 1:2] + sin * flat[:, 0] + cos * flat[:, 1]
-    corners_m[..., 2] = poses[:, 2:3]
-    return np.asarray(sees(camera, corners_m.reshape(-1, 3)).reshape(-1, 4).all(axis=1))
-
-
-def _print_m(lab: LabSettings) -> float:
-    """Return the side of a print, with its white margin of one cell."""
-    cells = len(black_cells(lab.dictionary, 0))
-    return lab.marker_length_m * cells / (cells - 2)
 
 
 def camera_poses(camera: Camera, placed: PlacedMarkers) -> tuple[Array, Array]:

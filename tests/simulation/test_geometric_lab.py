@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,11 +15,17 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import pose_facing_up
 from ipsys_log.log.codec import encode
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Measurement, Message, Rig, Tracks
+from ipsys_log.messages.channels import MODEL
+from ipsys_log.pipeline import replay
 from ipsys_log.rig.file import check_rig
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.cameras import Camera
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session, simulate_sightings
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.geometric_sightings import simulate_sightings
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
@@ -102,14 +109,16 @@ def test_session_is_a_log_in_order_with_a_valid_rig() -> None:
     assert messages[-1].topic == "/runs/geometric/record"
     measured = [m.payload for m in messages if isinstance(m.payload, Measurement)]
     assert [m.splits for m in measured] == [("train",)] * 4
-    # Each camera has a sighting of a measured marker in its stationary interval, by its own clock.
+    # All five frames of a camera are in the stationary interval, by its own clock.
+    seen = sightings_of(messages)
     for measurement in measured:
         assert measurement.still is not None
-        assert any(
-            measurement.still.start <= time_ns <= measurement.still.end
-            for _, time_ns, marker_id in sightings_of(messages)
-            if marker_id == measurement.marker_id
-        )
+        frames = {camera: 0 for camera, _, _ in seen}
+        for camera, time_ns, marker_id in seen:
+            inside = measurement.still.start <= time_ns <= measurement.still.end
+            frames[camera] += inside and marker_id == measurement.marker_id
+        assert 5 in frames.values()
+        assert set(frames.values()) <= {0, 5}
 
 
 def test_equal_settings_give_equal_bytes_and_other_seeds_others() -> None:
@@ -200,6 +209,37 @@ def test_wobble_tilts_robots_by_the_stated_angle() -> None:
     assert still == pytest.approx(np.tile([0.0, 0.0, 1.0], (50, 1)), abs=1e-12)
 
 
+def test_prints_and_robots_differ_from_the_rig_by_their_sigmas() -> None:
+    varied = replace(SMALL, points=1, marker_scale_sigma=0.002, robot_height_sigma_m=0.001)
+    labs = [build_lab(replace(varied, lab=LabSettings(seed=seed, drive_s=0.0))) for seed in range(40)]
+    sides_m = np.array([[*lab.sides_m.values()] for lab in labs]).ravel()
+    heights_m = np.array([[*lab.robot_heights_m.values()] for lab in labs]).ravel()
+    assert (sides_m / 0.2 - 1).std() == pytest.approx(0.002, rel=0.3)
+    assert (heights_m - 0.1).std() == pytest.approx(0.001, rel=0.3)
+    assert abs(np.corrcoef(sides_m, heights_m)[0, 1]) < 0.4
+
+
+def test_markers_of_another_size_and_height_are_seen_as_such() -> None:
+    lab = build_lab(replace(SMALL, marker_scale_sigma=0.05, robot_height_sigma_m=0.02))
+    messages = list(simulate_session(lab))
+    truth = {m.publish_time_ns: m.payload for m in messages if isinstance(m.payload, Tracks)}
+    for (camera, time_ns, marker_id), marker in sightings_of(messages).items():
+        track = next(one for one in truth[time_ns].tracks if one.id == marker_id)
+        centre_m = np.array([track.x_m, track.y_m, track.z_m])
+        nominal_m = square_at(track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0)
+        corners_m = centre_m + lab.sides_m[marker_id] / 0.2 * (nominal_m - centre_m)
+        assert marker.corners_px == pytest.approx(by_opencv(lab.camera(camera), corners_m), abs=1e-6)
+    end = max(truth)
+    driving_m = {track.id: track.z_m for track in truth[end].tracks}
+    assert driving_m == pytest.approx(dict(lab.robot_heights_m))
+
+
+def test_held_out_points_have_the_split_test() -> None:
+    messages = simulate_session(build_lab(replace(SMALL, held_out_points=3)))
+    splits = [m.payload.splits for m in messages if isinstance(m.payload, Measurement)]
+    assert splits == [("train",)] * 4 + [("test",)] * 3
+
+
 def test_intrinsics_of_the_user_have_the_stated_errors() -> None:
     def lenses(kind: str) -> list[tuple[CameraCalibration, CameraCalibration]]:
         lab = build_lab(replace(SMALL, intrinsics=kind))
@@ -227,23 +267,16 @@ def test_tilted_cameras_still_see_their_part_of_the_floor() -> None:
         assert len(np.unique(sightings.placements[sightings.placements < 30])) >= 8
 
 
-def test_markers_of_a_session_can_be_fitted() -> None:
-    from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
-    from ipsys_log.messages import CameraPoints
-    from ipsys_log.stages.camera_frame import CameraFrame
-
-    messages, stage = list(simulate_session(build_lab(GeometricSettings(points=12)))), CameraFrame()
-    points = [
-        replace(message, payload=payload)
-        for message in messages
-        if isinstance(message.payload, (Rig, CameraCalibration, Markers))
-        for payload in stage(message)
-        if isinstance(payload, CameraPoints)
-    ]
-    pairs = build_pairs(gather_sightings(points), valid_measurements(messages, None))
-    assert {name: len(own) >= 4 for name, own in pairs.items()} == dict.fromkeys(
-        ("red", "white", "black"), True
-    )
+def test_a_written_session_can_be_fitted_without_images(tmp_path: Path) -> None:
+    path = tmp_path / "lab.mcap"
+    write_log(path, simulate_session(build_lab(GeometricSettings(points=18))))
+    outcomes = replay([path], Request(models=("rayplane",)), until="fit")
+    assert [(one.stage, one.run) for one in outcomes] == [("camera-frame", "geometric"), ("fit", "rayplane")]
+    with Session([path]) as session:
+        (message,) = session.messages(session.topics(MODEL, "rayplane"))
+    pairs = {camera.camera: len(camera.pairs) for camera in message.payload.cameras}
+    assert set(pairs) == {"red", "white", "black"}
+    assert min(pairs.values()) >= 6
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.robust import limit_of, robust_loss
+from ipsys_log.joint.trajectories import Kind
 
 __all__ = ["Finding", "Reading", "find_faults", "standardise_readings"]
 
@@ -244,7 +245,7 @@ def _wrong_sightings(fit: JointFit) -> list[Finding]:
             body = observations.bodies[int(factors.sightings.body[row])].name
             where = (
                 f"at {factors.sightings.times_s[row]:.2f} s"
-                if factors.moving
+                if factors.kind is not Kind.STATIONARY
                 else f"at point {observations.points[int(factors.trajectory[row])].name}"
             )
             text = (

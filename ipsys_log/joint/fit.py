@@ -20,7 +20,7 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import Solution, solve
 from ipsys_log.joint.start import PlacedCamera, place_cameras
-from ipsys_log.joint.trajectories import Trajectories
+from ipsys_log.joint.trajectories import Kind, Trajectories
 
 __all__ = ["JointFit", "fit_jointly"]
 
@@ -107,10 +107,10 @@ def _build(
     layout = make_layout(observations, settings, _floor(placed, settings), len(paths) > 0)
     factors = []
     for camera, (sightings, path) in enumerate(zip(observations.sightings, numbers, strict=True)):
-        for moving, rows in enumerate((sightings.point >= 0, path >= 0)):
+        for kind, trajectory in ((Kind.STATIONARY, sightings.point), (Kind.FLOOR, path)):
+            rows = trajectory >= 0
             if rows.any():
-                trajectory = path[rows] if moving else sightings.point[rows]
-                own = sightings.select(rows), trajectory, bool(moving)
+                own = sightings.select(rows), trajectory[rows], kind
                 factors.append(
                     make_sighting_factors(camera, *own, observations.bodies, settings.corner_floor_px)
                 )

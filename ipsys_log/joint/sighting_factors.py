@@ -13,7 +13,7 @@ from ipsys_log.joint.observations import Body, Sightings
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.rotations import cross
-from ipsys_log.joint.trajectories import Placement, Trajectories
+from ipsys_log.joint.trajectories import Kind, Placement, Trajectories
 
 __all__ = ["SightingFactors", "Slopes", "WeightedRows", "make_sighting_factors"]
 
@@ -22,6 +22,7 @@ Indices = NDArray[np.intp]
 
 # A covariance of lower rank has no noise in some directions, because a fitted pose removed it there.
 _NO_VARIANCE = 1e-4
+_SQUARE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,15 +59,17 @@ class WeightedRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SightingFactors:
-    """Sightings of one camera, of bodies that are all stationary or all move.
+    """Sightings of one camera, of bodies on trajectories of one kind.
 
     Attributes
     ----------
     camera : index of the camera.
     sightings : the n sightings, of p points each.
     trajectory : (n,), index of the stationary pose or of the path.
-    moving : whether the bodies move.
+    kind : kind of the trajectories.
     points_m : (n, p, 3), the points in body coordinates, at their nominal size.
+    pixels, rows : (n, p, 2) and (n, p), the measured points, and their rows. A point that is not visible has
+        the mean of the others, and no weight.
     inward : (n, p, 2), motion of a point in the image by an edge offset of 1 px.
     variances : (n, 2 p, 2 p), covariances with the repeatable part of the errors.
     whitening : (n, 2 p, 2 p), matrices that turn residuals into numbers of variance 1.
@@ -75,25 +78,29 @@ class SightingFactors:
     camera: int
     sightings: Sightings
     trajectory: Indices
-    moving: bool
+    kind: Kind
     points_m: Array
+    pixels: Array
+    rows: Array
     inward: Array
     variances: Array
     whitening: Array
 
     @property
-    def limit(self) -> float:
-        """The largest chi2 of a normal error."""
-        return float(limit_of(2.0 * self.points_m.shape[1]))
+    def limit(self) -> Array:
+        """The largest chi2 of a normal error, (n,)."""
+        visible = np.isfinite(self.sightings.pixels[:, :, 0]).sum(axis=1)
+        return np.asarray(limit_of(2.0 * visible))
 
     def place(self, state: State, layout: Layout, trajectories: Trajectories) -> Placement:
         """Return the poses of the bodies at the instants of the sightings."""
-        if not self.moving:
+        if self.kind is Kind.STATIONARY:
             return trajectories.place_stationary(self.trajectory, state)
         edge = layout.cameras[self.camera].edge
         clock_s, row_s = state.values[edge + 1 : edge + 3]
-        rows = self.sightings.pixels[:, :, 1].mean(axis=1)
-        times_s = self.sightings.times_s + clock_s + row_s * rows
+        times_s = self.sightings.times_s + clock_s + row_s * self.rows.mean(axis=1)
+        if self.kind is Kind.FREE:
+            return trajectories.place_free(self.trajectory, times_s, state)
         return trajectories.place_moving(self.trajectory, times_s, state, layout)
 
     def residuals(self, state: State, layout: Layout, trajectories: Trajectories) -> Array:
@@ -149,7 +156,7 @@ class SightingFactors:
         """Return the global unknowns (u,) of these factors, less the modes of the floor."""
         block, bodies = layout.cameras[self.camera], np.unique(self.sightings.body)
         parts = [np.arange(block.start, block.stop), layout.scales.start + bodies]
-        return np.concatenate([*parts, layout.heights.start + bodies] if self.moving else parts)
+        return np.concatenate([*parts, layout.heights.start + bodies] if self.kind is Kind.FLOOR else parts)
 
     def slopes(self, place: Placement, state: State, layout: Layout) -> Slopes:
         """Return the pixels of the points, and their derivatives."""
@@ -170,7 +177,8 @@ class SightingFactors:
         by_global[..., edge] = self.inward
         if place.velocities is not None:
             by_global[..., edge + 1] = by_time = (by_pose * place.velocities[:, None, None]).sum(axis=3)
-            by_global[..., edge + 2] = by_time * self.sightings.pixels[:, :, None, 1]
+            by_global[..., edge + 2] = by_time * self.rows[:, :, None]
+        if self.kind is Kind.FLOOR:
             by_global[np.arange(count), ..., edge + 3 + len(bodies) + which] = by_world[..., 2]
         sizes = state.values[layout.scales][self.sightings.body][:, None, None]
         by_size = (by_world * (arms_m / sizes)[:, :, None]).sum(axis=3)
@@ -194,8 +202,7 @@ class SightingFactors:
         block = layout.cameras[self.camera]
         row_s = state.values[block.edge + 2]
         if place.velocities is not None and row_s:
-            rows = self.sightings.pixels[:, :, 1]
-            later_s = row_s * (rows - rows.mean(axis=1, keepdims=True))
+            later_s = row_s * (self.rows - self.rows.mean(axis=1, keepdims=True))
             speeds = place.velocities[:, None, :3] + cross(place.velocities[:, None, 3:], arms_m)
             points_m = points_m + later_s[:, :, None] * speeds
         origin_m = state.values[block.start + 3 : block.start + 6]
@@ -203,7 +210,7 @@ class SightingFactors:
 
     def _whiten(self, pixels: Array, edge_px: float) -> Array:
         count, size = self.points_m.shape[:2]
-        misses = pixels.reshape(count, size, 2) + edge_px * self.inward - self.sightings.pixels
+        misses = pixels.reshape(count, size, 2) + edge_px * self.inward - self.pixels
         return np.asarray((self.whitening @ misses.reshape(count, 2 * size, 1))[:, :, 0])
 
 
@@ -211,23 +218,29 @@ def make_sighting_factors(
     camera: int,
     sightings: Sightings,
     trajectory: Indices,
-    moving: bool,
+    kind: Kind,
     bodies: tuple[Body, ...],
     floor_px: float,
 ) -> SightingFactors:
     """Return the factors of sightings; ``floor_px`` is the repeatable part of the error of a point."""
-    points_m = np.stack([bodies[body].points_m for body in sightings.body.tolist()])
-    variances = _fill(sightings.covariances_px2)
-    variances = variances + floor_px**2 * np.eye(variances.shape[1])
+    visible: NDArray[np.bool_] = np.isfinite(sightings.pixels[:, :, 0])
+    size = visible.shape[1]
+    means = np.where(visible[:, :, None], sightings.pixels, 0.0).sum(axis=1) / visible.sum(axis=1)[:, None]
+    pixels = np.where(visible[:, :, None], sightings.pixels, means[:, None])
+    variances = _fill(sightings.covariances_px2) if size == _SQUARE else sightings.covariances_px2
+    variances = variances + floor_px**2 * np.eye(2 * size)
+    whitening = _whitening(variances) * np.repeat(visible, 2, axis=1)[:, :, None]
     return SightingFactors(
         camera,
         sightings,
         trajectory,
-        moving,
-        points_m,
-        _inward(sightings.pixels),
+        kind,
+        np.stack([bodies[body].points_m for body in sightings.body.tolist()]),
+        pixels,
+        pixels[:, :, 1],
+        _inward(pixels),
         variances,
-        _whitening(variances),
+        whitening,
     )
 
 
@@ -250,7 +263,7 @@ def _inward(pixels: Array) -> Array:
     The directions of the measured edges are used, so that the motion is a constant. Bodies that are not
     squares have no edges.
     """
-    if pixels.shape[1] != 4:
+    if pixels.shape[1] != _SQUARE:
         return np.zeros_like(pixels)
     after, before = (np.roll(pixels, shift, axis=1) - pixels for shift in (-1, 1))
     units = [side / np.linalg.norm(side, axis=2, keepdims=True) for side in (after, before)]

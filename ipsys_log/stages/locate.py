@@ -13,6 +13,7 @@ from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Positi
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, POSITIONS, RIG
 from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
 from ipsys_log.models.table import AppliedModel, reads_height
+from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
 
 __all__ = ["STAGE", "Locate"]
 
@@ -43,7 +44,9 @@ class Locate:
         if applied is not None:
             points = message.payload.points
             heights_m = np.array([self._height(point.id) for point in points])
-            yield Positions(message.publish_time_ns, _positions(applied, points, heights_m) if points else ())
+            sigmas_m = np.array([self._height_sigma(point.id) for point in points])
+            positions = _positions(applied, points, heights_m, sigmas_m) if points else ()
+            yield Positions(message.publish_time_ns, positions)
 
     def _height(self, marker_id: int) -> float:
         if not reads_height(self._name):
@@ -56,11 +59,18 @@ class Locate:
             )
         return height_m
 
+    def _height_sigma(self, marker_id: int) -> float:
+        sigma_m = self._rig.height_sigma_of(marker_id) if self._rig else None
+        return HEIGHT_SIGMA_M if sigma_m is None else sigma_m
+
 
 def _positions(
-    applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array
+    applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array, height_sigmas_m: Array
 ) -> tuple[Position, ...]:
-    """Return the positions of the markers; a marker whose ray does not meet its height has none."""
+    """Return the positions of the markers; a marker whose ray does not meet its height has none.
+
+    A marker whose depth contradicts its height is not inside: its position is valid at that height only.
+    """
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
     # The model maps a second point, a little along the heading: the two points give the world heading.
     angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
@@ -68,9 +78,12 @@ def _positions(
     both = applied.predict(np.vstack([points_m, ahead]), np.concatenate([heights_m, heights_m]))
     world, along = both[: len(points)], both[len(points) :] - both[: len(points)]
     headings = np.arctan2(along[:, 1], along[:, 0]).tolist()
-    covariances = applied.covariances(points_m, heights_m)
+    covariances = applied.covariances(points_m, heights_m, height_sigmas_m)
     sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
     inside = applied.inside(points_m, world, sigmas_m)
+    if inside is not None:
+        depth_sigmas_m = np.sqrt([0.0 if p.covariance_m2 is None else p.covariance_m2[2, 2] for p in points])
+        inside &= applied.at_height(points_m, world, height_sigmas_m, depth_sigmas_m)
     return tuple(
         Position(
             point.id,
@@ -99,10 +112,14 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
 
 STAGE = Stage(
     name="locate",
-    versions={"locate": 1},
+    versions={"locate": 2},
     reads=(RIG, CAMERA_POINTS, MODEL),
     writes=(POSITIONS,),
     plan=_plan,
-    rig_part=lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),
+    rig_part=lambda rig: (
+        rig.marker_height_m,
+        rig.marker_height_sigma_m,
+        {(m.id, m.height_m, m.height_sigma_m) for m in rig.markers},
+    ),
     method=model_read,
 )

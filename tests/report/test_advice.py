@@ -174,8 +174,8 @@ def test_large_error_of_few_points_is_explained(paper: Findings) -> None:
     assert paper.advice is not None
     found = re.fullmatch(
         r"The error of poly with 10 points, (\d+) cm, is no fault of the lab: poly has 10 coefficients for "
-        r"each coordinate, so it passes through 10 points with their errors and is wrong between and beyond them. "
-        r"With 40 points, it is ([\d.]+) cm.",
+        r"each coordinate, so it passes through 10 points with their errors and is wrong between and beyond "
+        r"them. With 40 points, it is ([\d.]+) cm.",
         paper.advice.sentences[-1],
     )
     assert found is not None, paper.advice.sentences

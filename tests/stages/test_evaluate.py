@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from ipsys_log.analysis.accuracy import POOLED, error_statistics, evaluate_cross_validated, evaluate_held_out
+from ipsys_log.analysis.camera_models import height_sigmas
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
     gather_points,
@@ -356,6 +357,13 @@ def test_covariance_includes_most_of_a_model_misfit() -> None:
     within_68, within_95 = regions("rigid", 0.0004, range(40))
     assert 0.55 <= within_68 <= 0.76
     assert 0.80 <= within_95 <= 0.98
+
+
+def test_sigma_of_a_measured_height_is_that_of_its_ruler() -> None:
+    world = labs.places(np.random.default_rng(0), 3)
+    seen = labs.pairs(world, world, labs.tape_covariances(world, 0.001, 0.005))
+    np.testing.assert_allclose(height_sigmas(seen), 0.005)
+    np.testing.assert_allclose(height_sigmas([replace(seen[0], world_covariance_m2=None)]), 0.0005)
 
 
 @pytest.mark.parametrize("ruler_m", [0.001, 0.005])

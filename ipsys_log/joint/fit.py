@@ -121,6 +121,7 @@ def _build(
     values = layout.mean.copy()
     for block, camera_pose in zip(layout.cameras, placed, strict=True):
         values[block.start + 3 : block.start + 6] = camera_pose.origin_m
+        values[block.lens][4:] = camera_pose.lens.D
     turns = np.stack([camera_pose.camera_from_world for camera_pose in placed])
     positions_m, headings_rad = _point_starts(observations, placed)
     state = State(values, turns, positions_m, level_turns(headings_rad), knots)

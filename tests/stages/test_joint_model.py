@@ -8,12 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Markers, Message, Run, Tracks
-from ipsys_log.messages.channels import MODEL
+from ipsys_log.messages import TRUTH_TOPIC, Markers, Message, Run, Tracks
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
@@ -55,29 +52,21 @@ def log(calibration: Path, tmp_path: Path) -> Path:
     return path
 
 
-def errors_m(log: Path, run: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the errors on the floor of the tracks of a run, at the instants of the ground truth."""
-    with Session([log]) as session:
-        truth = {t.timestamp: t for t in session.payloads(["/truth/tracks"])}
-        offsets = [
-            np.hypot(track.x_m - true.x_m, track.y_m - true.y_m)
-            for tracks in session.payloads([f"/runs/{run}/tracks"])
-            for true in (truth[tracks.timestamp].tracks if tracks.timestamp in truth else ())
-            for track in tracks.tracks
-            if track.id == true.id and track.inside
-        ]
-    assert len(offsets) > 100
-    return np.array(offsets)
+def replay(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
+    """Return the models in the JSON of a replay."""
+    done = ipsys("replay", *arguments, "--json")
+    assert done.code == 0, done.err
+    models: dict[str, Any] = json.loads(done.out)["models"]
+    return models
 
 
 def test_joint_model_halves_the_error_of_rayplane(ipsys: Ipsys, log: Path) -> None:
-    done = ipsys("replay", log, "--model", "joint", "--model", "rayplane", "--json")
-    assert done.code == 0, done.err
-    models = json.loads(done.out)["models"]
+    models = replay(ipsys, log, "--model", "joint", "--model", "rayplane")
     truth = {name: model["pooled"]["truth"]["2d"]["mean_cm"] for name, model in models.items()}
+    tracks = {name: model["tracks"]["truth"]["2d"]["mean_cm"] for name, model in models.items()}
     assert truth["joint"] < 0.6 * truth["rayplane"]
-    assert errors_m(log, "joint").mean() < 0.6 * errors_m(log, "rayplane").mean()
-    assert errors_m(log, "joint").mean() < 0.0015
+    assert tracks["joint"] < 0.6 * tracks["rayplane"]
+    assert tracks["joint"] < 0.15
 
 
 def test_replay_of_the_joint_model_gives_the_same_bytes(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
@@ -89,21 +78,24 @@ def test_replay_of_the_joint_model_gives_the_same_bytes(ipsys: Ipsys, log: Path,
     assert verified.code == 0, verified.out + verified.err
 
 
-def test_drive_after_the_points_determines_the_lenses(ipsys: Ipsys, tmp_path: Path) -> None:
-    points = list(simulate_session(lab(6, 0.0, intrinsics="nominal")))
-    drive = [m for m in hour_later(simulate_session(lab(0, 40.0, intrinsics="nominal"))) if m.camera]
-    sigmas = []
-    for name, messages in {"points": points, "both": [*points, *drive]}.items():
-        log = tmp_path / f"{name}.mcap"
-        write_log(log, [m for m in messages if m in points or "/markers" in m.topic])
-        done = ipsys("fit", log, "--model", "joint")
-        assert done.code == 0, done.err
-        with Session([log]) as session:
-            (model,) = session.payloads(session.topics(MODEL, "joint"))
-        arrays = [{p.name: p.values.reshape(p.shape) for p in camera.parameters} for camera in model.cameras]
-        # The first row of the intrinsics is the focal length.
-        sigmas.append(max(float(np.linalg.norm(array["modes"][6])) for array in arrays))
-    assert sigmas[1] < 0.3 * sigmas[0]
+@pytest.mark.slow
+def test_drive_after_the_points_halves_the_error(ipsys: Ipsys, tmp_path: Path) -> None:
+    points, both = tmp_path / "points.mcap", tmp_path / "both.mcap"
+    measured = list(simulate_session(lab(6, 0.0)))
+    drive = [
+        m
+        for m in hour_later(simulate_session(lab(0, 40.0)))
+        if "/markers" in m.topic or m.topic == TRUTH_TOPIC
+    ]
+    write_log(points, measured)
+    write_log(both, [*measured, *drive])
+    assert ipsys("fit", points, "--model", "joint").code == 0
+    before = ["-o", tmp_path / "before.mcap", "--model-from", points]
+    errors_cm = [
+        replay(ipsys, both, "--model", "joint", *more)["joint"]["tracks"]["truth"]["2d"]["mean_cm"]
+        for more in (before, [])
+    ]
+    assert errors_cm[1] < 0.5 * errors_cm[0]
 
 
 def test_log_with_camera_points_only_is_refused(ipsys: Ipsys, tmp_path: Path, data: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 
 from ipsys_log.analysis.calibration_points import find_pairs, measured
 from ipsys_log.errors import FitError
+from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.observations import Observations
@@ -61,11 +62,31 @@ def fit_without(
     )
 
 
-def fit_joint_model(view: StageView, train: Collection[str], time_ns: int, progress: Progress) -> Model:
-    """Fit the joint model of a log to the calibration points ``train`` and to all drives."""
+# More remarks on probable faults hide the first ones, which often cause the others.
+_MOST_FAULTS = 10
+
+
+def fit_joint_model(
+    view: StageView, train: Collection[str], time_ns: int, notes: list[str], progress: Progress
+) -> Model:
+    """Fit the joint model of a log to the calibration points ``train`` and to all drives.
+
+    Probable faults of the observations, and cameras without a model, go to ``notes``.
+    """
     points = measured(view)
     left_out = {point.measurement.id for point in points} - set(train)
-    fit = fit_without(observe(view), left_out, progress)
+    observations = observe(view)
+    fit = fit_without(observations, left_out, progress)
+    fitted = {camera.name for camera in fit.observations.cameras}
+    notes.extend(
+        f"camera {camera.name} saw no calibration point and no robot: it has no model"
+        for camera in observations.cameras
+        if camera.name not in fitted
+    )
+    faults = [fault.text for fault in find_faults(fit)]
+    notes.extend(faults[:_MOST_FAULTS])
+    if len(faults) > _MOST_FAULTS:
+        notes.append(f"{len(faults) - _MOST_FAULTS} more probable faults; correct the first ones")
     pairs = {
         camera: [pair for pair in seen if pair.measurement in train]
         for camera, seen in find_pairs(view, points).items()

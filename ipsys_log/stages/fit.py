@@ -160,11 +160,15 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
 
 def _plan_joint(view: StageView, options: Mapping[str, str], parameters: Mapping[str, str]) -> Plan:
+    notes: list[str] = []
+
     def compute(progress: Progress) -> Model:
         train, _ = split_ids([point.measurement for point in measured(view)], options)
-        return fit_joint_model(view, train, view.last_ns(*READS), progress)
+        return fit_joint_model(view, train, view.last_ns(*READS), notes, progress)
 
-    return Plan(run=model_run(parameters["model"]), parameters=parameters, reads=READS, compute=compute)
+    return Plan(
+        run=model_run(parameters["model"]), parameters=parameters, reads=READS, compute=compute, notes=notes
+    )
 
 
 def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:

@@ -15,7 +15,7 @@ from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.rotations import cross
 from ipsys_log.joint.trajectories import Placement, Trajectories
 
-__all__ = ["SightingFactors", "Slopes", "make_sighting_factors"]
+__all__ = ["SightingFactors", "Slopes", "WeightedRows", "make_sighting_factors"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -31,6 +31,29 @@ class Slopes:
     pixels: Array
     by_pose: Array
     by_global: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeightedRows:
+    """Weighted residuals of n sightings, and their derivatives.
+
+    Attributes
+    ----------
+    loss : the sum of the robust losses.
+    residuals : (n, 2 p).
+    starts, by_local : (n,), first local unknown of each sighting; (n, 2 p, k), by k local unknowns.
+    by_global : (n, 2 p, u), by the unknowns of :meth:`SightingFactors.columns`.
+    by_height, modes : (n, 2 p) and (n, m); their product is the derivative by the modes of the floor below
+        moving bodies. None for stationary bodies.
+    """
+
+    loss: float
+    residuals: Array
+    starts: Indices
+    by_local: Array
+    by_global: Array
+    by_height: Array
+    modes: Array | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,30 +107,43 @@ class SightingFactors:
         self, normal: NormalEquations, state: State, layout: Layout, trajectories: Trajectories, ease: float
     ) -> None:
         """Add the weighted factors to normal equations; ``ease`` multiplies the limit of the loss."""
+        rows = self.weighted_rows(state, layout, trajectories, ease)
+        normal.cost += rows.loss / 2
+        columns = self.columns(layout)
+        normal.add_local(rows.starts, rows.by_local, rows.residuals)
+        normal.add_mixed(rows.starts, rows.by_local, columns, rows.by_global)
+        normal.add_global(columns, rows.by_global, rows.residuals)
+        if rows.modes is not None and layout.floor.count:
+            by_height = rows.by_height
+            modes = np.arange(layout.modes.start, layout.modes.stop)
+            by_knots = (rows.by_local * by_height[:, :, None]).sum(axis=1)[:, None]
+            normal.add_mixed(rows.starts, by_knots, layout.modes, rows.modes[:, None])
+            across = (rows.by_global * by_height[:, :, None]).sum(axis=1)
+            normal.add_global_block(columns, modes, across.T @ rows.modes)
+            strengths = (by_height**2).sum(axis=1)[:, None]
+            normal.dense[np.ix_(modes, modes)] += (rows.modes * strengths).T @ rows.modes
+            normal.global_gradient[modes] += (by_height * rows.residuals).sum(axis=1) @ rows.modes
+
+    def weighted_rows(
+        self, state: State, layout: Layout, trajectories: Trajectories, ease: float = 1.0
+    ) -> WeightedRows:
+        """Return the whitened residuals with the weights of the robust loss, and their derivatives."""
         place = self.place(state, layout, trajectories)
         slopes = self.slopes(place, state, layout)
         residuals = self._whiten(slopes.pixels, state.values[layout.cameras[self.camera].edge])
         loss, weights = robust_loss((residuals**2).sum(axis=1), self.limit * ease)
-        normal.cost += float(loss.sum()) / 2
         roots = np.sqrt(weights)
-        residuals = residuals * roots[:, None]
         weighing = self.whitening * roots[:, None, None]
-        by_pose, by_global = weighing @ slopes.by_pose, weighing @ slopes.by_global
-        columns = self.columns(layout)
-        local = by_pose if place.slopes is None else by_pose @ place.slopes
-        normal.add_local(place.starts, local, residuals)
-        normal.add_mixed(place.starts, local, columns, by_global)
-        normal.add_global(columns, by_global, residuals)
-        if place.modes is not None and layout.floor.count:
-            by_height = by_pose[:, :, 2]
-            modes = np.arange(layout.modes.start, layout.modes.stop)
-            by_knots = (local * by_height[:, :, None]).sum(axis=1)[:, None]
-            normal.add_mixed(place.starts, by_knots, modes, place.modes[:, None])
-            across = (by_global * by_height[:, :, None]).sum(axis=1)
-            normal.add_global_block(columns, modes, across.T @ place.modes)
-            strengths = (by_height**2).sum(axis=1)[:, None]
-            normal.dense[np.ix_(modes, modes)] += (place.modes * strengths).T @ place.modes
-            normal.global_gradient[modes] += (by_height * residuals).sum(axis=1) @ place.modes
+        by_pose = weighing @ slopes.by_pose
+        return WeightedRows(
+            float(loss.sum()),
+            residuals * roots[:, None],
+            place.starts,
+            by_pose if place.slopes is None else by_pose @ place.slopes,
+            weighing @ slopes.by_global,
+            by_pose[:, :, 2],
+            place.modes,
+        )
 
     def columns(self, layout: Layout) -> Indices:
         """Return the global unknowns (u,) of these factors, less the modes of the floor."""

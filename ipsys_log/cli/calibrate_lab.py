@@ -230,7 +230,11 @@ def _mm(length_m: float) -> str:
 def _headline(lab: LabCalibration) -> Iterator[str]:
     """Yield the answer in one line, and the probable faults, which come before all figures."""
     worst = lab.worst
-    if lab.is_enough:
+    if lab.causes:
+        yield "Not enough: correct the faults of the observations first."
+    elif lab.missing:
+        yield f"Not enough: camera {', '.join(lab.missing)} has no model."
+    elif lab.is_enough:
         yield f"Enough: the expected mean error of each camera is {_mm(worst.mean_m)} mm or less."
     else:
         yield (
@@ -328,6 +332,7 @@ def _as_json(lab: LabCalibration) -> dict[str, Any]:
         "marker_height_m": lab.height_m,
         "calibration_points": len(lab.points_m),
         "cameras": cameras,
+        "missing": list(lab.missing),
         "faults": [
             {"kind": f.kind, "subject": f.subject, "score": f.score, "text": f.text} for f in lab.faults
         ],

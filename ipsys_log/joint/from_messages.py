@@ -23,12 +23,14 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Rig
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["gather_observations"]
+__all__ = ["ON_REFERENCE_SIGMA_M", "gather_observations"]
 
 Array = NDArray[np.float64]
 
 _USUAL_TAPE_M = 0.003
 _USUAL_RULER_M = 0.001
+# A marker that is laid onto a reference point is this near to it, along each axis.
+ON_REFERENCE_SIGMA_M = 0.001
 # A marker that lies on the floor needs no ruler. This is the thickness of its paper.
 _ON_FLOOR_M = 0.0003
 # Corners without a covariance come from a method whose errors repeat in all images.
@@ -175,9 +177,14 @@ def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
     ranges_m = np.array([d.distance_m for d in distances], dtype=np.float64)
     sigmas_m = np.array([d.sigma_m or usual_m for d in distances], dtype=np.float64)
     given = np.array([entered.x_m, entered.y_m]) if entered is not None else None
+    given_m = usual_m
+    if given is None and len(distances) == 1 and distances[0].distance_m == 0:
+        # At a distance of 0, only a point determines both coordinates: a distance has no direction there.
+        given, given_m = references_m[0], distances[0].sigma_m or ON_REFERENCE_SIGMA_M
+        references_m, ranges_m, sigmas_m = references_m[:0], ranges_m[:0], sigmas_m[:0]
     start_m = given if given is not None else _start(references_m, ranges_m, sigmas_m, measurement.side)
     height_m = measurement.height_m if entered is None else entered.z_m
-    placed = given is not None and len(distances) < 2
+    placed = given is not None and len(ranges_m) < 2
     return CalibrationPoint(
         measurement.id,
         body,
@@ -186,7 +193,7 @@ def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
         sigmas_m,
         start_m,
         given if placed else None,
-        usual_m**2 * np.eye(2) if placed else None,
+        given_m**2 * np.eye(2) if placed else None,
         height_m,
         _ON_FLOOR_M if height_m == 0 else measurement.height_sigma_m or _USUAL_RULER_M,
     )

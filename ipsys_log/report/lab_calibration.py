@@ -44,6 +44,8 @@ _USUAL_TAPE_M = 0.003
 _MOST_POINTS = 4
 # A gap is worth a drive if its mean expected error exceeds the goal, and this multiple of the camera's mean.
 _WORSE = 1.1
+# Kinds of faults after which the covariance of the fit is not true. The robust loss removes the others.
+_CAUSES = ("camera", "length", "robot_height")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +105,7 @@ class LabCalibration:
     points : points to tape next, with their effect; empty if the goal is reached.
     gap : the part of the floor that a robot should cross; None if none is needed.
     faults : probable faults of the observations.
+    missing : cameras of the log without a model, because they saw no marker of the fit.
     notes : remarks.
     """
 
@@ -116,6 +119,7 @@ class LabCalibration:
     points: tuple[TapedPoint, ...]
     gap: FloorGap | None
     faults: tuple[Finding, ...]
+    missing: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
@@ -137,9 +141,14 @@ class LabCalibration:
         )
 
     @property
+    def causes(self) -> tuple[Finding, ...]:
+        """The faults that make all figures untrue: wrong sizes and heights of markers, and moved cameras."""
+        return tuple(fault for fault in self.faults if fault.kind in _CAUSES)
+
+    @property
     def is_enough(self) -> bool:
-        """True if the mean expected error of every camera is at most the goal."""
-        return self.worst.mean_m <= self.goal_m
+        """True if every camera of the log has a model, with a mean expected error of at most the goal."""
+        return self.worst.mean_m <= self.goal_m and not self.missing and not self.causes
 
     def _errors_m(self) -> Array:
         return np.concatenate([camera.expected.errors_m for camera in self.cameras])
@@ -175,7 +184,8 @@ def describe_lab(
     view = LogView(session, _inputs(session, run), *given)
     points = [point.measurement for point in measured(view)]
     used, _ = split_ids(points, {"train": train})
-    fit = fit_without(observe(view), {point.id for point in points} - used, progress)
+    observations = observe(view)
+    fit = fit_without(observations, {point.id for point in points} - used, progress)
     models = build_models(fit)
     sizes_px = {camera: (lenses[camera].width, lenses[camera].height) for camera in models}
     places_m = _places(fit, models)
@@ -205,10 +215,11 @@ def describe_lab(
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,
     )
     points_m = fit.state.positions_m[:, :2]
-    notes = tuple(_notes(rig, cameras, len(points_m)))
+    missing = tuple(sorted({camera.name for camera in observations.cameras} - models.keys()))
+    notes = tuple(_notes(rig, cameras, missing, len(points_m)))
     faults = tuple(find_faults(fit))
     return LabCalibration(
-        run, rig, goal_m, cameras, grid, height_m, points_m, tuple(taped), gap, faults, notes
+        run, rig, goal_m, cameras, grid, height_m, points_m, tuple(taped), gap, faults, missing, notes
     )
 
 
@@ -319,10 +330,12 @@ def _tape(rig: Rig) -> TapeCovariances:
     return covariances
 
 
-def _notes(rig: Rig, cameras: Sequence[CameraResult], points: int) -> Iterator[str]:
-    seen = {camera.camera for camera in cameras}
-    for name in sorted({camera.name for camera in rig.cameras} - seen):
+def _notes(rig: Rig, cameras: Sequence[CameraResult], missing: Sequence[str], points: int) -> Iterator[str]:
+    for name in missing:
         yield f"camera {name} saw no marker of the fit: it has no model; drive through its field of view"
+    seen = {*missing, *(camera.camera for camera in cameras)}
+    for name in sorted({camera.name for camera in rig.cameras} - seen):
+        yield f"camera {name} of the rig is not in the log: it has no model"
     nominal = [camera.camera for camera in cameras if camera.nominal]
     if nominal:
         yield (

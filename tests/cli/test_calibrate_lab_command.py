@@ -27,7 +27,7 @@ from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
 
 # Smaller than a real session: the fit takes about two seconds.
-SETTINGS = GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=25.0, drive_laps=1, seed=3), points=6)
+SETTINGS = GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=25.0, seed=3), points=6)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_the_answer_is_first_and_fits_into_80_columns(
     assert lines[0].endswith("; the goal is 1 mm.")
     # Only advice may be longer: the terminal wraps it between words.
     assert max(len(line) for line in lines if not line.startswith(("Drive", "Tape", "Then"))) <= 80
-    assert [line.split()[0] for line in lines[3:7]] == ["black", "red", "white", "all"]
+    assert [line.split()[0] for line in lines[4:8]] == ["black", "red", "white", "all"]
     assert any(line.startswith("Tape a point near x ") for line in lines)
     done = ipsys("calibrate-lab", fitted, "--goal-mm", "20")
     assert done.out.startswith("Enough: the expected mean error of each camera is ")
@@ -186,8 +186,8 @@ def test_a_wrong_reading_is_named_first(ipsys: Ipsys, lab: GeometricLab, tmp_pat
         if not isinstance(payload, Measurement) or payload.id != "s002":
             return message
         first, second = payload.distances
-        longer = replace(first, distance_m=first.distance_m + 0.1)
-        return replace(message, payload=replace(payload, distances=(longer, second)))
+        shorter = replace(first, distance_m=first.distance_m - 0.1)
+        return replace(message, payload=replace(payload, distances=(shorter, second)))
 
     log = changed(lab, tmp_path / "wrong.mcap", wrong)
     done = ipsys("calibrate-lab", log)
@@ -231,9 +231,7 @@ def test_markers_on_two_reference_points_replace_the_tape(
         if not isinstance(message.payload, Measurement):
             return message
         on_it = (Distance(next(names), 0.0),)
-        return replace(
-            message, payload=replace(message.payload, distances=on_it, side=None, height_m=0.0)
-        )
+        return replace(message, payload=replace(message.payload, distances=on_it, side=None, height_m=0.0))
 
     log = changed(placed, tmp_path / "placed.mcap", on_reference)
     answer = described(ipsys, log, "--goal-mm", "3")
@@ -274,6 +272,8 @@ def test_a_camera_without_overlap_and_tape_is_refused(
 
     def apart(message: Message) -> Message:
         payload = message.payload
+        if isinstance(payload, Rig):
+            return replace(message, payload=replace(payload, markers=()))
         if isinstance(payload, Markers) and message.camera == "red":
             moved = tuple(replace(m, id=m.id + 6) for m in payload.markers)
             return replace(message, payload=replace(payload, markers=moved))
@@ -282,3 +282,15 @@ def test_a_camera_without_overlap_and_tape_is_refused(
     line = refused(ipsys, changed(lab, tmp_path / "apart.mcap", apart))
     assert "camera red" in line
     assert "drive a robot through the overlap" in line
+
+
+def test_a_camera_without_a_marker_is_not_enough(ipsys: Ipsys, lab: GeometricLab, tmp_path: Path) -> None:
+    def blind(message: Message) -> Message:
+        if isinstance(message.payload, Markers) and message.camera == "red":
+            return replace(message, payload=replace(message.payload, markers=()))
+        return message
+
+    log = changed(lab, tmp_path / "blind.mcap", blind)
+    done = ipsys("calibrate-lab", log, "--goal-mm", "50")
+    assert done.code == 0, done.err
+    assert done.out.startswith("Not enough: camera red has no model.")

@@ -9,8 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import crossing_angle, multilaterate, tape_covariance
-from ipsys_log.joint.from_messages import ON_REFERENCE_SIGMA_M
+from ipsys_log.geometry.trilateration import (
+    ON_REFERENCE_SIGMA_M,
+    crossing_angle,
+    multilaterate,
+    tape_covariance,
+)
 from ipsys_log.messages import Distance, Measurement, Rig
 from ipsys_log.units import CM_PER_M
 

@@ -14,7 +14,9 @@ from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
     Corners,
-    Logs,
+    Force,
+    Host,
+    Port,
     RigFile,
     cameras_of,
     load_calibrations,
@@ -24,14 +26,14 @@ from ipsys_log.cli.options import (
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from rich.table import Table
 
     from ipsys_log.messages import CameraCalibration, Rig
     from ipsys_log.report.lab_calibration import LabCalibration
 
-__all__ = ["add_commands"]
+__all__ = ["add_commands", "nominal_lenses"]
 
 # Largest goal that still means something, in mm.
 _MOST_GOAL_MM = 1000.0
@@ -61,7 +63,7 @@ Goal = Annotated[
 Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 Output = Annotated[
     Optional[Path],  # noqa: UP045
-    log_option(help="Write the results to a new log, not to the last LOG."),
+    log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
 ]
 Plot = Annotated[
     Path | None,
@@ -72,12 +74,33 @@ Plot = Annotated[
 ]
 
 
+Sources = Annotated[
+    Optional[list[Path]],  # noqa: UP045
+    typer.Argument(
+        help="Logs, read as one session. The last log gets the results. Without LOG: use the cameras of "
+        "--rig now.",
+        metavar="LOG",
+    ),
+]
+Seconds = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option(min=1.0, metavar="SECONDS", help="Without LOG: stop the cameras after this time."),
+]
+Terminal = Annotated[
+    bool,
+    typer.Option(
+        "--terminal",
+        help="Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
+    ),
+]
+
+
 def add_commands(app: typer.Typer) -> None:
     app.command("calibrate-lab")(calibrate_lab)
 
 
 def calibrate_lab(
-    logs: Logs,
+    logs: Sources = None,
     goal_mm: Goal = 3.0,
     focal: Focal = None,
     field_of_view: FieldOfView = None,
@@ -87,6 +110,11 @@ def calibrate_lab(
     corners: Corners = None,
     output: Output = None,
     plot: Plot = None,
+    seconds: Seconds = None,
+    terminal: Terminal = False,
+    host: Host = None,
+    port: Port = 8000,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate all cameras of a lab together, from drives of robots and a few taped points.
@@ -94,6 +122,9 @@ def calibrate_lab(
     The command fits the model joint, prints the expected error over the floor, and says whether it is enough.
     If it is not, the command names points to tape and a part of the floor to drive through. Without a tape:
     lay a marker on each of two reference points, and enter 0 as its distance.
+
+    Without LOG, the command records the cameras of --rig into -o until Ctrl-C. Meanwhile it prints the
+    expected error, and takes the measured points on a page.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.messages.channels import MODEL, RIG
@@ -105,7 +136,30 @@ def calibrate_lab(
     if not 0 < goal_mm <= _MOST_GOAL_MM:
         raise IpsysError(f"--goal-mm {goal_mm:g}: is not a length above 0 and up to {_MOST_GOAL_MM:g} mm")
     if plot is not None:
-        check_figure_file(plot, "--plot", logs)
+        check_figure_file(plot, "--plot", logs or [])
+    if logs:
+        _refuse_live(seconds=seconds, terminal=terminal, host=host, force=force)
+    else:
+        if output is None:
+            raise IpsysError("no log is given; name a log, or give --rig lab.toml -o lab.mcap to use cameras")
+        from ipsys_log.cli.calibrate_live import record_drive
+
+        nominal = [("--focal", text) for text in focal or []]
+        nominal += [("--field-of-view", text) for text in field_of_view or []]
+        page = None if terminal else (host, port)
+        record_drive(
+            output,
+            rig or Path("lab.toml"),
+            calibration,
+            nominal,
+            corners,
+            goal_mm / 1000,
+            seconds,
+            page,
+            force,
+        )
+        # The log has the rig and the intrinsics of its cameras.
+        logs, output, rig, calibration, focal, field_of_view = [output], None, None, None, None, None
     given_rig = load_matching_rig(rig, lambda: cameras_of(logs))
     _check(logs, given_rig)
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
@@ -147,46 +201,71 @@ def _check(logs: list[Path], rig: Rig | None) -> None:
             )
 
 
+def _refuse_live(**options: object) -> None:
+    """Refuse options that belong to a recording."""
+    from ipsys_log.errors import IpsysError
+
+    for name, value in options.items():
+        if value:
+            raise IpsysError(f"--{name} is only for live cameras; leave out LOG or this option")
+
+
 def _nominal_lenses(
     logs: list[Path],
     given: dict[str, CameraCalibration],
     focal: list[str],
     field_of_view: list[str],
 ) -> dict[str, CameraCalibration]:
-    """Return nominal intrinsics by camera, from focal lengths and fields of view.
-
-    A value without a camera holds for all cameras without a calibration.
-    """
-    from ipsys_log.calibration.nominal import nominal_intrinsics
-    from ipsys_log.errors import IpsysError
+    """Return nominal intrinsics of the cameras of logs, by camera."""
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.checks import image_sizes
 
     if not focal and not field_of_view:
         return {}
-    lenses: dict[str, CameraCalibration] = {}
     with Session(logs) as session:
         sizes_px = image_sizes(session)
-        cameras = sorted(cameras_of(logs))
         calibrated = {*session.calibrations, *given}
-    for option, texts in (("--focal", focal), ("--field-of-view", field_of_view)):
-        for text in texts:
-            camera, _, number = text.rpartition("=")
-            value = _positive(option, text, number)
-            if camera and camera not in cameras:
-                raise IpsysError(
-                    f"{option} {text}: the log has no camera {camera!r}; it has {', '.join(cameras)}"
-                )
-            for name in [camera] if camera else [c for c in cameras if c not in calibrated]:
-                if name not in sizes_px:
-                    raise IpsysError(
-                        f"camera {name}: the log has no images and no image size; give --calibration"
-                    )
-                size_px = sizes_px[name]
-                is_focal = option == "--focal"
-                lenses[name] = nominal_intrinsics(
-                    name, size_px, value if is_focal else None, None if is_focal else math.radians(value)
-                )
+    options = [*(("--focal", text) for text in focal), *(("--field-of-view", text) for text in field_of_view)]
+    return nominal_lenses(options, sorted(cameras_of(logs)), calibrated, sizes_px)
+
+
+def nominal_lenses(
+    options: Sequence[tuple[str, str]],
+    cameras: Sequence[str],
+    calibrated: Collection[str],
+    sizes_px: Mapping[str, tuple[int, int]],
+) -> dict[str, CameraCalibration]:
+    """Return nominal intrinsics by camera, from focal lengths and fields of view.
+
+    Parameters
+    ----------
+    options : names of options with their texts. A text without a camera is for all cameras without a
+        calibration.
+    cameras, calibrated : all cameras, and those with a calibration.
+    sizes_px : sizes of the images by camera.
+
+    Raises
+    ------
+    IpsysError
+        A text is not a number, or names no camera; or the size of an image is unknown.
+    """
+    from ipsys_log.calibration.nominal import nominal_intrinsics
+    from ipsys_log.errors import IpsysError
+
+    lenses: dict[str, CameraCalibration] = {}
+    for option, text in options:
+        camera, _, number = text.rpartition("=")
+        value = _positive(option, text, number)
+        if camera and camera not in cameras:
+            raise IpsysError(f"{option} {text}: there is no camera {camera!r}; there is {', '.join(cameras)}")
+        for name in [camera] if camera else [c for c in cameras if c not in calibrated]:
+            if name not in sizes_px:
+                raise IpsysError(f"camera {name}: the size of its images is unknown; give --calibration")
+            if option == "--focal":
+                lenses[name] = nominal_intrinsics(name, sizes_px[name], value)
+            else:
+                angle_rad = math.radians(value)
+                lenses[name] = nominal_intrinsics(name, sizes_px[name], field_of_view_rad=angle_rad)
     return lenses
 
 
@@ -333,6 +412,7 @@ def _as_json(lab: LabCalibration) -> dict[str, Any]:
         "calibration_points": len(lab.points_m),
         "cameras": cameras,
         "missing": list(lab.missing),
+        "ignored_sightings": lab.ignored,
         "faults": [
             {"kind": f.kind, "subject": f.subject, "score": f.score, "text": f.text} for f in lab.faults
         ],

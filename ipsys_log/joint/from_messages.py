@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.geometry.trilateration import multilaterate
+from ipsys_log.geometry.trilateration import ON_REFERENCE_SIGMA_M, multilaterate
 from ipsys_log.joint.observations import (
     Body,
     CalibrationPoint,
@@ -23,14 +23,12 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Rig
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ON_REFERENCE_SIGMA_M", "gather_observations"]
+__all__ = ["gather_observations"]
 
 Array = NDArray[np.float64]
 
 _USUAL_TAPE_M = 0.003
 _USUAL_RULER_M = 0.001
-# A marker that is laid onto a reference point is this near to it, along each axis.
-ON_REFERENCE_SIGMA_M = 0.001
 # A marker that lies on the floor needs no ruler. This is the thickness of its paper.
 _ON_FLOOR_M = 0.0003
 # Corners without a covariance come from a method whose errors repeat in all images.

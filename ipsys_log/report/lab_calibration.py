@@ -32,7 +32,7 @@ from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, Channel
 from ipsys_log.messages.stage import Progress
 from ipsys_log.runs.view import LogView
 
-__all__ = ["CameraResult", "LabCalibration", "describe_lab"]
+__all__ = ["CameraResult", "LabCalibration", "describe_fit", "describe_lab"]
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,8 @@ class LabCalibration:
     points_m : (p, 2), the calibration points.
     points : points to tape next, with their effect; empty if the goal is reached.
     gap : the part of the floor that a robot should cross; None if none is needed.
-    faults : probable faults of the observations.
+    faults : probable faults of the observations, without single sightings of moving markers.
+    ignored : number of sightings of moving markers that do not fit; they have little weight.
     missing : cameras of the log without a model, because they saw no marker of the fit.
     notes : remarks.
     """
@@ -119,6 +120,7 @@ class LabCalibration:
     points: tuple[TapedPoint, ...]
     gap: FloorGap | None
     faults: tuple[Finding, ...]
+    ignored: int
     missing: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -186,6 +188,19 @@ def describe_lab(
     used, _ = split_ids(points, {"train": train})
     observations = observe(view)
     fit = fit_without(observations, {point.id for point in points} - used, progress)
+    names = [camera.name for camera in observations.cameras]
+    return describe_fit(fit, names, run, rig, lenses, goal_m)
+
+
+def describe_fit(
+    fit: JointFit,
+    names: Sequence[str],
+    run: str,
+    rig: Rig,
+    lenses: Mapping[str, CameraCalibration],
+    goal_m: float,
+) -> LabCalibration:
+    """Describe a joint fit; ``names`` are all cameras with markers, see :func:`describe_lab`."""
     models = build_models(fit)
     sizes_px = {camera: (lenses[camera].width, lenses[camera].height) for camera in models}
     places_m = _places(fit, models)
@@ -215,11 +230,25 @@ def describe_lab(
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,
     )
     points_m = fit.state.positions_m[:, :2]
-    missing = tuple(sorted({camera.name for camera in observations.cameras} - models.keys()))
-    notes = tuple(_notes(rig, cameras, missing, len(points_m)))
-    faults = tuple(find_faults(fit))
+    missing = tuple(sorted(set(names) - models.keys()))
+    findings = find_faults(fit)
+    faults = tuple(finding for finding in findings if not finding.moving)
+    ignored = len(findings) - len(faults)
+    notes = tuple(_notes(rig, cameras, missing, len(points_m), ignored))
     return LabCalibration(
-        run, rig, goal_m, cameras, grid, height_m, points_m, tuple(taped), gap, faults, missing, notes
+        run,
+        rig,
+        goal_m,
+        cameras,
+        grid,
+        height_m,
+        points_m,
+        tuple(taped),
+        gap,
+        faults,
+        ignored,
+        missing,
+        notes,
     )
 
 
@@ -330,7 +359,9 @@ def _tape(rig: Rig) -> TapeCovariances:
     return covariances
 
 
-def _notes(rig: Rig, cameras: Sequence[CameraResult], missing: Sequence[str], points: int) -> Iterator[str]:
+def _notes(
+    rig: Rig, cameras: Sequence[CameraResult], missing: Sequence[str], points: int, ignored: int
+) -> Iterator[str]:
     for name in missing:
         yield f"camera {name} saw no marker of the fit: it has no model; drive through its field of view"
     seen = {*missing, *(camera.camera for camera in cameras)}
@@ -346,6 +377,12 @@ def _notes(rig: Rig, cameras: Sequence[CameraResult], missing: Sequence[str], po
         yield (
             "no sightings of moving robots: set marker_height_m in lab.toml, and drive a robot through all "
             "fields of view"
+        )
+    if ignored:
+        moving = sum(camera.sightings[1] for camera in cameras)
+        yield (
+            f"{ignored} of {moving} sightings of moving markers do not fit, and have little weight; if they "
+            "are many, drive without sharp turns, and check the ids and the heights of the markers"
         )
     if rig.floor is None:
         yield "the rig has no floor: the map covers the places of the markers and 50 cm around them"

@@ -254,6 +254,9 @@ def test_impossible_input_is_refused(ipsys: Ipsys, lab: GeometricLab, fitted: Pa
     for goal in ("0", "-1", "nan", "inf", "2000"):
         assert f"--goal-mm {goal}: is not a length" in refused(ipsys, fitted, "--goal-mm", goal)
     assert "this is the log itself" in refused(ipsys, fitted, "--plot", fitted)
+    assert "no log is given; name a log, or give --rig lab.toml -o lab.mcap" in refused(ipsys)
+    for option in (("--seconds", "3"), ("--terminal",), ("--force",), ("--host", "0.0.0.0")):
+        assert f"{option[0]} is only for live cameras" in refused(ipsys, fitted, *option)
     no_rig = changed(lab, tmp_path / "norig.mcap", lambda m: None if isinstance(m.payload, Rig) else m)
     assert "has no rig" in refused(ipsys, no_rig)
 
@@ -294,3 +297,20 @@ def test_a_camera_without_a_marker_is_not_enough(ipsys: Ipsys, lab: GeometricLab
     done = ipsys("calibrate-lab", log, "--goal-mm", "50")
     assert done.code == 0, done.err
     assert done.out.startswith("Not enough: camera red has no model.")
+
+
+# Records simulated cameras in real time.
+@pytest.mark.slow
+def test_live_cameras_are_recorded_and_points_are_asked_for(ipsys: Ipsys, tmp_path: Path) -> None:
+    rig, log = tmp_path / "lab.toml", tmp_path / "lab.mcap"
+    assert ipsys("init", rig, "--simulated").code == 0
+    options = ("--rig", rig, "-o", log, "--field-of-view", "105", "--seconds", "12", "--port", "0")
+    done = ipsys("calibrate-lab", *options)
+    # Nobody entered a point: the drive is in the log, and the error names the next command.
+    assert done.code == 1
+    assert f"enter some with 'ipsys measure {log}'" in done.err
+    assert "markers were in these parts of the images: " in done.err
+    assert ipsys("measure", log, "--csv", tmp_path / "lab_tape.csv", "--force").code == 0
+    answer = described(ipsys, log)
+    assert all(camera["nominal"] for camera in answer["cameras"])
+    assert answer["mean_mm"] < 4

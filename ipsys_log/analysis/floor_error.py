@@ -23,6 +23,8 @@ from ipsys_log.models.table import AppliedModel
 
 __all__ = [
     "GRID_M",
+    "WALL_M",
+    "WHOLE_PRINT",
     "FloorError",
     "KnownSightings",
     "Locator",

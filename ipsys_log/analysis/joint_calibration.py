@@ -12,12 +12,12 @@ from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.selection import seeing_cameras, without_points
-from ipsys_log.messages import Markers, Model, Rig
+from ipsys_log.messages import CameraCalibration, Markers, Model, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import Progress, StageView
 from ipsys_log.models.table import reads_corners
 
-__all__ = ["READS", "fit_joint_model", "fit_without", "measured_part", "observe"]
+__all__ = ["READS", "fit_joint_model", "fit_without", "is_nominal", "measured_part", "observe"]
 
 # The channels that a joint calibration reads.
 READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
@@ -48,7 +48,14 @@ def observe(view: StageView) -> Observations:
         markers.setdefault(str(message.camera), []).append(message.payload)
     if rig is None or not markers:
         raise FitError("joint is fitted to the corners of markers, but the log has none; use best")
-    return gather_observations(rig, view.calibrations(), markers, [point.measurement for point in points])
+    lenses = view.calibrations()
+    nominal = {camera for camera, lens in lenses.items() if is_nominal(lens)}
+    return gather_observations(rig, lenses, markers, [point.measurement for point in points], nominal)
+
+
+def is_nominal(lens: CameraCalibration) -> bool:
+    """Return whether intrinsics come from a data sheet: a calibration by images gives a distortion."""
+    return not lens.D.any()
 
 
 def fit_without(

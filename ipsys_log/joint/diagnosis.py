@@ -44,12 +44,14 @@ class Finding:
 
     ``kind`` is ``distance``, ``height``, ``place``, ``swapped``, ``length``, ``robot_height``, ``sighting``
     or ``camera``; ``subject`` is the point, marker or camera. ``score`` is in standard deviations.
+    ``moving`` is True for a sighting of a moving marker.
     """
 
     kind: str
     subject: str
     score: float
     text: str
+    moving: bool = False
 
 
 def standardise_readings(fit: JointFit) -> list[Reading]:
@@ -252,5 +254,5 @@ def _wrong_sightings(fit: JointFit) -> list[Finding]:
                 f"camera {camera}: marker {body} {where} is not where the other observations place it; it "
                 "may be another marker, or the camera or the marker was moved"
             )
-            findings.append(Finding("sighting", camera, score, text))
+            findings.append(Finding("sighting", camera, score, text, factors.moving))
     return findings

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.geometry.trilateration import multilaterate
+from ipsys_log.geometry.trilateration import ON_REFERENCE_SIGMA_M, multilaterate
 from ipsys_log.joint.observations import (
     Body,
     CalibrationPoint,
@@ -175,9 +175,14 @@ def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
     ranges_m = np.array([d.distance_m for d in distances], dtype=np.float64)
     sigmas_m = np.array([d.sigma_m or usual_m for d in distances], dtype=np.float64)
     given = np.array([entered.x_m, entered.y_m]) if entered is not None else None
+    given_m = usual_m
+    if given is None and len(distances) == 1 and distances[0].distance_m == 0:
+        # At a distance of 0, only a point determines both coordinates: a distance has no direction there.
+        given, given_m = references_m[0], distances[0].sigma_m or ON_REFERENCE_SIGMA_M
+        references_m, ranges_m, sigmas_m = references_m[:0], ranges_m[:0], sigmas_m[:0]
     start_m = given if given is not None else _start(references_m, ranges_m, sigmas_m, measurement.side)
     height_m = measurement.height_m if entered is None else entered.z_m
-    placed = given is not None and len(distances) < 2
+    placed = given is not None and len(ranges_m) < 2
     return CalibrationPoint(
         measurement.id,
         body,
@@ -186,7 +191,7 @@ def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
         sigmas_m,
         start_m,
         given if placed else None,
-        usual_m**2 * np.eye(2) if placed else None,
+        given_m**2 * np.eye(2) if placed else None,
         height_m,
         _ON_FLOOR_M if height_m == 0 else measurement.height_sigma_m or _USUAL_RULER_M,
     )

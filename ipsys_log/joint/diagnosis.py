@@ -254,5 +254,5 @@ def _wrong_sightings(fit: JointFit) -> list[Finding]:
                 f"camera {camera}: marker {body} {where} is not where the other observations place it; it "
                 "may be another marker, or the camera or the marker was moved"
             )
-            findings.append(Finding("sighting", camera, score, text, factors.moving))
+            findings.append(Finding("sighting", camera, score, text, factors.kind is not Kind.STATIONARY))
     return findings

@@ -74,6 +74,15 @@ Plot = Annotated[
 ]
 
 
+SaveNominal = Annotated[
+    Path | None,
+    typer.Option(
+        "--save-nominal",
+        metavar="DIR",
+        help="With LOG: write the nominal intrinsics into this folder, such as red.yaml, for lab.toml and "
+        "--calibration of later commands.",
+    ),
+]
 Sources = Annotated[
     Optional[list[Path]],  # noqa: UP045
     typer.Argument(
@@ -110,6 +119,7 @@ def calibrate_lab(
     corners: Corners = None,
     output: Output = None,
     plot: Plot = None,
+    save_nominal: SaveNominal = None,
     seconds: Seconds = None,
     terminal: Terminal = False,
     host: Host = None,
@@ -163,7 +173,10 @@ def calibrate_lab(
     given_rig = load_matching_rig(rig, lambda: cameras_of(logs))
     _check(logs, given_rig)
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
-    lenses = {**lenses, **_nominal_lenses(logs, lenses, focal or [], field_of_view or [])}
+    nominal_values = _nominal_lenses(logs, lenses, focal or [], field_of_view or [])
+    if save_nominal is not None:
+        _write_nominal(nominal_values, save_nominal)
+    lenses = {**lenses, **nominal_values}
     options: dict[str, Any] = {
         "train": train,
         "rig": rig,
@@ -181,6 +194,34 @@ def calibrate_lab(
                 lambda done, total: progress("describe", done, total),
             )  # fmt: skip
         _show(lab, plot, as_json)
+
+
+def _write_nominal(lenses: Mapping[str, CameraCalibration], folder: Path) -> None:
+    """Write nominal intrinsics, one YAML file for each camera; no file is overwritten.
+
+    The estimated intrinsics of the fit are not for other uses: above a level floor, focal length and height
+    of a camera are nearly the same unknown.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.exchange.calibration_files import opencv_yaml
+    from ipsys_log.joint.observations import lens_model_of
+    from ipsys_log.report.files import check_folder, write_files
+
+    check_folder(folder, "--save-nominal")
+    if not lenses:
+        raise IpsysError(
+            "--save-nominal needs --focal or --field-of-view, for a camera without a calibration"
+        )
+    comment = "ipsys calibrate-lab: nominal values, not estimated from images"
+    files = {
+        f"{name}.yaml": opencv_yaml(lens, dict.fromkeys(lens_model_of(lens).names, 0.0), comment).encode()
+        for name, lens in lenses.items()
+    }
+    for name in files:
+        if (folder / name).exists():
+            raise IpsysError(f"{folder / name}: exists already; give another folder to --save-nominal")
+    write_files(folder, files)
+    remarks.print(f"{folder} has {', '.join(files)}", markup=False)
 
 
 def _check(logs: list[Path], rig: Rig | None) -> None:
@@ -258,9 +299,17 @@ def nominal_lenses(
         value = _positive(option, text, number)
         if camera and camera not in cameras:
             raise IpsysError(f"{option} {text}: there is no camera {camera!r}; there is {', '.join(cameras)}")
-        for name in [camera] if camera else [c for c in cameras if c not in calibrated]:
+        names = [camera] if camera else [name for name in cameras if name not in calibrated]
+        if not names:
+            raise IpsysError(
+                f"{option} {text}: every camera has a calibration; to replace one, write {cameras[0]}={text}"
+            )
+        for name in names:
             if name not in sizes_px:
-                raise IpsysError(f"camera {name}: the size of its images is unknown; give --calibration")
+                raise IpsysError(
+                    f"camera {name}: the size of its images is unknown; write its width and height into "
+                    "lab.toml, or give --calibration"
+                )
             if option == "--focal":
                 lenses[name] = nominal_intrinsics(name, sizes_px[name], value)
             else:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
+from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.joint.locate import locate
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
@@ -203,12 +204,23 @@ def test_nominal_field_of_view_replaces_a_chessboard(ipsys: Ipsys, lab: Geometri
 
     log = changed(lab, tmp_path / "bare.mcap", bare)
     assert "has no calibration" in refused(ipsys, log)
-    answer = described(ipsys, log, "--focal", "1200")
+    folder = tmp_path / "lenses"
+    answer = described(ipsys, log, "--focal", "1200", "--save-nominal", folder)
     assert any("nominal intrinsics of camera black, red, white" in note for note in answer["notes"])
     assert all(camera["nominal"] for camera in answer["cameras"])
     assert answer["mean_mm"] < 5
     mean_m, _ = true_error_m(lab, log)
     assert mean_m < 0.006
+    nominal = read_intrinsics(folder / "red.yaml", "red")
+    assert (nominal.K[0, 0], nominal.width, nominal.height) == (1200, 1920, 1080)
+    line = refused(ipsys, log, "--focal", "1200", "--save-nominal", folder)
+    assert line.endswith("black.yaml: exists already; give another folder to --save-nominal")
+    lenses = [option for c in lab.cameras for option in ("--calibration", f"{c.name}={folder / c.name}.yaml")]
+    # Files with nominal values stay nominal, and give the same result.
+    assert described(ipsys, log, *lenses)["mean_mm"] == answer["mean_mm"]
+    assert "--save-nominal needs --focal or --field-of-view" in refused(
+        ipsys, log, *lenses, "--save-nominal", tmp_path
+    )
     assert "no camera 'blue'" in refused(ipsys, log, "--focal", "blue=1200")
     assert "--focal wide: is not a number above 0" in refused(ipsys, log, "--focal", "wide")
     assert "a focal length of 3 px is impossible" in refused(ipsys, log, "--focal", "3")
@@ -254,6 +266,8 @@ def test_impossible_input_is_refused(ipsys: Ipsys, lab: GeometricLab, fitted: Pa
     for goal in ("0", "-1", "nan", "inf", "2000"):
         assert f"--goal-mm {goal}: is not a length" in refused(ipsys, fitted, "--goal-mm", goal)
     assert "this is the log itself" in refused(ipsys, fitted, "--plot", fitted)
+    line = refused(ipsys, fitted, "--focal", "1200")
+    assert line.endswith("--focal 1200: every camera has a calibration; to replace one, write black=1200")
     assert "no log is given; name a log, or give --rig lab.toml -o lab.mcap" in refused(ipsys)
     for option in (("--seconds", "3"), ("--terminal",), ("--force",), ("--host", "0.0.0.0")):
         assert f"{option[0]} is only for live cameras" in refused(ipsys, fitted, *option)
@@ -304,7 +318,7 @@ def test_a_camera_without_a_marker_is_not_enough(ipsys: Ipsys, lab: GeometricLab
 def test_live_cameras_are_recorded_and_points_are_asked_for(ipsys: Ipsys, tmp_path: Path) -> None:
     rig, log = tmp_path / "lab.toml", tmp_path / "lab.mcap"
     assert ipsys("init", rig, "--simulated").code == 0
-    options = ("--rig", rig, "-o", log, "--field-of-view", "105", "--seconds", "12", "--port", "0")
+    options = ("--rig", rig, "-o", log, "--seconds", "12", "--port", "0")
     done = ipsys("calibrate-lab", *options)
     # Nobody entered a point: the drive is in the log, and the error names the next command.
     assert done.code == 1
@@ -312,5 +326,5 @@ def test_live_cameras_are_recorded_and_points_are_asked_for(ipsys: Ipsys, tmp_pa
     assert "markers were in these parts of the images: " in done.err
     assert ipsys("measure", log, "--csv", tmp_path / "lab_tape.csv", "--force").code == 0
     answer = described(ipsys, log)
-    assert all(camera["nominal"] for camera in answer["cameras"])
+    assert [camera["camera"] for camera in answer["cameras"]] == ["black", "red", "white"]
     assert answer["mean_mm"] < 4

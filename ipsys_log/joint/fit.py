@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.errors import FitError
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State, make_layout
 from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
 from ipsys_log.joint.problem import Problem
+from ipsys_log.joint.refusals import check_observations, check_spread
 from ipsys_log.joint.rotations import level_turns
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 # The field of the floor reaches this far beyond the outermost place of a marker.
 _BEYOND_M = 1.0
+# Before the wobble of robots is known from their poses, a step need not be so exact.
+_ROUGH = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,27 +70,18 @@ def fit_jointly(
         The observations do not determine the cameras.
     """
     settings = settings or JointSettings()
-    _check(observations)
+    check_observations(observations)
     observations = _without_unseen(observations)
     placed = place_cameras(observations)
+    check_spread(observations, placed)
     problem, state = _build(observations, settings, placed)
     if len(problem.trajectories.paths):
         # The wobble of a robot acts on its corners by the poses, so that these come first.
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
-        state = solve(problem, state, progress).state
+        state = solve(problem, state, progress, _ROUGH).state
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
     solution = solve(problem, state, progress)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
-
-
-def _check(observations: Observations) -> None:
-    for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
-        if not len(sightings):
-            raise FitError(f"camera {camera.name}: it has no sightings; remove it from the fit")
-    if all(np.isinf(body.scale_sigma) for body in observations.bodies) and not any(
-        len(point.distances_m) or point.point_m is not None for point in observations.points
-    ):
-        raise FitError("no length is known; give the size of a marker, or measure distances with a tape")
 
 
 def _without_unseen(observations: Observations) -> Observations:

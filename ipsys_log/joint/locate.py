@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.lens_models import project_with_slopes
 from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.rotations import cross, level_turns
+from ipsys_log.joint.rotations import level_turns
 
 __all__ = ["Positions", "locate"]
 
 Array = NDArray[np.float64]
 
-_CORNERS = marker_corners(1.0)
 _FLAT = np.array([0, 1, 5])
 
 
@@ -41,14 +38,6 @@ class Positions:
     covariances_m2: Array
     chi2: Array
     modes_m: Array
-
-
-class _Slopes(NamedTuple):
-    """Residuals (n, 8) of corners, and their slopes (n, 8, ...) by pose (6) and by the camera's unknowns."""
-
-    residuals: Array
-    by_pose: Array
-    by_camera: Array
 
 
 def locate(
@@ -79,9 +68,11 @@ def locate(
     -------
     Positions.
     """
-    inward = _inward(corners_px)
+    inward = edge_motion(corners_px)
     points_m, headings_rad, floor_slopes, floor_modes = _start(model, corners_px, inward, heights_m)
-    now = _linearise(model, corners_px, inward, points_m, headings_rad, lengths_m * model.scale)
+    now = linearise_corners(
+        model, corners_px, inward, points_m, level_turns(headings_rad), lengths_m * model.scale
+    )
     by_height = now.by_pose[:, :, 2:3]
     slopes = now.by_pose[:, :, _FLAT]
     slopes[:, :, :2] += by_height * floor_slopes[:, None]
@@ -127,36 +118,3 @@ def _start(
     points_m = middle_m + floor_m[:, None] * away
     side = rays[:, 2] + rays[:, 3] - rays[:, 0] - rays[:, 1]
     return points_m, np.arctan2(side[:, 1], side[:, 0]), slopes, modes
-
-
-def _inward(corners_px: Array) -> Array:
-    after, before = (corners_px[:, order] - corners_px for order in ([1, 2, 3, 0], [3, 0, 1, 2]))
-    lengths_px = np.sqrt((after * after).sum(axis=2, keepdims=True))
-    return np.asarray(after / lengths_px + before / lengths_px[:, [3, 0, 1, 2]])
-
-
-def _linearise(
-    model: JointModel,
-    corners_px: Array,
-    inward: Array,
-    points_m: Array,
-    headings_rad: Array,
-    sizes_m: Array,
-) -> _Slopes:
-    count, lens = len(points_m), len(model.lens)
-    arms_m = _CORNERS @ level_turns(headings_rad).swapaxes(1, 2) * sizes_m[:, None, None]
-    points_c = (arms_m + (points_m - model.origin_m)[:, None]) @ model.camera_from_world.T
-    pixels, by_point, by_lens = project_with_slopes(model.lens_model, model.lens, points_c.reshape(-1, 3))
-    by_point = by_point.reshape(count, 4, 2, 3)
-    by_pose = np.empty((count, 4, 2, 6))
-    by_pose[..., :3] = by_world = by_point @ model.camera_from_world
-    by_pose[..., 3:] = cross(arms_m[:, :, None], by_world)
-    # The order is that of the rows of JointModel.modes; clock and row time have no effect without a speed.
-    by_camera = np.zeros((count, 4, 2, lens + 10))
-    by_camera[..., :3] = cross(points_c[:, :, None], by_point)
-    by_camera[..., 3:6] = -by_world
-    by_camera[..., 6 : 6 + lens] = by_lens.reshape(count, 4, 2, lens)
-    by_camera[..., 6 + lens] = inward
-    by_camera[..., 9 + lens] = (by_world * arms_m[:, :, None]).sum(axis=3) / model.scale
-    misses = pixels.reshape(count, 4, 2) + model.edge_offset_px * inward - corners_px
-    return _Slopes(misses.reshape(count, 8), by_pose.reshape(count, 8, 6), by_camera.reshape(count, 8, -1))

@@ -58,8 +58,7 @@ def _common_normal(normals: Array) -> Array:
     """Return the direction (3,) that most markers share, from two candidates each, (n, 2, 3)."""
     if not len(normals):
         return np.array([0.0, 0.0, -1.0])
-    every = normals.reshape(-1, 3)
-    candidates = every[:: max(1, len(every) // _CANDIDATES)]
+    candidates = normals[:: max(1, len(normals) // _CANDIDATES)].reshape(-1, 3)
     angles = np.arccos(np.clip(np.einsum("nkd,cd->cnk", normals, candidates), -1, 1)).min(axis=2)
     losses = np.minimum(angles / _ALIKE_RAD, 1.0) ** 2
     up = candidates[losses.sum(axis=1).argmin()]

@@ -66,10 +66,14 @@ class NormalEquations:
         by_global : (n, r, u), derivatives of the weighted residuals.
         """
         count, rows, size = slopes.shape
-        indices = np.repeat(starts, rows)[:, None] + np.arange(size)
+        if not count:
+            return
+        first = int(starts.min())
+        indices = np.repeat(starts - first, rows)[:, None] + np.arange(size)
+        reach = int(starts.max()) - first + size
         ends = np.arange(count * rows + 1) * size
-        sparse = csr_array((slopes.ravel(), indices.ravel(), ends), shape=(count * rows, len(self.mixed)))
-        self.mixed[:, columns] += sparse.T @ by_global.reshape(count * rows, -1)
+        sparse = csr_array((slopes.ravel(), indices.ravel(), ends), shape=(count * rows, reach))
+        self.mixed[first : first + reach, columns] += sparse.T @ by_global.reshape(count * rows, -1)
 
     def add_global(self, columns: Indices, slopes: Array, residuals: Array) -> None:
         """Add factors of global unknowns: slopes (n, r, u) by the unknowns ``columns`` (u,)."""
@@ -101,7 +105,7 @@ class Factorisation:
     def __init__(self, normal: NormalEquations, free: NDArray[np.bool_], damping: float = 0.0) -> None:
         self.free = free
         self.local_count = len(normal.mixed)
-        mixed = normal.mixed[:, free]
+        mixed = np.asfortranarray(normal.mixed[:, free])
         if self.local_count:
             band = normal.band.copy()
             band[0] *= 1 + damping

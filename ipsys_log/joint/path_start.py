@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
-from ipsys_log.joint.normal import Factorisation, NormalEquations
+from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.start import PlacedCamera
@@ -22,8 +23,8 @@ Indices = NDArray[np.intp]
 _GAP_S = 1.0
 _LEAST_SIGHTINGS, _LEAST_S = 8, 0.5
 # Time between knots, in intervals between the frames of a camera, and its limits.
-_FRAMES_PER_KNOT = 1.5
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.1, 0.25
+_FRAMES_PER_KNOT = 1.0
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.09, 0.25
 # The path continues this long before and after its sightings, because clocks have offsets.
 _PAD_S = 0.25
 # Errors of a place and of a heading from one marker and rough camera poses.
@@ -150,7 +151,7 @@ def _fit_knots(paths: Paths, parts: list[_Places], settings: JointSettings) -> A
         residuals = (values - places) / sigmas
         normal.add_local(3 * near, slopes * roots[:, None, None], residuals * roots[:, None])
         trajectories.add_accelerations(normal, knots)
-        step = Factorisation(normal, np.zeros(0, dtype=np.bool_), 1e-9).step(normal)[1]
+        step = solveh_banded(normal.band, -normal.local_gradient, lower=True, check_finite=False)
         knots = knots + step.reshape(-1, 3)
         values = (weights[:, :, None] * knots[near[:, None] + np.arange(4)]).sum(axis=1)
         chi2 = (((values - places) / sigmas) ** 2).sum(axis=1)

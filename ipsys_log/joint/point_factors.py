@@ -103,7 +103,7 @@ class PointFactors:
         if layout.floor.count:
             modes = np.arange(layout.modes.start, layout.modes.stop)
             by_modes = -layout.floor.modes(at)[:, None] * scale[:, None, None]
-            normal.add_mixed(starts, slopes[:, None], modes, by_modes)
+            normal.add_mixed(starts, slopes[:, None], layout.modes, by_modes)
             normal.add_global(modes, by_modes, residuals[:, None])
 
     def _add_tilts(self, normal: NormalEquations, state: State, residuals: Array) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.point_factors import PointFactors
-from ipsys_log.joint.robust import robust_loss
+from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.sighting_factors import SightingFactors
 from ipsys_log.joint.trajectories import Trajectories
 
@@ -35,7 +35,7 @@ class Problem:
             chi2 = (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1)
             total += float(robust_loss(chi2, factors.limit * ease)[0].sum()) / 2
         total += float((self.trajectories.acceleration_residuals(state.knots) ** 2).sum()) / 2
-        return total + float((self.prior_residuals(state) ** 2).sum()) / 2
+        return total + float(self._prior_loss(state)[1].sum()) / 2
 
     def prior_residuals(self, state: State) -> Array:
         """Return the differences from the prior, (g,), in standard deviations."""
@@ -51,13 +51,24 @@ class Problem:
             factors.add_to(normal, state, layout, trajectories, ease)
         self.points.add_to(normal, state, layout, ease)
         trajectories.add_accelerations(normal, state.knots)
-        residuals = self.prior_residuals(state)
-        normal.cost += float((residuals**2).sum()) / 2
+        residuals, loss, weights = self._prior_loss(state)
+        normal.cost += float(loss.sum()) / 2
         sigma = layout.sigma
-        weights = np.where(np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1.0), 0.0)
-        normal.dense[np.diag_indices_from(normal.dense)] += weights**2
-        normal.global_gradient += weights * residuals
+        scales = np.where(np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1.0), 0.0)
+        normal.dense[np.diag_indices_from(normal.dense)] += weights * scales**2
+        normal.global_gradient += weights * scales * residuals
         return normal
+
+    def _prior_loss(self, state: State) -> tuple[Array, Array, Array]:
+        """Return standardised differences from the prior, their losses, and their weights, all (g,).
+
+        The size and the height of a marker in the rig may be wrong: then they must not distort the rest.
+        """
+        residuals = self.prior_residuals(state)
+        loss, weights = residuals**2, np.ones(len(residuals))
+        bodies = slice(self.layout.scales.start, self.layout.heights.stop)
+        loss[bodies], weights[bodies] = robust_loss(residuals[bodies] ** 2, float(limit_of(1.0)))
+        return residuals, loss, weights
 
     def reweighted(self, state: State, tilt_sigma_rad: float) -> Problem:
         """Return the problem with the wobble of moving bodies in the covariances of their corners."""

@@ -14,9 +14,8 @@ class JointSettings:
     Attributes
     ----------
     floor_sigma_m, floor_length_m : standard deviation and correlation length of the floor's unevenness.
-    corner_floor_px : repeatable part of the error of a corner. It has the same value in all images of a
-        stationary marker (sampling of the print by the pixels, rest of the lens distortion), so that an
-        average over frames does not reduce it.
+    corner_floor_px : error of a corner that the covariance of the detection does not contain: the rest of the
+        lens distortion, and the print. An average over frames does not reduce it.
     focal_sigma, centre_sigma, distortion_sigma : uncertainty of a chessboard calibration: focal length
         (relative), principal point (share of the width), coefficients of the lens distortion. A usual
         calibration is better than this by a factor of two or three, but its errors are correlated: a
@@ -35,7 +34,7 @@ class JointSettings:
 
     floor_sigma_m: float = 0.001
     floor_length_m: float = 0.5
-    corner_floor_px: float = 0.015
+    corner_floor_px: float = 0.01
     focal_sigma: float = 0.003
     centre_sigma: float = 0.002
     distortion_sigma: float = 0.01

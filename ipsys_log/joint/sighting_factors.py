@@ -102,7 +102,7 @@ class SightingFactors:
             by_height = by_pose[:, :, 2]
             modes = np.arange(layout.modes.start, layout.modes.stop)
             by_knots = (local * by_height[:, :, None]).sum(axis=1)[:, None]
-            normal.add_mixed(place.starts, by_knots, modes, place.modes[:, None])
+            normal.add_mixed(place.starts, by_knots, layout.modes, place.modes[:, None])
             across = (by_global * by_height[:, :, None]).sum(axis=1)
             normal.add_global_block(columns, modes, across.T @ place.modes)
             strengths = (by_height**2).sum(axis=1)[:, None]

@@ -12,13 +12,13 @@ from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 
-__all__ = ["Solution", "solve"]
+__all__ = ["SHORT", "Solution", "solve"]
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
 _MOST_STEPS = 200
-# The fit has converged if a full step is shorter than this share of the standard deviation.
-_SHORT = 1e-3
+# Share of the standard deviation: the optimum is exact to a thousandth of its uncertainty.
+SHORT = 1e-3
 # Before the loss is strict, a step need not be so exact.
 _ROUGH = 0.3
 
@@ -35,7 +35,10 @@ class Solution:
 
 
 def solve(
-    problem: Problem, state: State, progress: Callable[[int, float], None] = lambda step, cost: None
+    problem: Problem,
+    state: State,
+    progress: Callable[[int, float], None] = lambda step, cost: None,
+    short: float = SHORT,
 ) -> Solution:
     """Minimise the cost of a problem, from a start.
 
@@ -47,6 +50,7 @@ def solve(
     problem : factors and unknowns.
     state : the start.
     progress : called with the number of steps and the cost after each step.
+    short : the fit has converged if a full step is shorter than this share of the standard deviation.
 
     Raises
     ------
@@ -62,7 +66,7 @@ def solve(
     for step in range(_MOST_STEPS):
         state, cost, decrement, damping = _descend(problem, state, normal, damping, ease)
         progress(step + 1, cost)
-        long = _SHORT if ease == 1.0 else _ROUGH
+        long = short if ease == 1.0 else _ROUGH
         settled = decrement <= long**2
         if settled and ease == 1.0:
             normal = problem.linearise(state, ease)
@@ -97,7 +101,7 @@ def _descend(
             # A short step by strong damping is no sign of a minimum.
             decrement = expected if damping <= _FIRST_DAMPING else np.inf
             return trial, cost, decrement, max(damping / 10, _LEAST_DAMPING)
-        if expected <= _SHORT**2:
+        if expected <= SHORT**2:
             # Rounding errors hide the decrease: this is the minimum.
             return state, normal.cost, 0.0, damping
         damping = _more(damping)

@@ -109,7 +109,7 @@ class Trajectories:
         x, y, heading = np.einsum("nk,nkd->dn", weights, near)
         vx, vy, turn = np.einsum("nk,nkd->dn", speeds, near)
         flat = np.stack([x, y], axis=1)
-        floor_m, slopes = layout.floor.heights(flat, state.values[layout.modes])
+        floor_m, slopes, modes = layout.floor.evaluate(flat, state.values[layout.modes])
         z = floor_m + state.values[layout.heights][self.paths.bodies[paths]]
         by_knots = np.zeros((len(paths), _POSE, 4, _KNOT))
         by_knots[:, 0, :, 0] = by_knots[:, 1, :, 1] = by_knots[:, 5, :, 2] = weights
@@ -123,7 +123,7 @@ class Trajectories:
             _POSE * self.stationary + _KNOT * knots,
             by_knots.reshape(len(paths), _POSE, -1),
             velocities,
-            layout.floor.modes(flat),
+            modes,
         )
 
     def add_accelerations(self, normal: NormalEquations, knots: Array) -> None:

@@ -30,8 +30,11 @@ def residuals_of(problem: Problem, state: State, ease: float = 1.0) -> Array:
         _robust(points.places, two),
         points.tilts.ravel(),
         trajectories.acceleration_residuals(state.knots).ravel(),
-        problem.prior_residuals(state),
     ]
+    prior = problem.prior_residuals(state)
+    bodies = slice(layout.scales.start, layout.heights.stop)
+    prior[bodies] = _robust(prior[bodies][:, None], float(limit_of(1.0)))
+    parts.append(prior)
     return np.concatenate(parts)
 
 

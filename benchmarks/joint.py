@@ -4,10 +4,10 @@
     python benchmarks/joint.py --labs 5 --lab-scene 16     # scenes with this in their name
     python benchmarks/joint.py --picture floor.png       # also a map of the errors of one lab
 
-The labs have no images: markers have the noise that detect has in rendered labs (see
-ipsys_log/simulation/corner_noise.py). Each lab has another seed, and all calibrations get the same labs. The
-error over the floor is defined in ipsys_log/analysis/floor_error.py. The script prints a table, and writes
-JSON with -o.
+Most labs have no images: markers have the noise that detect has in rendered labs (see
+ipsys_log/simulation/corner_noise.py). Some labs are rendered, to confirm this. Each lab has another seed, and
+all calibrations get the same labs. The error over the floor is defined in ipsys_log/analysis/floor_error.py.
+The script prints a table, and writes JSON with -o.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from geometric_labs import (
     USE_DRIVES,
     Scene,
     Session,
+    driving_robots,
+    held_out_points,
     make_session,
     nodes_of,
     standing_robots,
@@ -38,7 +40,6 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.floor_error import KnownSightings, Locator, SightingErrors, compute_errors, summarize
 from ipsys_log.errors import FitError
-from ipsys_log.simulation.geometric_lab import build_lab
 
 __all__ = ["measure"]
 
@@ -46,6 +47,8 @@ __all__ = ["measure"]
 _FIRST_SEED = 1000
 _MM = 1000.0
 _STANDING_FRAMES, _EVERY_NODE = 300, 23
+# Places of held-out points and of a driving robot, each seen by up to three cameras.
+_HELD_OUT, _DRIVEN = 100, 200
 # Limits of the median error of joint calibration over flat labs, in mm.
 _WANTED_MM = {
     "75 points": 1.0,
@@ -64,6 +67,8 @@ def measure(options: argparse.Namespace) -> Report:
     """Calibrate the labs of every scene with every contender."""
     report = Report("joint")
     scenes = [scene for scene in SCENES if options.lab_scene in scene.name]
+    if not options.rendered_labs:
+        scenes = [scene for scene in scenes if not scene.rendered]
     if options.smoke:
         scenes = [scene for scene in scenes if not scene.drives][:1]
     names = options.models.split(",") if options.models else list(CONTENDERS)
@@ -85,8 +90,9 @@ def _measure_scene(
     scene: Scene, names: Sequence[str], options: argparse.Namespace, report: Report
 ) -> dict[str, list[Figures | None]]:
     figures: dict[str, list[Figures | None]] = defaultdict(list)
-    for number in range(1 if options.smoke else options.labs):
-        session = make_session(build_lab(scene.seeded(_FIRST_SEED + number)))
+    labs = options.rendered_labs if scene.rendered else options.labs
+    for number in range(1 if options.smoke else labs):
+        session = make_session(scene, _FIRST_SEED + number)
         nodes = nodes_of(session.lab)
         maps: dict[str, list[SightingErrors]] = {}
         for name in names:
@@ -121,15 +127,33 @@ def _figures(
     fit_s: float,
 ) -> Figures:
     error = asdict(summarize(errors, _measured(session)))
-    shares = error.pop("shares") or {}
+    shares = error.pop("shares")
     figures = {
         f"{key}m" if key.endswith("_m") else key: value * (_MM if key.endswith("_m") else 1)
         for key, value in error.items()
     }
-    figures.update(shares)
+    figures["coverage"] = _coverage(session, shares, locator)
     figures["standing_mm"] = _MM * _repeatability(session, nodes, locator)
     figures["fit_s"] = fit_s
     return figures
+
+
+def _coverage(
+    session: Session, grid: dict[str, float] | None, locator: Locator
+) -> dict[str, dict[str, float]] | None:
+    """Return the shares inside the regions of the covariances, on the grid, at points and in a drive."""
+    if grid is None:
+        return None
+    others = {
+        "points": held_out_points(session.lab, _HELD_OUT),
+        "drive": driving_robots(session.lab, _DRIVEN),
+    }
+    coverage = {"grid": grid}
+    for name, sightings in others.items():
+        shares = summarize(compute_errors(sightings, locator), _measured(session)).shares
+        if shares is not None:
+            coverage[name] = asdict(shares)
+    return coverage
 
 
 def _repeatability(session: Session, nodes: Sequence[KnownSightings], locator: Locator) -> float:
@@ -143,23 +167,27 @@ def _repeatability(session: Session, nodes: Sequence[KnownSightings], locator: L
 
 def _add(report: Report, scene: Scene, figures: dict[str, list[Figures | None]]) -> None:
     """Add the figures of a scene: a table, rows with limits, and details."""
-    titles = f"{'mean (90 %)':>14}{'p95':>7}{'aligned':>8}{'outside':>8}{'still':>7}"
-    lines = [scene.name, f"  {'in mm':<18}{titles}{'68 %':>6}{'95 %':>6}{'NEES':>6}"]
+    titles = f"{'mean (90 %)':>15}{'p95':>8}{'aligned':>9}{'outside':>9}{'still':>8}"
+    lines = [scene.name, f"  {'in mm':<20}{titles}"]
+    covered = [f"  {'% inside, NEES':<20}{'grid':>19}{'points':>19}{'drive':>19}"]
     means: dict[str, tuple[float, ...]] = {}
     for name, labs in figures.items():
         known = [one for one in labs if one is not None]
         report.details.setdefault(scene.name, {})[name] = labs
         if not known:
-            lines.append(f"  {name:<18}{'too few points':>14}")
+            lines.append(f"  {name:<20}{'too few points':>15}")
             continue
         means[name] = tuple(one["mean_mm"] for one in known)
         lines.append(_line(name, known, len(labs)))
+        if all(one["coverage"] for one in known):
+            covered.append(_covered(name, known))
         if name == "joint" and (limit := _WANTED_MM.get(scene.name)) is not None:
             report.rows.append(Row(f"{scene.name}, {name}", means[name], "mm", ("<=", limit)))
-    report.tables.append("\n".join(lines))
-    for name in means.keys() - {"rayplane"}:
-        if "rayplane" in means and len(means[name]) == len(means["rayplane"]):
-            ratios = [a / b for a, b in zip(means[name], means["rayplane"], strict=True)]
+    report.tables.append("\n".join(lines + covered))
+    today = means.pop("rayplane", ())
+    for name, values in means.items():
+        if len(values) == len(today):
+            ratios = [mine / usual for mine, usual in zip(values, today, strict=True)]
             report.rows.append(Row(f"{scene.name}: {name} / rayplane", tuple(ratios)))
 
 
@@ -171,16 +199,30 @@ def _line(name: str, known: list[Figures], labs: int) -> str:
 
     title = name if len(known) == labs else f"{name}, {len(known)} labs"
     mean = f"{median('mean_mm'):.2f} ({np.percentile([one['mean_mm'] for one in known], 90):.2f})"
-    line = f"  {title:<18}{mean:>14}{median('p95_mm'):>7.2f}{median('aligned_mean_mm'):>8.2f}"
-    line += f"{median('outside_mean_mm'):>8.2f}{median('standing_mm'):>7.3f}"
-    if all("nees" in one for one in known):
-        shares = [float(np.mean([one[key] for one in known])) for key in ("inside_68", "inside_95", "nees")]
-        line += f"{100 * shares[0]:>6.0f}{100 * shares[1]:>6.0f}{shares[2]:>6.2f}"
+    line = f"  {title:<20}{mean:>15}{median('p95_mm'):>8.2f}{median('aligned_mean_mm'):>9.2f}"
+    return line + f"{median('outside_mean_mm'):>9.2f}{median('standing_mm'):>8.3f}"
+
+
+def _covered(name: str, known: list[Figures]) -> str:
+    """Return the mean shares inside the 68 and 95 % regions, with standard errors over labs, and the NEES."""
+    line = f"  {name:<20}"
+    for kind in ("grid", "points", "drive"):
+        shares = [one["coverage"][kind] for one in known]
+        cells = []
+        for key in ("inside_68", "inside_95"):
+            values = [100 * one[key] for one in shares]
+            cell = f"{np.mean(values):.0f}"
+            if len(values) > 1:
+                cell += f"±{np.std(values, ddof=1) / np.sqrt(len(values)):.0f}"
+            cells.append(cell)
+        cells.append(f"{np.mean([one['nees'] for one in shares]):.2f}")
+        line += f"{' '.join(cells):>19}"
     return line
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
-    parser.add_argument("--labs", type=int, default=20, help="of each scene")
+    parser.add_argument("--labs", type=int, default=5, help="of each scene without images")
+    parser.add_argument("--rendered-labs", type=int, default=3, help="of each scene with images")
     parser.add_argument("--lab-scene", default="", help="only scenes with this in their name")
     parser.add_argument("--models", default="", help=f"of {', '.join(CONTENDERS)}, separated by commas")
     parser.add_argument("--picture", help="map of the errors in the first lab of the first scene")

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.joint.fit import JointFit
+from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.robust import limit_of, robust_loss
+from ipsys_log.joint.trajectories import Kind
 
 __all__ = ["Finding", "Reading", "find_faults", "standardise_readings"]
 
@@ -18,7 +20,7 @@ Array = NDArray[np.float64]
 _WRONG = 4.5
 # A tape reading that fits the place of another point this well was swapped with it.
 _SAME_PLACE_M = 0.03
-_USUAL_MM = 1000.0
+_MM_PER_M = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +138,15 @@ def _spread_of_points(fit: JointFit) -> _PointSpread:
 
 
 def find_faults(fit: JointFit) -> list[Finding]:
-    """Return probable faults, the largest score first."""
-    findings = [*_wrong_readings(fit), *_wrong_bodies(fit), *_wrong_sightings(fit)]
-    return sorted(findings, key=lambda finding: (-finding.score, finding.kind, finding.subject))
+    """Return probable faults: causes of other faults first, then by their scores."""
+    findings = [
+        *_wrong_readings(fit),
+        *_wrong_bodies(fit),
+        *_wrong_sightings(fit),
+        *_moved_cameras(fit),
+    ]
+    first = ("camera", "length", "robot_height")
+    return sorted(findings, key=lambda one: (one.kind not in first, -one.score, one.kind, one.subject))
 
 
 def _wrong_readings(fit: JointFit) -> list[Finding]:
@@ -154,8 +162,17 @@ def _wrong_readings(fit: JointFit) -> list[Finding]:
             text = f"point {name}: its tape readings fit the place of point {twin}; were they swapped?"
             findings.append(Finding("swapped", name, worst.score, text))
             continue
+        tape = [reading for reading in readings if reading.kind == "distance"]
+        if len(tape) > 1:
+            largest_mm = max(abs(reading.residual_m) for reading in tape) * _MM_PER_M
+            text = (
+                f"point {name}: its distances disagree with the cameras by up to {largest_mm:.0f} mm; check "
+                "the side, the id of the marker, and if the marker was moved"
+            )
+            findings.append(Finding("distance", name, worst.score, text))
+            continue
         text = ", ".join(
-            f"{_reading_name(reading)} is {abs(reading.residual_m) * _USUAL_MM:.0f} mm too "
+            f"{_reading_name(reading)} is {abs(reading.residual_m) * _MM_PER_M:.0f} mm too "
             f"{'short' if reading.residual_m > 0 else 'long'}"
             for reading in readings
         )
@@ -189,7 +206,7 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
     for number, body in enumerate(bodies):
         score = abs(float(residuals[layout.scales][number]))
         if score > _WRONG:
-            side_mm = float(np.linalg.norm(body.points_m[1] - body.points_m[0])) * _USUAL_MM
+            side_mm = float(np.linalg.norm(body.points_m[1] - body.points_m[0])) * _MM_PER_M
             text = (
                 f"marker {body.name}: its side is {side_mm * scales[number]:.1f} mm, not {side_mm:.1f} mm; "
                 "measure the print, and correct the rig"
@@ -198,10 +215,22 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
         score = abs(float(residuals[layout.heights][number]))
         if score > _WRONG and body.height_m is not None:
             text = (
-                f"marker {body.name}: a robot carries it at {heights[number] * _USUAL_MM:.0f} mm, not at "
-                f"{body.height_m * _USUAL_MM:.0f} mm; correct the rig, or exchange the markers of two robots"
+                f"marker {body.name}: a robot carries it at {heights[number] * _MM_PER_M:.0f} mm, not at "
+                f"{body.height_m * _MM_PER_M:.0f} mm; correct the rig, or exchange the markers of two robots"
             )
             findings.append(Finding("robot_height", body.name, score, text))
+    return findings
+
+
+def _moved_cameras(fit: JointFit) -> list[Finding]:
+    findings = []
+    for motion in find_moved_cameras(fit):
+        shift_mm = float(np.linalg.norm(motion.shift_m)) * _MM_PER_M
+        text = (
+            f"camera {motion.camera}: it was moved after about {motion.time_s:.0f} s, by {shift_mm:.0f} mm "
+            f"and {np.degrees(motion.turn_rad):.2f} degrees; calibrate with the observations before or after"
+        )
+        findings.append(Finding("camera", motion.camera, float(np.sqrt(motion.chi2)), text))
     return findings
 
 
@@ -216,7 +245,7 @@ def _wrong_sightings(fit: JointFit) -> list[Finding]:
             body = observations.bodies[int(factors.sightings.body[row])].name
             where = (
                 f"at {factors.sightings.times_s[row]:.2f} s"
-                if factors.moving
+                if factors.kind is not Kind.STATIONARY
                 else f"at point {observations.points[int(factors.trajectory[row])].name}"
             )
             text = (

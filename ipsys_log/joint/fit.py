@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
+from ipsys_log.joint.floor_unevenness import most_likely_scale
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State, make_layout
 from ipsys_log.joint.path_start import start_paths
@@ -20,7 +21,7 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import Solution, solve
 from ipsys_log.joint.start import PlacedCamera, place_cameras
-from ipsys_log.joint.trajectories import Trajectories
+from ipsys_log.joint.trajectories import Kind, Trajectories
 
 __all__ = ["JointFit", "fit_jointly"]
 
@@ -80,8 +81,33 @@ def fit_jointly(
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
         state = solve(problem, state, progress, _ROUGH).state
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
+    fit = _solve(observations, settings, problem, state, progress)
+    if not problem.layout.floor.count or not settings.floor_sigma_spread:
+        return fit
+    modes = problem.layout.modes
+    factor = most_likely_scale(
+        fit.state.values[modes], fit.covariance[modes, modes], settings.floor_sigma_spread
+    )
+    return _solve(observations, settings, *_with_floor(fit, factor), progress)
+
+
+def _solve(
+    observations: Observations,
+    settings: JointSettings,
+    problem: Problem,
+    state: State,
+    progress: Callable[[int, float], None],
+) -> JointFit:
     solution = solve(problem, state, progress)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
+
+
+def _with_floor(fit: JointFit, factor: float) -> tuple[Problem, State]:
+    """Return the problem with another standard deviation of the floor, and the same floor as its start."""
+    layout, values = fit.problem.layout, fit.state.values.copy()
+    values[layout.modes] /= factor
+    problem = replace(fit.problem, layout=replace(layout, floor=layout.floor.scaled(factor)))
+    return problem, replace(fit.state, values=values)
 
 
 def _without_unseen(observations: Observations) -> Observations:
@@ -107,10 +133,10 @@ def _build(
     layout = make_layout(observations, settings, _floor(placed, settings), len(paths) > 0)
     factors = []
     for camera, (sightings, path) in enumerate(zip(observations.sightings, numbers, strict=True)):
-        for moving, rows in enumerate((sightings.point >= 0, path >= 0)):
+        for kind, trajectory in ((Kind.STATIONARY, sightings.point), (Kind.FLOOR, path)):
+            rows = trajectory >= 0
             if rows.any():
-                trajectory = path[rows] if moving else sightings.point[rows]
-                own = sightings.select(rows), trajectory, bool(moving)
+                own = sightings.select(rows), trajectory[rows], kind
                 factors.append(
                     make_sighting_factors(camera, *own, observations.bodies, settings.corner_floor_px)
                 )
@@ -121,6 +147,7 @@ def _build(
     values = layout.mean.copy()
     for block, camera_pose in zip(layout.cameras, placed, strict=True):
         values[block.start + 3 : block.start + 6] = camera_pose.origin_m
+        values[block.lens][4:] = camera_pose.lens.D
     turns = np.stack([camera_pose.camera_from_world for camera_pose in placed])
     positions_m, headings_rad = _point_starts(observations, placed)
     state = State(values, turns, positions_m, level_turns(headings_rad), knots)

@@ -7,7 +7,7 @@ a standard normal distribution.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ class FloorField:
     def count(self) -> int:
         """The number of modes m."""
         return len(self.pairs)
+
+    def scaled(self, factor: float) -> FloorField:
+        """Return the field with another standard deviation."""
+        return replace(self, along_x=self.along_x * factor)
 
     def modes(self, points_m: Array) -> Array:
         """Return the modes at points: (n, m) in m, for points (n, 2) or (n, 3)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,16 @@ from ipsys_log.geometry.square_pose import solve_squares
 from ipsys_log.joint.observations import Body, Sightings
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["MarkerViews", "view_markers"]
+__all__ = ["MarkerViews", "guess_distortion", "view_markers"]
 
 Array = NDArray[np.float64]
 
 # Normals of markers that lie on one floor agree within this angle, in one of the two poses of each marker.
 _ALIKE_RAD = np.radians(8.0)
 _CANDIDATES = 200
+# First coefficients of the distortion of nominal intrinsics, and the number of markers that are compared.
+_COEFFICIENTS = np.linspace(-0.4, 0.2, 13)
+_FEW = 60
 _ROUNDS = 5
 
 
@@ -26,10 +29,12 @@ _ROUNDS = 5
 class MarkerViews:
     """Markers as one camera sees them, in coordinates with the camera's position and z up.
 
-    ``level_from_camera`` is (3, 3). ``points_m`` (n, 3) are the centres, ``headings_rad`` (n,) the headings,
-    ``rays`` (n, 3) the directions to the centres. A marker that the lens model cannot reach is NaN.
+    ``lens`` are the intrinsics of the camera. ``level_from_camera`` is (3, 3). ``points_m`` (n, 3) are the
+    centres, ``headings_rad`` (n,) the headings, ``rays`` (n, 3) the directions to the centres. A marker that
+    the lens model cannot reach is NaN.
     """
 
+    lens: CameraCalibration
     level_from_camera: Array
     points_m: Array
     headings_rad: Array
@@ -45,19 +50,42 @@ def view_markers(sightings: Sightings, bodies: tuple[Body, ...], lens: CameraCal
     rotations = np.full((count, 2, 3, 3), np.nan)
     centres_m = np.full((count, 2, 3), np.nan)
     rotations[valid], centres_m[valid] = solve_squares(uv[valid], sides_m[sightings.body[valid]])
-    up = _common_normal(rotations[valid][..., 2])
+    up, _ = _common_normal(rotations[valid][..., 2])
     level = _level_from_up(up)
     best = (rotations[..., 2] @ up).argmax(axis=1)
     row = np.arange(count)
     sides = rotations[row, best][:, :, 1] @ level.T
     rays = np.concatenate([uv.mean(axis=1), np.ones((count, 1))], axis=1) @ level.T
-    return MarkerViews(level, centres_m[row, best] @ level.T, np.arctan2(sides[:, 1], sides[:, 0]), rays)
+    return MarkerViews(
+        lens, level, centres_m[row, best] @ level.T, np.arctan2(sides[:, 1], sides[:, 0]), rays
+    )
 
 
-def _common_normal(normals: Array) -> Array:
-    """Return the direction (3,) that most markers share, from two candidates each, (n, 2, 3)."""
+def guess_distortion(sightings: Sightings, lens: CameraCalibration) -> CameraCalibration:
+    """Return a nominal calibration with the first coefficient of the distortion for which normals agree best.
+
+    With a wrong distortion, the markers on a flat floor seem to lie on a bowl.
+    """
+    few = sightings.select(np.arange(0, len(sightings), max(1, len(sightings) // _FEW)))
+    sides_m = np.ones(len(few))
+    costs = []
+    for coefficient in _COEFFICIENTS:
+        curved = _with_coefficient(lens, coefficient)
+        uv = undistort(few.pixels.reshape(-1, 2), curved).reshape(len(few), 4, 2)
+        valid = np.isfinite(uv).all(axis=(1, 2))
+        rotations, _ = solve_squares(uv[valid], sides_m[valid])
+        costs.append(_common_normal(rotations[..., 2])[1] + int((~valid).sum()))
+    return _with_coefficient(lens, float(_COEFFICIENTS[int(np.argmin(costs))]))
+
+
+def _with_coefficient(lens: CameraCalibration, coefficient: float) -> CameraCalibration:
+    return replace(lens, D=np.r_[coefficient, lens.D[1:]])
+
+
+def _common_normal(normals: Array) -> tuple[Array, float]:
+    """Return the direction (3,) that most markers share, from two candidates each (n, 2, 3), and its cost."""
     if not len(normals):
-        return np.array([0.0, 0.0, -1.0])
+        return np.array([0.0, 0.0, -1.0]), 0.0
     candidates = normals[:: max(1, len(normals) // _CANDIDATES)].reshape(-1, 3)
     angles = np.arccos(np.clip(np.einsum("nkd,cd->cnk", normals, candidates), -1, 1)).min(axis=2)
     losses = np.minimum(angles / _ALIKE_RAD, 1.0) ** 2
@@ -68,7 +96,8 @@ def _common_normal(normals: Array) -> Array:
         near = cosines.max(axis=1) > np.cos(_ALIKE_RAD)
         up = own[near].sum(axis=0) if near.any() else up
         up = up / np.linalg.norm(up)
-    return np.asarray(up)
+    angles = np.arccos(np.clip(normals @ up, -1, 1)).min(axis=1)
+    return np.asarray(up), float((np.minimum(angles / _ALIKE_RAD, 1.0) ** 2).sum())
 
 
 def _level_from_up(up: Array) -> Array:

@@ -111,7 +111,7 @@ class Factorisation:
             band[0] *= 1 + damping
             self.band = cholesky_banded(band, lower=True, check_finite=False)
             # The columns of mixed, divided by the Cholesky factor.
-            self.whitened = self._forward(mixed)
+            self.whitened = self.forward(mixed)
         else:
             self.band, self.whitened = normal.band, mixed
         dense = normal.dense[np.ix_(free, free)]
@@ -125,11 +125,11 @@ class Factorisation:
         """Return the step of the global (g,) and the local unknowns (l,) that minimises the quadratic."""
         by_global = np.zeros(len(self.free))
         if not self.local_count:
-            by_global[self.free] = -self._solve_reduced(normal.global_gradient[self.free])
+            by_global[self.free] = -self.solve_reduced(normal.global_gradient[self.free])
             return by_global, np.zeros(0)
-        pulled = self._forward(normal.local_gradient[:, None])
+        pulled = self.forward(normal.local_gradient[:, None])
         gradient = normal.global_gradient[self.free] - self.whitened.T @ pulled[:, 0]
-        by_global[self.free] = -self._solve_reduced(gradient)
+        by_global[self.free] = -self.solve_reduced(gradient)
         right = -(pulled[:, 0] + self.whitened @ by_global[self.free])
         return by_global, self._backward(right[:, None])[:, 0]
 
@@ -151,15 +151,18 @@ class Factorisation:
         """
         unit = np.zeros((self.local_count, size))
         unit[start + np.arange(size), np.arange(size)] = 1.0
-        own = self._forward(unit)
+        own = self.forward(unit)
         slopes = np.zeros((size, len(self.free)))
         slopes[:, self.free] = -own.T @ self.whitened
         return slopes, np.asarray(own.T @ own)
 
-    def _solve_reduced(self, right: Array) -> Array:
-        return np.asarray(cho_solve(self.reduced, right * self.units, check_finite=False) * self.units)
+    def solve_reduced(self, right: Array) -> Array:
+        """Solve for the free global unknowns (f,) or (f, k), after the elimination of the local ones."""
+        units = self.units if right.ndim == 1 else self.units[:, None]
+        return np.asarray(cho_solve(self.reduced, right * units, check_finite=False) * units)
 
-    def _forward(self, right: Array) -> Array:
+    def forward(self, right: Array) -> Array:
+        """Divide columns (l, k) by the Cholesky factor of the local unknowns."""
         return np.asarray(lapack.dtbtrs(self.band, right, uplo="L")[0])
 
     def _backward(self, right: Array) -> Array:

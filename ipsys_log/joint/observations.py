@@ -111,8 +111,8 @@ class Sightings:
     body : (n,), indices of bodies.
     point : (n,), indices of the calibration points at which the bodies are stationary; -1: the body moves.
     times_s : (n,), instants of exposure by the camera's own clock.
-    pixels : (n, p, 2), in px of the raw image.
-    covariances_px2 : (n, 2 p, 2 p), of x0 y0 x1 y1 ...
+    pixels : (n, p, 2), in px of the raw image; NaN for a point that is not visible.
+    covariances_px2 : (n, 2 p, 2 p), of x0 y0 x1 y1 ...; without correlation with points that are not visible.
     """
 
     body: Indices

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +91,8 @@ class State:
     values : (g,), the global unknowns. The three of a camera's rotation are unused.
     camera_turns : (c, 3, 3), ``camera_from_world``.
     positions_m, turns : (t, 3) and (t, 3, 3), poses of the stationary bodies in the world.
-    knots : (k, 3), knots of the paths: x, y in m and heading in rad.
+    knots : (k, 3), knots of the paths over the floor: x, y in m and heading in rad.
+    free_knots : (f, 6), knots of free paths: position in m, and rotation vector from the mean orientation.
     """
 
     values: Array
@@ -99,11 +100,14 @@ class State:
     positions_m: Array
     turns: Array
     knots: Array
+    free_knots: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     def moved(self, layout: Layout, by_global: Array, by_local: Array) -> State:
         """Return the state after a step: (g,) of the global and (l,) of the local unknowns."""
-        count = len(self.positions_m)
-        poses = by_local[: 6 * count].reshape(-1, 6)
+        poses, knots, free_knots = np.split(
+            by_local, [6 * len(self.positions_m), 6 * len(self.positions_m) + self.knots.size]
+        )
+        poses = poses.reshape(-1, 6)
         turned = np.stack([by_global[block.start : block.start + 3] for block in layout.cameras])
         return replace(
             self,
@@ -111,7 +115,8 @@ class State:
             camera_turns=rotate(turned) @ self.camera_turns,
             positions_m=self.positions_m + poses[:, :3],
             turns=rotate(poses[:, 3:]) @ self.turns,
-            knots=self.knots + by_local[6 * count :].reshape(-1, 3),
+            knots=self.knots + knots.reshape(-1, 3),
+            free_knots=self.free_knots + free_knots.reshape(-1, 6),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,12 @@ from scipy.linalg import solveh_banded
 
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.parameters import State
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.start import PlacedCamera
 from ipsys_log.joint.trajectories import Paths, Trajectories
 
-__all__ = ["StartedPaths", "start_paths"]
+__all__ = ["StartedPaths", "cover_times", "smooth_knots", "start_paths"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -132,27 +134,58 @@ def _step(part: _Places) -> float:
 
 
 def _fit_knots(paths: Paths, parts: list[_Places], settings: JointSettings) -> Array:
-    """Return the knots (k, 3) of the paths through all places, robust against wrong ones."""
-    knots = np.zeros((paths.knot_count, 3))
+    """Return the knots (k, 3) of the paths through all places."""
     if not parts:
-        return knots
+        return np.zeros((0, 3))
     trajectories = Trajectories(0, paths, settings.acceleration_sigma, settings.turn_sigma)
     numbers = np.repeat(np.arange(len(parts)), [len(part.times_s) for part in parts])
     times_s = np.concatenate([part.times_s for part in parts])
     places = np.concatenate([part.places for part in parts])
-    near, weights, _ = paths.weights(numbers, times_s)
     sigmas = np.array([_PLACE_M, _PLACE_M, _HEADING_RAD])
-    slopes = weights[:, None, :, None] * (np.eye(3) / sigmas)[None, :, None, :]
-    slopes = slopes.reshape(len(places), 3, 12)
+    return smooth_knots(paths, numbers, times_s, places, sigmas, trajectories)
+
+
+def cover_times(times_s: Array, step_s: float) -> Paths:
+    """Return one path that covers times (n,), with knots ``step_s`` apart."""
+    start_s = float(times_s.min()) - _PAD_S
+    count = int(np.ceil((float(times_s.max()) + _PAD_S - start_s) / step_s)) + 3
+    first = np.zeros(1, dtype=np.intp)
+    return Paths(np.array([start_s]), np.array([step_s]), first, np.array([count]), first)
+
+
+def smooth_knots(
+    paths: Paths,
+    numbers: Indices,
+    times_s: Array,
+    places: Array,
+    sigmas: Array,
+    trajectories: Trajectories,
+) -> Array:
+    """Return knots (k, d) of paths through places, robust against wrong ones.
+
+    Parameters
+    ----------
+    paths : the paths of ``trajectories``, over the floor (d = 3) or free (d = 6).
+    numbers, times_s, places : (n,), (n,) and (n, d), path, time and place of each sighting.
+    sigmas : (d,), usual errors of a place.
+    trajectories : the paths with their accelerations, and no stationary pose.
+    """
+    size = places.shape[1]
+    empty = State(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    knots = np.zeros((paths.knot_count, size))
+    near, weights, _ = paths.weights(numbers, times_s)
+    slopes = weights[:, None, :, None] * (np.eye(size) / sigmas)[None, :, None, :]
+    slopes = slopes.reshape(len(places), size, 4 * size)
     roots = np.ones(len(places))
     for _ in range(_ROUNDS):
-        normal = NormalEquations(3 * paths.knot_count, 0, trajectories.bandwidth)
+        normal = NormalEquations(size * paths.knot_count, 0, trajectories.bandwidth)
         values = (weights[:, :, None] * knots[near[:, None] + np.arange(4)]).sum(axis=1)
         residuals = (values - places) / sigmas
-        normal.add_local(3 * near, slopes * roots[:, None, None], residuals * roots[:, None])
-        trajectories.add_accelerations(normal, knots)
+        normal.add_local(size * near, slopes * roots[:, None, None], residuals * roots[:, None])
+        moved = replace(empty, knots=knots) if size == 3 else replace(empty, free_knots=knots)
+        trajectories.add_accelerations(normal, moved)
         step = solveh_banded(normal.band, -normal.local_gradient, lower=True, check_finite=False)
-        knots = knots + step.reshape(-1, 3)
+        knots = knots + step.reshape(-1, size)
         values = (weights[:, :, None] * knots[near[:, None] + np.arange(4)]).sum(axis=1)
         chi2 = (((values - places) / sigmas) ** 2).sum(axis=1)
         roots = 1 / np.sqrt(1 + chi2 / max(9.0, 4 * float(np.median(chi2))))

@@ -12,7 +12,7 @@ from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.point_factors import PointFactors
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.sighting_factors import SightingFactors
-from ipsys_log.joint.trajectories import Trajectories
+from ipsys_log.joint.trajectories import Kind, Trajectories
 
 __all__ = ["Problem"]
 
@@ -34,7 +34,7 @@ class Problem:
         for factors in self.sightings:
             chi2 = (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1)
             total += float(robust_loss(chi2, factors.limit * ease)[0].sum()) / 2
-        total += float((self.trajectories.acceleration_residuals(state.knots) ** 2).sum()) / 2
+        total += float((self.trajectories.acceleration_residuals(state) ** 2).sum()) / 2
         return total + float(self._prior_loss(state)[1].sum()) / 2
 
     def prior_residuals(self, state: State) -> Array:
@@ -50,7 +50,7 @@ class Problem:
         for factors in self.sightings:
             factors.add_to(normal, state, layout, trajectories, ease)
         self.points.add_to(normal, state, layout, ease)
-        trajectories.add_accelerations(normal, state.knots)
+        trajectories.add_accelerations(normal, state)
         residuals, loss, weights = self._prior_loss(state)
         normal.cost += float(loss.sum()) / 2
         sigma = layout.sigma
@@ -76,7 +76,7 @@ class Problem:
             self,
             sightings=tuple(
                 factors.reweighted(state, self.layout, self.trajectories, tilt_sigma_rad)
-                if factors.moving
+                if factors.kind is Kind.FLOOR
                 else factors
                 for factors in self.sightings
             ),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["cross", "level_turns", "rotate"]
+__all__ = ["cross", "left_jacobians", "level_turns", "rotate"]
 
 Array = NDArray[np.float64]
 
@@ -39,3 +39,22 @@ def cross(first: Array, second: Array) -> Array:
     product = np.empty(np.broadcast_shapes(first.shape, second.shape))
     product[..., 0], product[..., 1], product[..., 2] = b * z - c * y, c * x - a * z, a * y - b * x
     return product
+
+
+def left_jacobians(vectors_rad: Array) -> Array:
+    """Return matrices (n, 3, 3) from a change of rotation vectors (n, 3) to the turn in fixed axes.
+
+    References
+    ----------
+    Barfoot, State estimation for robotics, 2017, eq. (7.77).
+    """
+    angles = np.sqrt((vectors_rad * vectors_rad).sum(axis=1))
+    small = angles < 1e-4
+    safe = np.where(small, 1.0, angles)
+    first = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1 / 6, (safe - np.sin(safe)) / safe**3)
+    skew = np.zeros((len(vectors_rad), 3, 3))
+    x, y, z = vectors_rad.T
+    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -z, y, -x
+    skew[:, 1, 0], skew[:, 2, 0], skew[:, 2, 1] = z, -y, x
+    return np.asarray(np.eye(3) + first[:, None, None] * skew + second[:, None, None] * skew @ skew)

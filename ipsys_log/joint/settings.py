@@ -14,6 +14,8 @@ class JointSettings:
     Attributes
     ----------
     floor_sigma_m, floor_length_m : standard deviation and correlation length of the floor's unevenness.
+    floor_sigma_spread : uncertainty of this standard deviation, as that of its logarithm. The fit estimates
+        it; 0 keeps it constant.
     corner_floor_px : error of a corner that the covariance of the detection does not contain: the rest of the
         lens distortion, and the print. An average over frames does not reduce it.
     focal_sigma, centre_sigma, distortion_sigma : uncertainty of a chessboard calibration: focal length
@@ -34,6 +36,7 @@ class JointSettings:
 
     floor_sigma_m: float = 0.001
     floor_length_m: float = 0.5
+    floor_sigma_spread: float = 1.0
     corner_floor_px: float = 0.01
     focal_sigma: float = 0.003
     centre_sigma: float = 0.002

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
-from ipsys_log.joint.marker_views import MarkerViews, view_markers
+from ipsys_log.joint.marker_views import MarkerViews, guess_distortion, view_markers
 from ipsys_log.joint.observations import Observations
+from ipsys_log.messages import CameraCalibration
 
 __all__ = ["PlacedCamera", "place_cameras"]
 
@@ -28,10 +29,11 @@ _GAP_S = 0.5
 class PlacedCamera:
     """A camera with a rough pose, and the markers in world coordinates as the camera sees them.
 
-    ``camera_from_world`` is a rotation (3, 3), ``origin_m`` (3,) the position. ``points_m`` is (n, 3),
-    ``headings_rad`` (n,), ``rays`` (n, 3).
+    ``lens`` are its intrinsics; nominal ones have a guessed distortion. ``camera_from_world`` is a rotation
+    (3, 3), ``origin_m`` (3,) the position. ``points_m`` is (n, 3), ``headings_rad`` (n,), ``rays`` (n, 3).
     """
 
+    lens: CameraCalibration
     camera_from_world: Array
     origin_m: Array
     points_m: Array
@@ -70,7 +72,11 @@ def place_cameras(observations: Observations) -> list[PlacedCamera]:
         A camera has no measured points and shares no marker with a placed camera.
     """
     views = [
-        view_markers(sightings, observations.bodies, camera.lens)
+        view_markers(
+            sightings,
+            observations.bodies,
+            guess_distortion(sightings, camera.lens) if camera.nominal else camera.lens,
+        )
         for sightings, camera in zip(observations.sightings, observations.cameras, strict=True)
     ]
     known = _measured_places(observations)
@@ -209,6 +215,7 @@ def _align(matches: _Matches) -> tuple[float, Array]:
 def _moved(view: MarkerViews, shift_m: Array, turn_rad: float) -> PlacedCamera:
     turn = _about_vertical(turn_rad)
     return PlacedCamera(
+        view.lens,
         (turn @ view.level_from_camera).T,
         shift_m,
         view.points_m @ turn.T + shift_m,
@@ -241,6 +248,7 @@ def _anchor(observations: Observations, cameras: list[PlacedCamera], known: Arra
     turn = _about_vertical(turn_rad)
     return [
         PlacedCamera(
+            placed.lens,
             placed.camera_from_world @ turn.T,
             turn @ placed.origin_m + shift_m,
             placed.points_m @ turn.T + shift_m,

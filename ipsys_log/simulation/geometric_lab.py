@@ -69,6 +69,10 @@ class GeometricSettings:
     wobble_deg, wobble_s : tilt of a driving robot about each horizontal axis (RMS), and its correlation time.
     clock_offset_s : the stamps of each camera are late by a constant, uniform between minus and plus this.
     frame_delays_s : true delay of the frames of each camera after those of the first; repeated if short.
+    marker_scale_sigma : relative standard deviation of the true side of each marker; the rig has the nominal
+        one.
+    robot_height_sigma_m : standard deviation of the true height of each robot's marker; the rig has
+        ``drive_height_m`` for all.
     row_time_in_rig : whether the rig has the row time of the lab; otherwise markers have no time offset.
     corner_noise : factor of the corner noise; 0 gives exact corners with the usual covariances.
     """
@@ -84,6 +88,8 @@ class GeometricSettings:
     wobble_s: float = 0.5
     clock_offset_s: float = 0.0
     frame_delays_s: tuple[float, ...] = (0.0,)
+    marker_scale_sigma: float = 0.0
+    robot_height_sigma_m: float = 0.0
     row_time_in_rig: bool = True
     corner_noise: float = 1.0
 
@@ -100,6 +106,8 @@ class GeometricSettings:
             "floor_rms_m": self.floor_rms_m,
             "wobble_deg": self.wobble_deg,
             "clock_offset_s": self.clock_offset_s,
+            "marker_scale_sigma": self.marker_scale_sigma,
+            "robot_height_sigma_m": self.robot_height_sigma_m,
             "corner_noise": self.corner_noise,
         }
         for name, value in numbers.items():
@@ -119,9 +127,10 @@ class PlacedMarkers:
     centres_m: Array
     rotations: Array
 
-    def corners_m(self, length_m: float) -> Array:
-        """Return the corners of squares with a side, in OpenCV's order, (n, 4, 3) in world m."""
-        corners: Array = marker_corners(length_m) @ self.rotations.swapaxes(1, 2) + self.centres_m[:, None]
+    def corners_m(self, length_m: float | Array) -> Array:
+        """Return the corners of squares in OpenCV's order, (n, 4, 3) in world m; one side, or (n,) sides."""
+        arms_m = marker_corners(1.0) * np.reshape(length_m, (-1, 1, 1))
+        corners: Array = arms_m @ self.rotations.swapaxes(1, 2) + self.centres_m[:, None]
         return corners
 
 
@@ -138,7 +147,8 @@ class GeometricLab:
     clock_offsets_ns : by camera; a stamp is the true time plus this.
     frame_delays_ns : by camera; true time of a frame after the instant of all cameras.
     points : calibration points, in sets of simultaneous ones; z_m is the height above the uneven floor.
-    drive : the robots' path; its heights are above the uneven floor.
+    drive : the robots' path; its height is that of the rig.
+    sides_m, robot_heights_m : true side of each marker, and its true height above the floor on its robot.
     wobble : by marker, the tilts of a robot in rad about world x and y.
     """
 
@@ -150,6 +160,8 @@ class GeometricLab:
     frame_delays_ns: Mapping[str, int]
     points: tuple[tuple[SimulatedPose, ...], ...]
     drive: Drive
+    sides_m: Mapping[int, float]
+    robot_heights_m: Mapping[int, float]
     wobble: Mapping[int, SmoothSignal]
 
     def camera(self, name: str) -> Camera:
@@ -181,7 +193,7 @@ class GeometricLab:
     def drive_poses(self, marker_id: int, times_s: Array) -> PlacedMarkers:
         """Return the true poses of a robot's marker at times (n,) in s after the start of the drive."""
         path = self.drive.poses_over(marker_id, times_s)
-        poses = np.insert(path, 2, self.drive.height_m, axis=1)
+        poses = np.insert(path, 2, self.robot_heights_m[marker_id], axis=1)
         return self.place(poses, self.wobble[marker_id].at(times_s))
 
 
@@ -202,6 +214,9 @@ def build_lab(settings: GeometricSettings) -> GeometricLab:
     clocks = random_stream(lab.seed, Purpose.CLOCK).uniform(-1, 1, len(names)) * settings.clock_offset_s
     delays_s = [settings.frame_delays_s[n % len(settings.frame_delays_s)] for n in range(len(names))]
     drive = plan_drive(lab, cameras)
+    prints = random_stream(lab.seed, Purpose.PRINTS).standard_normal((lab.markers, 2))
+    scales = 1 + settings.marker_scale_sigma * prints[:, 0]
+    heights_m = lab.drive_height_m + settings.robot_height_sigma_m * prints[:, 1]
     return GeometricLab(
         settings,
         cameras,
@@ -216,6 +231,8 @@ def build_lab(settings: GeometricSettings) -> GeometricLab:
         {name: round(delay * NS_PER_S) for name, delay in zip(names, delays_s, strict=True)},
         _choose_points(settings, cameras),
         drive,
+        dict(enumerate((lab.marker_length_m * scales).tolist())),
+        dict(enumerate(heights_m.tolist())),
         {
             marker_id: SmoothSignal.draw(
                 np.radians(settings.wobble_deg),

@@ -278,7 +278,7 @@ def _still_parts(lab: GeometricLab, camera: Camera) -> Iterator[_Part]:
         placed = lab.place(np.repeat(_as_array(poses), count, axis=0))
         ids = np.repeat([pose.marker_id for pose in poses], count)
         placements = np.repeat(np.arange(index, index + len(poses)), count)
-        corners_m = placed.corners_m(lab.settings.lab.marker_length_m)
+        corners_m = placed.corners_m(np.array([lab.sides_m[n] for n in ids.tolist()]))
         yield _Part(np.tile(times_ns, len(poses)), ids, placements, placed, corners_m)
         index += len(poses)
 
@@ -289,24 +289,21 @@ def _drive_parts(lab: GeometricLab, camera: Camera) -> Iterator[_Part]:
     count = len(frames_ns)
     first = sum(map(len, lab.points))
     for marker_id in lab.drive.ahead_s:
-        late_s = _exposures(lab, camera, marker_id, since_s)
-        placed = lab.drive_poses(marker_id, since_s + late_s.mean(axis=1))
-        if lab.settings.lab.row_time_ns:
-            corners_m = _corners_at(lab, marker_id, since_s[:, None] + late_s)
-        else:
-            corners_m = placed.corners_m(lab.settings.lab.marker_length_m)
+        times_s = since_s[:, None] + _exposures(lab, camera, marker_id, since_s)
+        placed = lab.drive_poses(marker_id, times_s.mean(axis=1))
+        corners_m = _corners_at(lab, marker_id, times_s)
         placements = first + np.arange(count)
         yield _Part(frames_ns, np.full(count, marker_id), placements, placed, corners_m)
         first += count
 
 
 def _exposures(lab: GeometricLab, camera: Camera, marker_id: int, since_s: Array) -> Array:
-    """Return the exposure of each corner after that of the first row, (n, 4) in s.
+    """Return the exposure of a marker after that of the first row, (n, 1) in s, or of its corners, (n, 4).
 
     With a known row time, detect fits the motion: its corners are those at the mean time of the marker.
     Otherwise the image shows each corner at its own time.
     """
-    settings, late_s = lab.settings.lab, np.zeros((len(since_s), 4))
+    settings, late_s = lab.settings.lab, np.zeros((len(since_s), 1))
     if not settings.row_time_ns:
         return late_s
     # A robot moves by a few pixels during a frame: the last repetition changes less than a nanosecond.
@@ -314,17 +311,17 @@ def _exposures(lab: GeometricLab, camera: Camera, marker_id: int, since_s: Array
         rows = _project(camera, _corners_at(lab, marker_id, since_s[:, None] + late_s))[..., 1]
         rows = np.clip(np.nan_to_num(rows), 0, settings.height)
         if lab.settings.row_time_in_rig:
-            rows = np.repeat(rows.mean(axis=1, keepdims=True), 4, axis=1)
+            rows = rows.mean(axis=1, keepdims=True)
         late_s = rows * settings.row_time_ns / NS_PER_S
     return late_s
 
 
 def _corners_at(lab: GeometricLab, marker_id: int, times_s: Array) -> Array:
-    """Return the corners (n, 4, 3) of a robot's marker, each at its own time (n, 4) in s."""
+    """Return the corners (n, 4, 3) of a robot's marker at times (n, 1), or each at its own time (n, 4)."""
     placed = lab.drive_poses(marker_id, times_s.reshape(-1))
-    corners_m = placed.corners_m(lab.settings.lab.marker_length_m).reshape(-1, 4, 4, 3)
+    corners_m = placed.corners_m(lab.sides_m[marker_id])
     own = np.arange(4)
-    return np.asarray(corners_m[:, own, own])
+    return corners_m if times_s.shape[1] == 1 else np.asarray(corners_m.reshape(-1, 4, 4, 3)[:, own, own])
 
 
 def _project(camera: Camera, corners_m: Array) -> Array:

@@ -34,6 +34,7 @@ class Purpose(IntEnum):
     CORNERS = 14
     WOBBLE = 15
     GEOMETRY = 16
+    PRINTS = 17
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

@@ -29,7 +29,7 @@ def residuals_of(problem: Problem, state: State, ease: float = 1.0) -> Array:
         _robust(points.heights[:, None], one),
         _robust(points.places, two),
         points.tilts.ravel(),
-        trajectories.acceleration_residuals(state.knots).ravel(),
+        trajectories.acceleration_residuals(state),
     ]
     prior = problem.prior_residuals(state)
     bodies = slice(layout.scales.start, layout.heights.stop)
@@ -38,7 +38,7 @@ def residuals_of(problem: Problem, state: State, ease: float = 1.0) -> Array:
     return np.concatenate(parts)
 
 
-def _robust(residuals: Array, limit: float) -> Array:
+def _robust(residuals: Array, limit: Array | float) -> Array:
     chi2 = (residuals**2).sum(axis=1)
     loss, _ = robust_loss(chi2, limit)
     return np.asarray((residuals * np.sqrt(loss / np.maximum(chi2, 1e-300))[:, None]).ravel())

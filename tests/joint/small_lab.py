@@ -92,7 +92,7 @@ def make_lab(
             Sightings(
                 np.zeros(count, dtype=np.intp),
                 np.array([number for number, _ in own], dtype=np.intp),
-                np.zeros(count),
+                np.arange(count, dtype=np.float64),
                 np.array([pixels for _, pixels in own]).reshape(-1, 4, 2),
                 np.tile(noise_px**2 * np.eye(8), (count, 1, 1)),
             )

@@ -102,14 +102,16 @@ def test_session_is_a_log_in_order_with_a_valid_rig() -> None:
     assert messages[-1].topic == "/runs/geometric/record"
     measured = [m.payload for m in messages if isinstance(m.payload, Measurement)]
     assert [m.splits for m in measured] == [("train",)] * 4
-    # Each camera has a sighting of a measured marker in its stationary interval, by its own clock.
+    # All five frames of a camera are in the stationary interval, by its own clock.
+    seen = sightings_of(messages)
     for measurement in measured:
         assert measurement.still is not None
-        assert any(
-            measurement.still.start <= time_ns <= measurement.still.end
-            for _, time_ns, marker_id in sightings_of(messages)
-            if marker_id == measurement.marker_id
-        )
+        frames = {camera: 0 for camera, _, _ in seen}
+        for camera, time_ns, marker_id in seen:
+            inside = measurement.still.start <= time_ns <= measurement.still.end
+            frames[camera] += inside and marker_id == measurement.marker_id
+        assert 5 in frames.values()
+        assert set(frames.values()) <= {0, 5}
 
 
 def test_equal_settings_give_equal_bytes_and_other_seeds_others() -> None:
@@ -198,6 +200,37 @@ def test_wobble_tilts_robots_by_the_stated_angle() -> None:
     assert tilts_deg.std(axis=0) == pytest.approx([0.6, 0.6], rel=0.15)
     still = build_lab(SMALL).drive_poses(0, np.linspace(0, 5, 50)).rotations[:, :, 2]
     assert still == pytest.approx(np.tile([0.0, 0.0, 1.0], (50, 1)), abs=1e-12)
+
+
+def test_prints_and_robots_differ_from_the_rig_by_their_sigmas() -> None:
+    varied = replace(SMALL, points=1, marker_scale_sigma=0.002, robot_height_sigma_m=0.001)
+    labs = [build_lab(replace(varied, lab=LabSettings(seed=seed, drive_s=0.0))) for seed in range(40)]
+    sides_m = np.array([[*lab.sides_m.values()] for lab in labs]).ravel()
+    heights_m = np.array([[*lab.robot_heights_m.values()] for lab in labs]).ravel()
+    assert (sides_m / 0.2 - 1).std() == pytest.approx(0.002, rel=0.3)
+    assert (heights_m - 0.1).std() == pytest.approx(0.001, rel=0.3)
+    assert abs(np.corrcoef(sides_m, heights_m)[0, 1]) < 0.4
+
+
+def test_markers_of_another_size_and_height_are_seen_as_such() -> None:
+    lab = build_lab(replace(SMALL, marker_scale_sigma=0.05, robot_height_sigma_m=0.02))
+    messages = list(simulate_session(lab))
+    truth = {m.publish_time_ns: m.payload for m in messages if isinstance(m.payload, Tracks)}
+    for (camera, time_ns, marker_id), marker in sightings_of(messages).items():
+        track = next(one for one in truth[time_ns].tracks if one.id == marker_id)
+        centre_m = np.array([track.x_m, track.y_m, track.z_m])
+        nominal_m = square_at(track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0)
+        corners_m = centre_m + lab.sides_m[marker_id] / 0.2 * (nominal_m - centre_m)
+        assert marker.corners_px == pytest.approx(by_opencv(lab.camera(camera), corners_m), abs=1e-6)
+    end = max(truth)
+    driving_m = {track.id: track.z_m for track in truth[end].tracks}
+    assert driving_m == pytest.approx(dict(lab.robot_heights_m))
+
+
+def test_held_out_points_have_the_split_test() -> None:
+    messages = simulate_session(build_lab(replace(SMALL, held_out_points=3)))
+    splits = [m.payload.splits for m in messages if isinstance(m.payload, Measurement)]
+    assert splits == [("train",)] * 4 + [("test",)] * 3
 
 
 def test_intrinsics_of_the_user_have_the_stated_errors() -> None:

@@ -19,7 +19,7 @@ from ipsys_log.joint.refusals import check_observations, check_spread
 from ipsys_log.joint.rotations import level_turns
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
-from ipsys_log.joint.solver import Solution, solve
+from ipsys_log.joint.solver import SHORT, Solution, solve
 from ipsys_log.joint.start import PlacedCamera, place_cameras
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 _BEYOND_M = 1.0
 # Before the wobble of robots is known from their poses, a step need not be so exact.
 _ROUGH = 0.3
+# The same before the unevenness of the floor is known.
+_NEAR = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,9 +83,9 @@ def fit_jointly(
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
         state = solve(problem, state, progress, _ROUGH).state
         problem = problem.reweighted(state, settings.wobble_sigma_rad)
-    fit = _solve(observations, settings, problem, state, progress)
     if not problem.layout.floor.count or not settings.floor_sigma_spread:
-        return fit
+        return _solve(observations, settings, problem, state, progress)
+    fit = _solve(observations, settings, problem, state, progress, _NEAR)
     modes = problem.layout.modes
     factor = most_likely_scale(
         fit.state.values[modes], fit.covariance[modes, modes], settings.floor_sigma_spread
@@ -97,8 +99,9 @@ def _solve(
     problem: Problem,
     state: State,
     progress: Callable[[int, float], None],
+    short: float = SHORT,
 ) -> JointFit:
-    solution = solve(problem, state, progress)
+    solution = solve(problem, state, progress, short)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
 
 

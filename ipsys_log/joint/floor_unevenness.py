@@ -17,8 +17,8 @@ _LEAST, _MOST = -3.0, 3.0
 def most_likely_scale(amplitudes: Array, covariance: Array, spread: float) -> float:
     """Return the factor on the floor's standard deviation that makes the observations most likely.
 
-    The amplitudes have a standard normal prior. What the observations alone say of them follows from their
-    mean and covariance after the fit. With another factor, the prior changes, and so does the probability of
+    The amplitudes have a standard normal prior. Their mean and covariance after the fit, without this prior,
+    are the information in the observations. Another factor changes the prior, and thereby the probability of
     the observations (the evidence, with all other unknowns integrated out).
 
     Parameters

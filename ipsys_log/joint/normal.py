@@ -116,7 +116,7 @@ class Factorisation:
             self.band, self.whitened = normal.band, mixed
         dense = normal.dense[np.ix_(free, free)]
         reduced = dense - self.whitened.T @ self.whitened
-        reduced[np.diag_indices_from(reduced)] += damping * dense.diagonal()
+        reduced[np.diag_indices_from(reduced)] *= 1 + damping
         # A diagonal of 1 avoids that the units of the unknowns decide on the rank.
         self.units = 1 / np.sqrt(np.maximum(dense.diagonal(), np.finfo(np.float64).tiny))
         self.reduced = cho_factor(reduced * self.units[:, None] * self.units, lower=True, check_finite=False)

@@ -104,7 +104,9 @@ def _descend(
         if np.isfinite(cost) and cost <= normal.cost:
             # A short step by strong damping is no sign of a minimum.
             decrement = expected if damping <= _FIRST_DAMPING else np.inf
-            return trial, cost, decrement, max(damping / 10, _LEAST_DAMPING)
+            # Weak directions converge only without damping: a step as good as expected ends it soon.
+            relief = 100.0 if normal.cost - cost > 0.25 * expected else 3.0
+            return trial, cost, decrement, max(damping / relief, _LEAST_DAMPING)
         if expected <= SHORT**2:
             # Rounding errors hide the decrease: this is the minimum.
             return state, normal.cost, 0.0, damping

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import FitError
+from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.observations import Observations
@@ -69,6 +70,18 @@ def test_camera_positions_are_as_accurate_as_stated(driven: tuple[GeometricLab, 
         covariance = fit.covariance[rows, rows]
         assert error_m @ np.linalg.solve(covariance, error_m) < 22.0
         assert np.linalg.norm(error_m[:2]) < 0.005
+
+
+def test_exchanged_robots_are_named() -> None:
+    observations = observe(make_drive(30.0, points=12))
+    steps_m = (0.05, -0.05)
+    wrong = tuple(
+        replace(body, height_m=(body.height_m or 0.0) + step_m)
+        for body, step_m in zip(observations.bodies, steps_m, strict=True)
+    )
+    faults = find_faults(fit_jointly(replace(observations, bodies=wrong), COARSE))
+    assert {(fault.kind, fault.subject) for fault in faults} == {("robot_height", "0"), ("robot_height", "1")}
+    assert "at 100 mm, not at 150 mm" in "".join(fault.text for fault in faults)
 
 
 def test_slopes_of_paths_match_differences() -> None:

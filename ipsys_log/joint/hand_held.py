@@ -5,7 +5,7 @@ Nothing is known of the world: the first camera is its origin, and the body give
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -17,7 +17,7 @@ from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.floor_field import make_floor_field
-from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.observations import Observations, Sightings
 from ipsys_log.joint.parameters import Layout, State, make_layout
 from ipsys_log.joint.path_start import cover_times, smooth_knots
 from ipsys_log.joint.point_factors import make_point_factors
@@ -27,7 +27,7 @@ from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import solve
 from ipsys_log.joint.trajectories import Kind, Paths, Trajectories
 
-__all__ = ["fit_hand_held"]
+__all__ = ["fit_hand_held", "predict_errors"]
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,7 @@ def fit_hand_held(
     settings: JointSettings | None = None,
     step_s: float = 0.1,
     progress: Callable[[int, float], None] = lambda step, cost: None,
+    camera_poses: Sequence[Array] | None = None,
 ) -> JointFit:
     """Estimate cameras that see one body, which stands at some points and else moves freely.
 
@@ -51,6 +52,8 @@ def fit_hand_held(
     settings : prior standard deviations; None: the defaults.
     step_s : time between the knots of the path.
     progress : called with the number of steps and the cost after each step.
+    camera_poses : ``camera_from_world`` (4, 4) of each camera, which remain constant; None: the fit estimates
+        them, and the first camera is the world.
 
     Raises
     ------
@@ -59,10 +62,35 @@ def fit_hand_held(
     """
     settings = settings or JointSettings()
     views = [_view(observations, camera) for camera in range(len(observations.cameras))]
-    cameras = _chain_cameras(observations, views)
+    cameras = _chain_cameras(observations, views) if camera_poses is None else list(camera_poses)
     problem, state = _build(observations, settings, cameras, views, step_s)
+    if camera_poses is not None:
+        problem = replace(problem, layout=_with_known_poses(problem.layout))
     solution = solve(problem, state, progress)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
+
+
+def predict_errors(fit: JointFit, camera: int, sightings: Sightings) -> Array:
+    """Return the reprojection errors of sightings, also of those that the fit did not use.
+
+    Parameters
+    ----------
+    fit : cameras and poses of the body, by :func:`fit_hand_held`.
+    camera : index of the camera.
+    sightings : sightings of the body, with p points each, that all move or are all stationary.
+
+    Returns
+    -------
+    (n, p, 2) in px; NaN for a point that is not visible.
+    """
+    visible = np.isfinite(sightings.pixels)
+    kind = Kind.FREE if (sightings.point < 0).all() else Kind.STATIONARY
+    number = np.maximum(sightings.point, 0)
+    factors = make_sighting_factors(camera, sightings, number, kind, fit.observations.bodies, 0.0)
+    units = np.broadcast_to(np.eye(visible[0].size), factors.whitening.shape)
+    problem = fit.problem
+    errors_px = replace(factors, whitening=units).residuals(fit.state, problem.layout, problem.trajectories)
+    return np.where(visible, errors_px.reshape(visible.shape), np.nan)
 
 
 def _view(observations: Observations, camera: int) -> Array:
@@ -179,6 +207,14 @@ def _layout(observations: Observations, settings: JointSettings) -> Layout:
     sigma = layout.sigma.copy()
     sigma[:6] = 0.0
     sigma[layout.heights] = 0.0
+    return replace(layout, sigma=sigma)
+
+
+def _with_known_poses(layout: Layout) -> Layout:
+    """Return the unknowns with constant poses of all cameras."""
+    sigma = layout.sigma.copy()
+    for block in layout.cameras:
+        sigma[block.start : block.start + 6] = 0.0
     return replace(layout, sigma=sigma)
 
 

@@ -11,7 +11,7 @@ from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import make_pose, rotation, transform
 from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.hand_held import fit_hand_held
+from ipsys_log.joint.hand_held import fit_hand_held, predict_errors
 from ipsys_log.joint.observations import Body, CalibrationPoint, CameraPrior, Observations, Sightings
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration
@@ -131,3 +131,23 @@ def test_camera_that_shares_no_view_is_refused() -> None:
     late = replace(third, times_s=third.times_s + 100.0)
     with pytest.raises(FitError, match="camera c2: it never sees the board at the same time"):
         fit_hand_held(replace(observations, sightings=(first, second, late)), FIXED)
+
+
+def test_known_cameras_remain_constant() -> None:
+    fit = fit_hand_held(wave_board(moving=False), FIXED, camera_poses=make_cameras())
+    assert not fit.problem.layout.free.any()
+    for turn, camera in zip(fit.state.camera_turns, make_cameras(), strict=True):
+        assert np.array_equal(turn, camera[:3, :3])
+    errors_px = [predict_errors(fit, n, own) for n, own in enumerate(fit.observations.sightings)]
+    # Six unknowns of each pose fit a part of the noise of 0.05 px.
+    assert 0.04 < np.sqrt(np.nanmean(np.concatenate(errors_px) ** 2)) < 0.05
+
+
+def test_errors_of_frames_out_of_the_fit_are_noise() -> None:
+    observations = wave_board(moving=True)
+    *others, last = observations.sightings
+    out = np.arange(len(last)) % 2 == 0
+    fit = fit_hand_held(replace(observations, sightings=(*others, last.select(~out))), FIXED)
+    errors_px = predict_errors(fit, 2, last.select(out))
+    assert np.array_equal(np.isnan(errors_px), np.isnan(last.select(out).pixels))
+    assert 0.045 < np.sqrt(np.nanmean(errors_px**2)) < 0.075

@@ -15,7 +15,7 @@ from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.poses import transform
 from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import build_models
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Measurement, Message, Pair, Rig
 from ipsys_log.simulation.cameras import FLOOR_M
@@ -286,7 +286,7 @@ def _joint(session: Session) -> Locator:
             covariances_px2 = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (len(corners_px), 8, 8))
         lengths_m = np.full(len(corners_px), session.rig.marker_length_m)
         sigma_m = lab.settings.robot_height_sigma_m
-        found = locate(models[camera], corners_px, covariances_px2, heights_m, lengths_m, sigma_m)
+        found = locate_markers(models[camera], corners_px, covariances_px2, heights_m, lengths_m, sigma_m)
         return found.points_m, found.covariances_m2
 
     return locator

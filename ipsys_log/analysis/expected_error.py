@@ -19,7 +19,7 @@ from ipsys_log.analysis.floor_error import GRID_M, WALL_M, WHOLE_PRINT
 from ipsys_log.analysis.plan import mean_length
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.rotations import level_turns
 
@@ -159,7 +159,7 @@ def _modes(
     corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
     count = len(corners_px)
     exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
-    located = locate(
+    located = locate_markers(
         model, corners_px, exact, np.full(count, height_m), np.full(count, length_m), 0.0, tilt_sigma_rad=0.0
     )
     return seen, located.modes_m[:, :2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 from ipsys_log.analysis.calibration_points import find_pairs, measured
 from ipsys_log.errors import FitError
@@ -12,25 +12,11 @@ from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.selection import seeing_cameras, without_points
-from ipsys_log.messages import CameraCalibration, Markers, Model, Rig
-from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
+from ipsys_log.messages import CameraCalibration, Markers, Model
+from ipsys_log.messages.channels import MARKERS, RIG
 from ipsys_log.messages.stage import Progress, StageView
-from ipsys_log.models.table import reads_corners
 
-__all__ = ["READS", "fit_joint_model", "fit_without", "is_nominal", "measured_part", "observe"]
-
-# The channels that a joint calibration reads.
-READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
-
-
-def measured_part(rig: Rig, options: Mapping[str, str]) -> object:
-    """Return the part of the rig on which fits depend, for the model in the options of the user."""
-    points = (rig.reference_points, {m.id for m in rig.markers})
-    if not reads_corners(options.get("model", "")):
-        return points
-    markers = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
-    cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
-    return points, markers, cameras, rig.tape_sigma_m
+__all__ = ["fit_joint_model", "fit_without", "is_nominal", "observe"]
 
 
 def observe(view: StageView) -> Observations:

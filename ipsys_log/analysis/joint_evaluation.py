@@ -11,7 +11,7 @@ from ipsys_log.analysis.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
 from ipsys_log.analysis.cross_validation import FOLDS, gather_points, make_folds
 from ipsys_log.analysis.joint_calibration import fit_without
 from ipsys_log.errors import FitError
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import restore_joint
@@ -87,7 +87,7 @@ def _predict(
         points = [observations.points[int(sightings.point[row])] for row in rows]
         bodies = [observations.bodies[point.body] for point in points]
         own = [by_name[point.name] for point in points]
-        located = locate(
+        located = locate_markers(
             model,
             sightings.pixels[rows],
             sightings.covariances_px2[rows],

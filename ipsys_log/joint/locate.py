@@ -12,7 +12,7 @@ from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.rotations import level_turns
 
-__all__ = ["Positions", "locate"]
+__all__ = ["Positions", "locate_markers"]
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class Positions:
     modes_m: Array
 
 
-def locate(
+def locate_markers(
     model: JointModel,
     corners_px: Array,
     covariances_px2: Array,

@@ -24,7 +24,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import tape_covariance
 from ipsys_log.joint.diagnosis import Finding, find_faults
 from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Rig
@@ -273,7 +273,7 @@ def _places(fit: JointFit, models: Mapping[str, JointModel]) -> list[Array]:
             for body, point in zip(sightings.body.tolist(), sightings.point.tolist(), strict=True)
         ]
         lengths_m = np.array([bodies[body].length_m for body in sightings.body.tolist()])
-        located = locate(
+        located = locate_markers(
             models[camera.name], sightings.pixels, sightings.covariances_px2, np.array(heights_m), lengths_m
         )
         places_m = located.points_m[:, :2]

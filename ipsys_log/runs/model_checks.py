@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.calibration_points import find_pairs, measured, split_ids
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CameraModel
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
@@ -163,7 +163,7 @@ def check_models(
         for name in models:
             model, _ = fitted_in(other, name)
             for camera in model.cameras if {EVALUATION, POSITIONS} & {*written} else ():
-                restore_joint(camera) if reads_corners(model.name) else AppliedModel(model.name, camera)
+                _restore(model.name, camera)
             fitted = {camera.camera for camera in model.cameras}
             if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(
@@ -171,6 +171,14 @@ def check_models(
                     f"{', '.join(sorted(fitted))}, but the log has {', '.join(sorted(cameras))}; give a "
                     "model of these cameras"
                 )
+
+
+def _restore(name: str, camera: CameraModel) -> object:
+    if not reads_corners(name):
+        return AppliedModel(name, camera)
+    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
+
+    return restore_joint(camera)
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:

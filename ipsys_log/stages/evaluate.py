@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import evaluate_cross_validated, evaluate_held_out
 from ipsys_log.analysis.calibration_points import (
+    JOINT_READS,
     find_pairs,
     has_measurements,
     held_out_ids,
     measured,
+    measured_part,
     split_parameters,
 )
 from ipsys_log.analysis.camera_models import fit_camera_models
@@ -28,8 +30,6 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
-from ipsys_log.analysis.joint_calibration import READS, measured_part, observe
-from ipsys_log.analysis.joint_evaluation import evaluate_joint
 from ipsys_log.analysis.outliers import find_outliers, is_gross
 from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.errors import FitError
@@ -208,13 +208,17 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     again = _is_fitted_here(view, options, model.name)
     seed = options.get("seed", "0")
     joint = reads_corners(model.name)
-    reads = (*READS, MODEL, TRUTH) if joint else (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
+    reads = (*JOINT_READS, MODEL, TRUTH) if joint else (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
     notes: list[str] = []
 
     def compute(progress: Progress) -> Evaluation:
         points = measured(view)
         measurements = [point.measurement for point in points]
         if joint:
+            # Late: scipy takes 1 s, and most commands need no joint model.
+            from ipsys_log.analysis.joint_calibration import observe
+            from ipsys_log.analysis.joint_evaluation import evaluate_joint
+
             return evaluate_joint(
                 model,
                 observe(view),
@@ -248,7 +252,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 STAGE = Stage(
     name="evaluate",
     versions={"evaluate": 2},
-    reads=(*READS, MODEL, TRUTH),
+    reads=(*JOINT_READS, MODEL, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,
     rig_part=measured_part,

@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibration_points import (
+    JOINT_READS,
     find_pairs,
     has_measurements,
     measured,
+    measured_part,
     split_ids,
     split_parameters,
 )
 from ipsys_log.analysis.camera_models import fit_camera_models
 from ipsys_log.analysis.cross_validation import gather_points
-from ipsys_log.analysis.joint_calibration import READS, fit_joint_model, measured_part
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Model, Pair
@@ -163,11 +164,18 @@ def _plan_joint(view: StageView, options: Mapping[str, str], parameters: Mapping
     notes: list[str] = []
 
     def compute(progress: Progress) -> Model:
+        # Late: scipy takes 1 s, and most commands fit nothing.
+        from ipsys_log.analysis.joint_calibration import fit_joint_model
+
         train, _ = split_ids([point.measurement for point in measured(view)], options)
-        return fit_joint_model(view, train, view.last_ns(*READS), notes, progress)
+        return fit_joint_model(view, train, view.last_ns(*JOINT_READS), notes, progress)
 
     return Plan(
-        run=model_run(parameters["model"]), parameters=parameters, reads=READS, compute=compute, notes=notes
+        run=model_run(parameters["model"]),
+        parameters=parameters,
+        reads=JOINT_READS,
+        compute=compute,
+        notes=notes,
     )
 
 
@@ -192,7 +200,7 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str
 STAGE = Stage(
     name="fit",
     versions={"fit": 1, **MODEL_VERSIONS},
-    reads=READS,
+    reads=JOINT_READS,
     writes=(MODEL,),
     plan=_plan,
     rig_part=measured_part,

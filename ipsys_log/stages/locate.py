@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.locate import locate
-from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.payload import restore_joint
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -28,6 +25,9 @@ from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
 from ipsys_log.models.table import AppliedModel, reads_corners, reads_height
 from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
 from ipsys_log.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from ipsys_log.joint.model import JointModel
 
 __all__ = ["STAGE", "Locate", "LocateCorners"]
 
@@ -117,6 +117,9 @@ class LocateCorners:
     """The stage *locate* for the model of all corners: each marker is level, at the height of the rig."""
 
     def __init__(self, model: Model) -> None:
+        # Late: scipy takes 1 s, and most commands need no joint model.
+        from ipsys_log.joint.payload import restore_joint
+
         self._name = model.name
         self._cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
         self._rig: Rig | None = None
@@ -134,8 +137,10 @@ class LocateCorners:
             yield Positions(message.publish_time_ns, positions)
 
     def _positions(self, camera: JointModel, markers: tuple[Marker, ...]) -> tuple[Position, ...]:
+        from ipsys_log.joint.locate import locate_markers
+
         unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
-        located = locate(
+        located = locate_markers(
             camera,
             np.array([marker.corners_px for marker in markers], dtype=np.float64),
             np.array([m.covariance_px2 if m.covariance_px2 is not None else unknown for m in markers]),

@@ -15,7 +15,7 @@ import pytest
 
 from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
 from ipsys_log.exchange.calibration_files import read_intrinsics
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Distance, Markers, Measurement, Message, Rig
@@ -100,7 +100,7 @@ def true_error_m(lab: GeometricLab, log: Path) -> tuple[float, float]:
     def locator(camera: str, corners_px: Any, heights_m: Any, covariances_px2: Any = None) -> Any:
         count = len(corners_px)
         exact = np.broadcast_to(1e-4 * np.eye(8), (count, 8, 8))
-        located = locate(cameras[camera], corners_px, exact, heights_m, np.full(count, length_m))
+        located = locate_markers(cameras[camera], corners_px, exact, heights_m, np.full(count, length_m))
         return located.points_m, located.covariances_m2
 
     nodes: list[KnownSightings] = [

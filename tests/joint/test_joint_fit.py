@@ -9,7 +9,7 @@ from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import pose_facing_up, transform
 from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import build_models
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.settings import JointSettings
@@ -38,7 +38,7 @@ def floor_errors_m(fit: JointFit, truth: Truth) -> Array:
         pixels = np.stack([project(transform(pose, corners), lens) for corners in corners_m])
         count = len(grid)
         noise = np.tile(1e-6 * np.eye(8), (count, 1, 1))
-        found = locate(model, pixels, noise, np.full(count, 0.1), np.full(count, LENGTH_M))
+        found = locate_markers(model, pixels, noise, np.full(count, 0.1), np.full(count, LENGTH_M))
         errors.append(found.points_m[:, :2] - np.array(grid)[:, :2])
     return np.concatenate(errors)
 

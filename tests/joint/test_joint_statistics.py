@@ -10,7 +10,7 @@ from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import pose_facing_up, transform
 from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
 
@@ -25,7 +25,7 @@ def locate_grid(models: dict[str, JointModel], truth: Truth) -> tuple[Array, Arr
     rows = np.full(len(GRID), 0.1), np.full(len(GRID), LENGTH_M), 0.0, 0.0
     for model, lens, pose in zip(models.values(), truth.lenses, truth.camera_from_world, strict=True):
         pixels = np.stack([project(transform(pose, corners), lens) for corners in corners_m])
-        found = locate(model, pixels, exact, *rows)
+        found = locate_markers(model, pixels, exact, *rows)
         errors.append(found.points_m[:, :2] - np.array(GRID)[:, :2])
         covariances.append(found.covariances_m2[:, :2, :2])
     return np.concatenate(errors), np.concatenate(covariances)

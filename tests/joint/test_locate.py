@@ -10,7 +10,7 @@ from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
 from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.locate import locate
+from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.locate_poses import locate_poses
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.parameters import State
@@ -55,7 +55,7 @@ def noise(sigma_px: float = 0.02) -> Array:
 
 def test_locate_of_exact_corners_is_exact(model: JointModel) -> None:
     corners_px = see(model, level_poses(model))
-    found = locate(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
+    found = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
     assert np.abs(found.points_m[:, :2] - np.array(POSES)[:, :2]).max() < 2e-5
     assert np.abs(found.headings_rad - np.array(POSES)[:, 3]).max() < 1e-4
     assert found.chi2.max() < 0.1
@@ -65,7 +65,7 @@ def test_locate_covariance_is_that_of_calibration_and_noise(fit: JointFit, model
     """Disturb the calibration by its covariance, and the corners by their noise: positions spread alike."""
     rng = np.random.default_rng(0)
     corners_px = see(model, level_poses(model))
-    stated = locate(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M, 0.0, 0.0).covariances_m2
+    stated = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M, 0.0, 0.0).covariances_m2
     layout, count = fit.problem.layout, 400
     root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(len(fit.covariance)))
     local = np.zeros(fit.problem.trajectories.local_count)
@@ -88,7 +88,7 @@ def test_locate_covariance_is_that_of_calibration_and_noise(fit: JointFit, model
             0.0,
         )
         moved_px = corners_px + rng.normal(0.0, 0.02, corners_px.shape)
-        points.append(locate(other, moved_px, noise(), HEIGHTS_M, LENGTHS_M).points_m)
+        points.append(locate_markers(other, moved_px, noise(), HEIGHTS_M, LENGTHS_M).points_m)
     spread = np.stack([np.cov(np.array(points)[:, n].T) for n in range(3)])
     ratio = np.sqrt(np.einsum("nii->ni", spread) / np.einsum("nii->ni", stated))
     assert np.abs(ratio - 1).max() < 0.15
@@ -97,10 +97,11 @@ def test_locate_covariance_is_that_of_calibration_and_noise(fit: JointFit, model
 def test_height_error_is_in_the_covariance(model: JointModel) -> None:
     corners_px = see(model, level_poses(model))
     low, high = (
-        locate(model, corners_px, noise(), HEIGHTS_M + step, LENGTHS_M).points_m for step in (-0.005, 0.005)
+        locate_markers(model, corners_px, noise(), HEIGHTS_M + step, LENGTHS_M).points_m
+        for step in (-0.005, 0.005)
     )
     without, with_height = (
-        locate(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M, sigma_m).covariances_m2
+        locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M, sigma_m).covariances_m2
         for sigma_m in (0.0, 0.005)
     )
     half = (high - low) / 2
@@ -134,7 +135,7 @@ def test_pose_agrees_with_scipy(model: JointModel) -> None:
 def test_model_from_its_arrays_is_identical(model: JointModel) -> None:
     again = JointModel.from_arrays(model.to_arrays(), model.calibration)
     corners_px = see(model, level_poses(model))
-    first, second = (locate(one, corners_px, noise(), HEIGHTS_M, LENGTHS_M) for one in (model, again))
+    first, second = (locate_markers(one, corners_px, noise(), HEIGHTS_M, LENGTHS_M) for one in (model, again))
     assert first.points_m.tobytes() == second.points_m.tobytes()
     assert first.covariances_m2.tobytes() == second.covariances_m2.tobytes()
 
@@ -152,6 +153,6 @@ def test_marker_beside_the_lens_has_no_position(model: JointModel) -> None:
     corners_px = see(model, level_poses(model))
     corners_px[1] += 1e6
     with np.errstate(all="ignore"):
-        found = locate(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
+        found = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
     assert np.isnan(found.points_m[1]).all()
     assert np.isfinite(found.points_m[[0, 2]]).all()

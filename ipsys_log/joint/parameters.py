@@ -125,9 +125,10 @@ def make_layout(
 ) -> Layout:
     """Return the order and the prior of the global unknowns; clocks are free if bodies are ``moving``."""
     blocks, means, sigmas, start = [], [], [], 0
-    for number, camera in enumerate(observations.cameras):
+    clocks = _free_clocks(observations) if moving else [False] * len(observations.cameras)
+    for camera, free in zip(observations.cameras, clocks, strict=True):
         block = CameraBlock(start, lens_model_of(camera.lens))
-        clock = settings.clock_sigma_s if moving and number else _FIXED
+        clock = settings.clock_sigma_s if free else _FIXED
         mean, sigma = _camera_prior(camera, settings, clock, moving)
         blocks.append(block)
         means.append(mean)
@@ -143,6 +144,17 @@ def make_layout(
         np.ones(floor.count),
     ]
     return Layout(tuple(blocks), len(bodies), floor, np.concatenate(means), np.concatenate(sigmas))
+
+
+def _free_clocks(observations: Observations) -> list[bool]:
+    """Return which cameras have a clock offset to estimate: those that see moving bodies, but one.
+
+    The clock of this one is the reference. A camera that hardly sees a moving body is no good reference,
+    because it does not determine the times of the paths.
+    """
+    counts = [int((sightings.point < 0).sum()) for sightings in observations.sightings]
+    reference = next(number for number, count in enumerate(counts) if 2 * count >= max(counts))
+    return [count > 0 and number != reference for number, count in enumerate(counts)]
 
 
 def _camera_prior(

@@ -28,8 +28,9 @@ from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Rig
-from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, Channel
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, Channel
 from ipsys_log.messages.stage import Progress
+from ipsys_log.runs.graph import writes
 from ipsys_log.runs.view import LogView
 
 __all__ = ["CameraResult", "LabCalibration", "describe_fit", "describe_lab"]
@@ -254,7 +255,9 @@ def describe_fit(
 
 def _inputs(session: Session, run: str) -> dict[Channel, str]:
     """Return the runs of markers and camera points that a fit read."""
-    record = next(record for record in reversed(session.runs()) if (record.run, record.stage) == (run, "fit"))
+    record = next(
+        record for record in reversed(session.runs()) if record.run == run and writes(record, MODEL)
+    )
     return {
         channel: source
         for channel in (MARKERS, CAMERA_POINTS)

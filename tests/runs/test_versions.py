@@ -11,7 +11,7 @@ import pytest
 
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.models.table import MODELS
+from ipsys_log.models.table import CORNER_MODELS, MODELS
 from ipsys_log.runs import provenance
 from ipsys_log.runs.graph import STAGES, VERSIONS, version_parameters
 from ipsys_log.runs.provenance import recorded_version
@@ -42,7 +42,7 @@ def made(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
 
 
 def test_everything_that_computes_has_a_version() -> None:
-    parts = {part for model in MODELS for part in model.split("+")}
+    parts = {part for model in (*MODELS, *CORNER_MODELS) for part in model.split("+")}
     assert VERSIONS.keys() == {*(stage.name for stage in STAGES), *CORNERS, *METHODS, *parts}
     assert min(VERSIONS.values()) >= 1
 

@@ -340,11 +340,11 @@ def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
         print(json.dumps(_as_json(lab), indent=2, allow_nan=False))  # noqa: T201
     else:
         for line in _headline(lab):
-            console.print(line)
+            console.print(line, markup=False, highlight=False)
         console.print()
         console.print(_table(lab))
         for line in _advice(lab):
-            console.print(line)
+            console.print(line, markup=False, highlight=False)
     for note in lab.notes:
         remarks.print(note, style="yellow", markup=False)
     if plot is not None:

@@ -1,6 +1,6 @@
 """Run the benchmarks and print their results: ratios first.
 
-    ./scripts/bench                      # all benchmarks, about a quarter of an hour
+    ./scripts/bench                      # all benchmarks, about half an hour
     ./scripts/bench detection startup    # some benchmarks
     ./scripts/bench --smoke              # with very little data: a test that they run, not a measurement
 

@@ -20,6 +20,7 @@ locate          camera points,      positions         the run of its model
 fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
+The model ``joint`` reads markers and intrinsics instead of camera points, in fit, evaluate and locate.
 All stages read the rig; locate reads it only for models that need the height of a marker.
 :mod:`ipsys_log.runs` has the details: the plan of each stage (``graph``), and the search or creation of its
 run (``execute``). :mod:`ipsys_log.capture` moves frames from the cameras into the log (``recorder``), and

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ipsys_log.messages import (
+    IMPORTED,
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
     CameraPoint,
@@ -155,7 +156,7 @@ def session(
             splits=labels(n),
         )
         yield Message(MEASUREMENTS_TOPIC, time_ns + 1, time_ns, measurement)
-    yield Message("/runs/lab/record", time_ns + 2, time_ns, Run(time_ns, "lab", "import"))
+    yield Message("/runs/lab/record", time_ns + 2, time_ns, Run(time_ns, "lab", IMPORTED))
 
 
 RIG = Rig(

@@ -43,6 +43,29 @@ def test_benchmark_smoke_run_writes_its_ratios(arguments: list[str], tmp_path: P
     assert pipelines["tracking"]["found"] > 0.8
 
 
+def test_accuracy_of_calibrations_is_measured(tmp_path: Path) -> None:
+    output, picture = tmp_path / "results.json", tmp_path / "floor.png"
+    command = [sys.executable, "bench.py", "joint", "--smoke", "--models", "rayplane,best"]
+    done = subprocess.run(
+        [*command, "-o", str(output), "--picture", str(picture)],
+        cwd=BENCHMARKS,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.replace(str(output), "").replace(str(picture), "").splitlines()
+    assert max(map(len, lines)) <= 80
+    results = json.loads(output.read_text(encoding="utf-8"))
+    assert 0 < results["ratios"]["joint"]["75 points: best / rayplane"]["median"] < 3
+    (lab,) = results["details"]["joint"]["75 points"]["rayplane"]
+    assert 0 < lab["aligned_mean_mm"] < lab["mean_mm"] < lab["p95_mm"] < 10
+    # A robot that stands still moves by less than the errors of the calibration.
+    assert 0 < lab["standing_mm"] < 0.05
+    assert set(lab["coverage"]) == {"grid", "points", "drive"}
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
 def test_corners_are_scored_against_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(BENCHMARKS)
     detection, scenes = importlib.import_module("detection"), importlib.import_module("scenes")

@@ -20,7 +20,7 @@ from tests.conftest import Ipsys
 from tests.playing import SteppedClock, cameras, playing
 from tests.test_live import RATE_HZ, lenses, sent
 
-MODELS = ("poly", "rigid")
+MODELS = ("poly", "joint")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def recorded(lab_log: Path, fitted: Path, tmp_path_factory: pytest.TempPathFacto
 def test_two_models_live_equal_two_replays(recorded: Path, fitted: Path, tmp_path: Path) -> None:
     with Session([recorded]) as session:
         live = {topic: session.hash(topic) for topic in derived(session)}
-        settings = [*session.topics(MODEL, "poly"), *session.topics(MODEL, "rigid")]
+        settings = [*session.topics(MODEL, "poly"), *session.topics(MODEL, "joint")]
         own = [topic for reader in session.readers for topic in reader.channels if "/runs/" not in topic]
         for model in MODELS:
             log = tmp_path / f"{model}.mcap"

@@ -47,6 +47,9 @@ def test_a_log_of_an_earlier_release(ipsys: Ipsys, tmp_path: Path, path: Path) -
         assert {run.run for run in session.runs()} == {"edges", "poly", "rigid", "best"}
         before = session.payloads(session.topics(POSITIONS, "poly"))
     # The stored results are correct, and a new computation agrees to a tenth of a micrometre.
+    done = ipsys("replay", log)
+    renewed = {line.split()[0] for line in done.err.splitlines() if "is computed again" in line}
+    assert renewed == {"evaluate", "locate"}
     assert "nothing to do" in ipsys("replay", log).err
     again = tmp_path / "again.mcap"
     assert ipsys("replay", log, "--run", "again", "-o", again).code == 0

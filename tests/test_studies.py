@@ -170,6 +170,20 @@ def test_a_wrong_side_is_found_named_and_put_right(ipsys: Ipsys, tmp_path: Path)
     assert (first["measurement"], first["kind"]) == ("m13", "side")
 
 
+def test_imported_run_is_not_repeatable_and_later_ones_are(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    log = tmp_path / "imsel.mcap"
+    ipsys("import", "imsel", data / "imsel", "-o", log)
+    assert ipsys("replay", log, "--model", "rigid").code == 0
+    rows = json.loads(ipsys("runs", log, "--json").out)
+    states = {(row["run"], row["stage"]): row["state"] for row in rows}
+    assert states.pop(("imsel", "import")) == "not repeatable"
+    assert set(states.values()) == {"current"}
+    verified = ipsys("verify", log)
+    assert (verified.code, verified.err) == (0, "")
+    assert "rigid/tracks" in verified.out
+    assert "imsel" not in verified.out
+
+
 # The published data with two models.
 @pytest.mark.slow
 def test_wrong_point_of_the_authors_ranks_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.cross_validation import cross_validate, gather_points
+from ipsys_log.analysis.camera_models import fit_camera_models, height_sigmas, tape_covariances
+from ipsys_log.analysis.cross_validation import FOLDS, cross_validate, gather_points, make_folds
 from ipsys_log.analysis.pairs import level_cameras
-from ipsys_log.messages import CameraEvaluation, CameraModel, ErrorStatistics, Model, Pair, Residual
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Model, Pair, Residual
 from ipsys_log.models.table import AppliedModel, reads_height
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "HELD_OUT",
     "POOLED",
     "count_repeats",
+    "error_rows",
     "error_statistics",
     "evaluate_cross_validated",
     "evaluate_held_out",
@@ -26,7 +28,9 @@ __all__ = [
 _RESAMPLES = 2000
 
 
-def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) -> ErrorStatistics:
+def error_statistics(
+    errors_m: NDArray[np.float64], independent: bool = True, points: Sequence[str] | None = None
+) -> ErrorStatistics:
     """Return mean, bounds, percentiles and standard deviation of distances, and an interval of their mean.
 
     Parameters
@@ -34,12 +38,15 @@ def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) ->
     errors_m : (n,) or (repeats, n), n > 0, in m: distances at n points.
     independent : True if the errors of the points are independent. The errors at the instants of a track are
         not, and then there is no interval.
+    points : (n,), names of the calibration points; errors with the same name are of one point that several
+        cameras saw. None if all points are different.
 
     Returns
     -------
     ErrorStatistics : statistics of all distances; ``count`` is the number of points. The 95 % confidence
-        interval of the mean is a percentile bootstrap over the points, because points are independent and
-        repeats at one point are not. Equal errors always give the same interval.
+        interval of the mean is a percentile bootstrap over the points. Repeats at one point, and errors of
+        several cameras at one point, are not independent: they share the error of the tape. So they are
+        drawn together. Equal errors always give the same interval.
 
     References
     ----------
@@ -58,9 +65,8 @@ def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) ->
     median_m, p95_m = np.percentile(errors_m, [50, 95]).tolist()
     std_m = float(errors_m.std(ddof=1)) if errors_m.size > 1 else None
     low_m = high_m = None
-    if count > 1 and independent:
-        drawn = np.random.default_rng(0).integers(count, size=(_RESAMPLES, count))
-        low_m, high_m = np.percentile(places_m[drawn].mean(axis=1), [2.5, 97.5]).tolist()
+    if independent:
+        low_m, high_m = _bootstrap(places_m, range(count) if points is None else points)
     return ErrorStatistics(
         count,
         float(errors_m.mean()),
@@ -72,6 +78,21 @@ def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) ->
         low_m,
         high_m,
     )
+
+
+def _bootstrap(
+    places_m: NDArray[np.float64], points: Sequence[object]
+) -> tuple[float, float] | tuple[None, None]:
+    """Return the 95 % confidence interval of a mean; errors (n,) of one point are drawn together."""
+    clusters = {point: number for number, point in enumerate(dict.fromkeys(points))}
+    if len(clusters) < 2:
+        return None, None
+    numbers = [clusters[point] for point in points]
+    sums_m, counts = np.bincount(numbers, places_m), np.bincount(numbers)
+    drawn = np.random.default_rng(0).integers(len(clusters), size=(_RESAMPLES, len(clusters)))
+    means_m = sums_m[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    low_m, high_m = np.percentile(means_m, [2.5, 97.5]).tolist()
+    return low_m, high_m
 
 
 def root_mean_square_m(errors: ErrorStatistics, repeats: int = 1) -> float:
@@ -117,7 +138,7 @@ def evaluate_held_out(
     -------
     A row for each camera with held-out points, and a row for all cameras if there are several.
     """
-    predictions = {}
+    predictions, covariances = {}, {}
     for camera in model.cameras:
         used = {pair.measurement: pair.world_m for pair in camera.pairs}
         pairs = [
@@ -129,7 +150,8 @@ def evaluate_held_out(
             applied = AppliedModel(model.name, camera)
             points_m, world_m = _arrays(pairs)
             predictions[camera.camera] = (pairs, applied.predict(points_m, world_m[:, 2])[None])
-    return _rows(model, predictions, ground_truth, HELD_OUT)
+            covariances[camera.camera] = _covariances(applied, pairs)
+    return error_rows(model, predictions, covariances, ground_truth, HELD_OUT)
 
 
 def evaluate_cross_validated(
@@ -142,10 +164,17 @@ def evaluate_cross_validated(
 
     Parameters
     ----------
-    model : the model. Its name selects the model for each fold. The errors are compared with its covariances.
+    model : the model. Its name selects the model for each fold.
     pairs : all calibration points by camera.
     ground_truth : as in :func:`evaluate_held_out`.
     seed : random seed of the folds.
+
+    Returns
+    -------
+    Rows as in :func:`evaluate_held_out`. The shares of the errors within the regions of the covariance are
+    those of the first repeat, in which each point is held out once. Its error is compared with the covariance
+    of the model that was fitted without it. The covariance of one fold takes ten further fits, so the other
+    repeats have none.
 
     Raises
     ------
@@ -155,7 +184,36 @@ def evaluate_cross_validated(
     cameras = gather_points(pairs)
     predicted = cross_validate(model.name, cameras, seed)
     predictions = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
-    return _rows(model, predictions, ground_truth, CROSS_VALIDATION)
+    covariances = _fold_covariances(model.name, pairs, seed)
+    return error_rows(model, predictions, covariances, ground_truth, CROSS_VALIDATION)
+
+
+def _fold_covariances(name: str, pairs: Mapping[str, Sequence[Pair]], seed: int) -> dict[str, Array | None]:
+    """Return covariances (n, 3, 3) of the predictions of the first repeat, by camera; None if unknown."""
+    cameras = gather_points(pairs)
+    covariances: dict[str, Array | None] = {
+        camera: np.full((len(places.names), 3, 3), np.nan) for camera, places in cameras.items()
+    }
+    for fold in make_folds(cameras, FOLDS, np.random.default_rng(seed)):
+        rest = {
+            camera: [pair for pair in pairs[camera] if pair.measurement not in fold] for camera in cameras
+        }
+        for model in fit_camera_models(name, gather_points(rest), rest):
+            own = list(pairs[model.camera])
+            rows = [n for n, pair in enumerate(own) if pair.measurement in fold]
+            known, whole = None, covariances[model.camera]
+            if rows and whole is not None:
+                known = _covariances(AppliedModel(name, model), [own[n] for n in rows])
+                if known is None:
+                    covariances[model.camera] = None
+                else:
+                    whole[rows] = known
+    return covariances
+
+
+def _covariances(applied: AppliedModel, pairs: Sequence[Pair]) -> Array | None:
+    points_m, world_m = _arrays(pairs)
+    return applied.covariances(points_m, world_m[:, 2], height_sigmas(pairs))
 
 
 def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> int | None:
@@ -182,18 +240,23 @@ def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:
     return np.array([pair.camera_m for pair in pairs]), np.array([pair.world_m for pair in pairs])
 
 
-def _rows(
+def error_rows(
     model: Model,
     found: Mapping[str, tuple[list[Pair], Array]],
+    covariances: Mapping[str, Array | None],
     ground_truth: Mapping[str, Array],
     scheme: str,
 ) -> list[CameraEvaluation]:
-    """Return rows of errors; ``found`` has pairs and predictions (repeats, n, 3) of each camera."""
-    fitted = {camera.camera: camera for camera in model.cameras}
+    """Return rows of errors for each camera, and for all; ``found`` has their pairs and predictions.
+
+    The predictions are (repeats, n, 3).
+
+    ``covariances`` (n, 3, 3) are those of the first repeat.
+    """
     level = level_cameras(model)
     rows: list[CameraEvaluation] = []
     for against in ("tape", "truth"):
-        compared: list[tuple[Array, Array | None]] = []
+        compared: list[tuple[Array, Array | None, list[str]]] = []
         for camera, (pairs, predicted_m) in found.items():
             known = {p.measurement: p.world_m for p in pairs} if against == "tape" else ground_truth
             keep = [n for n, pair in enumerate(pairs) if pair.measurement in known]
@@ -202,19 +265,27 @@ def _rows(
             kept = [pairs[n] for n in keep]
             targets_m = np.array([known[pair.measurement] for pair in kept])
             offsets_m = predicted_m[:, keep] - targets_m
-            squares = _squares(model.name, fitted.get(camera), kept, offsets_m, against, camera in level)
+            known_m2 = covariances[camera]
+            shares = None
+            if known_m2 is not None:
+                tape_m2 = tape_covariances(kept) if against == "tape" else np.zeros((3, 3))
+                # A known height, or the only height of all calibration points, has no error.
+                size = 2 if camera in level or reads_height(model.name) else 3
+                shares = _shares(offsets_m[0], known_m2[keep] + tape_m2, size)
+            names = [pair.calibration_point or pair.measurement for pair in kept]
             residuals = tuple(
                 Residual(pair.measurement, target, point)
                 for repeat in predicted_m[:, keep]
                 for pair, target, point in zip(kept, targets_m, repeat, strict=True)
             )
-            rows.append(_row(camera, against, scheme, offsets_m, squares, residuals, camera in level))
-            compared.append((offsets_m, squares))
+            rows.append(_row(camera, against, scheme, offsets_m, names, shares, residuals, camera in level))
+            compared.append((offsets_m, shares, names))
         if len(compared) > 1:
-            offsets_m = np.concatenate([offsets for offsets, _ in compared], axis=1)
-            known_squares = [s for _, s in compared if s is not None]
-            squares = np.concatenate(known_squares, axis=1) if len(known_squares) == len(compared) else None
-            rows.append(_row(POOLED, against, scheme, offsets_m, squares, (), bool(level)))
+            offsets_m = np.concatenate([offsets for offsets, _, _ in compared], axis=1)
+            known_shares = [s for _, s, _ in compared if s is not None]
+            shares = np.concatenate(known_shares) if len(known_shares) == len(compared) else None
+            names = [name for _, _, own in compared for name in own]
+            rows.append(_row(POOLED, against, scheme, offsets_m, names, shares, (), bool(level)))
     return rows
 
 
@@ -223,6 +294,7 @@ def _row(
     against: str,
     scheme: str,
     offsets_m: Array,
+    names: Sequence[str],
     shares: Array | None,
     residuals: tuple[Residual, ...],
     level: bool,
@@ -232,8 +304,8 @@ def _row(
         camera,
         against,
         # If all calibration points have the same height, the 3D error is not meaningful.
-        None if level else error_statistics(np.linalg.norm(offsets_m, axis=2)),  # eq. (26)
-        error_statistics(np.linalg.norm(offsets_m[:, :, :2], axis=2)),  # eq. (27)
+        None if level else error_statistics(np.linalg.norm(offsets_m, axis=2), points=names),  # eq. (26)
+        error_statistics(np.linalg.norm(offsets_m[:, :, :2], axis=2), points=names),  # eq. (27)
         residuals,
         scheme,
         offsets_m.reshape(-1, 3).mean(axis=0),
@@ -242,24 +314,14 @@ def _row(
     )
 
 
-def _squares(
-    name: str, camera: CameraModel | None, pairs: Sequence[Pair], offsets_m: Array, against: str, level: bool
-) -> Array | None:
-    """Return the probability of the smallest region of the covariance with each error, (repeats, n)."""
-    if camera is None:
-        return None
-    points_m, world_m = _arrays(pairs)
-    covariances = AppliedModel(name, camera).covariances(points_m, world_m[:, 2])
-    if covariances is None:
-        return None
-    if against == "tape":
-        tape = [np.zeros((3, 3)) if p.world_covariance_m2 is None else p.world_covariance_m2 for p in pairs]
-        covariances = covariances + np.array(tape)
-    # A known height, or the only height of all calibration points, has no error.
-    size = 2 if level or reads_height(name) else 3
-    inverse = np.linalg.inv(covariances[:, :size, :size])
-    squares = np.einsum("rni,nij,rnj->rn", offsets_m[:, :, :size], inverse, offsets_m[:, :, :size])
+def _shares(offsets_m: Array, covariances_m2: Array, size: int) -> Array:
+    """Return the probability of the smallest region of the covariance with each error, (n,).
+
+    Only the first ``size`` coordinates count.
+    """
     from scipy.stats import chi2  # late: most commands evaluate nothing, and it takes 1 s
 
-    shares: Array = chi2.cdf(squares, size)
+    offsets_m = offsets_m[:, :size]
+    weighted = np.linalg.solve(covariances_m2[:, :size, :size], offsets_m[:, :, None])[:, :, 0]
+    shares: Array = chi2.cdf((offsets_m * weighted).sum(axis=1), size)
     return shares

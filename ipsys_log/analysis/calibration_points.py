@@ -11,18 +11,25 @@ from ipsys_log.analysis.pairs import (
     split,
     valid_measurements,
 )
-from ipsys_log.messages import Measurement, Pair
-from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, RIG
+from ipsys_log.messages import Measurement, Pair, Rig
+from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import StageView
+from ipsys_log.models.table import reads_corners
 
 __all__ = [
+    "JOINT_READS",
     "find_pairs",
     "has_measurements",
     "held_out_ids",
     "measured",
+    "measured_part",
     "split_ids",
     "split_parameters",
 ]
+
+
+# The channels that a joint calibration reads.
+JOINT_READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
 
 
 def measured(view: StageView) -> list[RiggedMeasurement]:
@@ -61,3 +68,13 @@ def split_parameters(view: StageView, options: Mapping[str, str]) -> dict[str, s
     """Return the parameters of the split: the label, or the seed if nothing is labelled."""
     labelled = any(m.splits for m in view.payloads(MEASUREMENTS))
     return {"train": options.get("train", "train")} if labelled else {"seed": options.get("seed", "0")}
+
+
+def measured_part(rig: Rig, options: Mapping[str, str]) -> object:
+    """Return the part of the rig on which fits depend, for the model in the options of the user."""
+    points = (rig.reference_points, {m.id for m in rig.markers})
+    if not reads_corners(options.get("model", "")):
+        return points
+    markers = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
+    cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
+    return points, markers, cameras, rig.tape_sigma_m

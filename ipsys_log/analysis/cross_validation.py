@@ -46,6 +46,7 @@ def gather_points(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, CalibrationP
             np.array([pair.camera_m for pair in own_pairs]),
             np.array([pair.world_m for pair in own_pairs]),
             tuple(pair.measurement for pair in own_pairs),
+            tuple(pair.calibration_point or pair.measurement for pair in own_pairs),
         )
         for camera, own_pairs in sorted(pairs.items())
         if own_pairs
@@ -55,20 +56,31 @@ def gather_points(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, CalibrationP
 def make_folds(
     cameras: Mapping[str, CalibrationPoints], folds: int, rng: np.random.Generator
 ) -> list[frozenset[str]]:
-    """Return random folds of names of calibration points, with equal shares of each camera in all folds.
+    """Return random folds of names of measurements, with equal shares of each camera in all folds.
 
-    A calibration point is in one fold only, for all cameras. Otherwise, a point that is held out from one
-    camera would be known through another camera.
+    All measurements of a calibration point are in one fold, for all cameras. Otherwise, a point that is held
+    out from one camera would be known through another camera.
     """
     dealt: dict[str, int] = {}
     for places in cameras.values():
-        counts = np.bincount([dealt[n] for n in places.names if n in dealt], minlength=folds)
-        rest = [name for name in places.names if name not in dealt]
+        own = list(dict.fromkeys(places.point_names))
+        counts = np.bincount([dealt[n] for n in own if n in dealt], minlength=folds)
+        rest = [name for name in own if name not in dealt]
         for index in rng.permutation(len(rest)):
             fold = int(counts.argmin())
             dealt[rest[index]] = fold
             counts[fold] += 1
-    return [frozenset(name for name, fold in dealt.items() if fold == f) for f in range(folds)]
+    return [_measurements(cameras, {n for n, fold in dealt.items() if fold == f}) for f in range(folds)]
+
+
+def _measurements(cameras: Mapping[str, CalibrationPoints], points: Collection[str]) -> frozenset[str]:
+    """Return the names of all measurements of some calibration points."""
+    return frozenset(
+        name
+        for places in cameras.values()
+        for name, point in zip(places.names, places.point_names, strict=True)
+        if point in points
+    )
 
 
 def predict_without(
@@ -91,8 +103,11 @@ def predict_without(
 
 def _without(places: CalibrationPoints, left_out: Collection[str]) -> CalibrationPoints:
     keep = np.array([name not in left_out for name in places.names], dtype=bool)
-    names = tuple(name for name in places.names if name not in left_out)
-    return CalibrationPoints(places.points_m[keep], places.world_m[keep], names)
+    names, points = (
+        tuple(name for name, kept in zip(all_names, keep, strict=True) if kept)
+        for all_names in (places.names, places.point_names)
+    )
+    return CalibrationPoints(places.points_m[keep], places.world_m[keep], names, points)
 
 
 def cross_validate(name: str, cameras: Mapping[str, CalibrationPoints], seed: int) -> dict[str, Array]:
@@ -156,11 +171,13 @@ def _each_left_out(
     name: str, cameras: Mapping[str, CalibrationPoints], unused: Collection[str]
 ) -> dict[str, dict[str, Array]]:
     predictions: dict[str, dict[str, Array]] = {camera: {} for camera in cameras}
-    for place in dict.fromkeys(place for places in cameras.values() for place in places.names):
-        predicted = predict_without(name, cameras, {place, *unused})
+    for point in dict.fromkeys(point for places in cameras.values() for point in places.point_names):
+        same = _measurements(cameras, {point})
+        predicted = predict_without(name, cameras, {*same, *unused})
         for camera, places in cameras.items():
-            if place in places.names:
-                predictions[camera][place] = predicted[camera][places.names.index(place)]
+            for row, place in enumerate(places.names):
+                if place in same:
+                    predictions[camera][place] = predicted[camera][row]
     return predictions
 
 
@@ -190,13 +207,14 @@ def learning_curve(
     seed : random seed of the subsets.
     """
     rng = np.random.default_rng(seed)
-    names = sorted({name for places in cameras.values() for name in places.names})
+    points = sorted({point for places in cameras.values() for point in places.point_names})
     for size in learning_sizes(name, cameras):
         errors: dict[str, list[tuple[float, float]]] = {camera: [] for camera in cameras}
         for _ in range(SUBSETS):
-            order = rng.permutation(names).tolist()
-            used = {place for places in cameras.values() for place in _first(places, order, size)}
-            for camera, means_m in _errors(name, cameras, set(names) - used, set(names) - used).items():
+            order = rng.permutation(points).tolist()
+            used = {point for places in cameras.values() for point in _first(places, order, size)}
+            left_out = set(_measurements(cameras, set(points) - used))
+            for camera, means_m in _errors(name, cameras, left_out, left_out).items():
                 errors[camera].append(means_m)
         yield [_point(camera, size, np.array(rows)) for camera, rows in errors.items() if rows]
 
@@ -231,7 +249,7 @@ def published_curve(
 
 
 def _first(places: CalibrationPoints, order: list[str], size: int) -> list[str]:
-    own = set(places.names)
+    own = set(places.point_names)
     return [place for place in order if place in own][:size]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,34 @@ from ipsys_log.analysis.pairs import RiggedMeasurement, Sightings, still_interva
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["gather_tracks", "track_errors", "true_points"]
+__all__ = ["TrackErrors", "gather_tracks", "track_errors", "true_points"]
 
 _SAME_HEIGHT_M = 0.005
 # Longest gap for linear interpolation. For a robot with 2 m/s and 2.5 rad/s, its error is 0.7 mm over 1/30 s,
 # and 6 mm over 0.1 s.
 _GAP_NS = NS_PER_S // 10
+
+
+Array = NDArray[np.float64]
+
+
+class TrackErrors(NamedTuple):
+    """The 3D errors and the floor errors of tracks at the instants that count, and at the others.
+
+    Attributes
+    ----------
+    space, floor : errors at the instants that count; over all instants if none counts.
+    counted, instants : number of instants that count, and of all instants with a ground truth.
+    others : the errors in space and on the floor at the instants that do not count; None if all count.
+    whole : the errors in space and on the floor over all instants.
+    """
+
+    space: ErrorStatistics
+    floor: ErrorStatistics
+    counted: int
+    instants: int
+    others: tuple[ErrorStatistics, ErrorStatistics] | None
+    whole: tuple[ErrorStatistics, ErrorStatistics]
 
 
 def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
@@ -55,7 +78,7 @@ def true_points(
 
 def track_errors(
     tracks: Mapping[int, Sightings], ground_truth: Mapping[int, Sightings], at_track_height: bool = False
-) -> tuple[ErrorStatistics, ErrorStatistics] | None:
+) -> TrackErrors | None:
     """Return the 3D errors and the floor errors of tracks against the ground truth at the same instants.
 
     A rolling shutter exposes a marker some time after the frame's instant. The true position between two
@@ -63,12 +86,13 @@ def track_errors(
 
     Parameters
     ----------
-    at_track_height : True to use only instants at which a marker has the height of its track. Models
-        with a known marker height are not valid while a user lifts the marker for a measurement.
+    at_track_height : True if only the instants count at which a marker has the height of its track. Models
+        with a known marker height are not valid while a user lifts the marker for a measurement. The errors
+        at the other instants stand beside.
 
     Returns
     -------
-    Both error statistics; None if no instant of a track has a ground truth.
+    The error statistics; None if no instant of a track has a ground truth.
     """
     offsets = []
     for marker_id, track in tracks.items():
@@ -79,17 +103,21 @@ def track_errors(
         # no common instant: the pose of each camera counts.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
         true_m, is_known = _between(known, times_ns)
-        offset = (track.points_m[::-1][last] - true_m)[is_known]
-        if at_track_height:
-            offset = offset[np.abs(offset[:, 2]) < _SAME_HEIGHT_M]
-        if len(offset):
-            offsets.append(offset)
-    if not offsets:
+        offsets.append((track.points_m[::-1][last] - true_m)[is_known])
+    rows_m = np.vstack([np.zeros((0, 3)), *offsets])
+    if not len(rows_m):
         return None
-    rows = np.vstack(offsets)
+    counts = np.abs(rows_m[:, 2]) < _SAME_HEIGHT_M if at_track_height else np.ones(len(rows_m), dtype=bool)
+    whole = _statistics(rows_m)
+    space, floor = _statistics(rows_m[counts]) if counts.any() else whole
+    others = None if counts.all() else _statistics(rows_m[~counts])
+    return TrackErrors(space, floor, int(counts.sum()), len(rows_m), others, whole)
+
+
+def _statistics(offsets_m: Array) -> tuple[ErrorStatistics, ErrorStatistics]:
     return (
-        error_statistics(np.linalg.norm(rows, axis=1), independent=False),
-        error_statistics(np.linalg.norm(rows[:, :2], axis=1), independent=False),
+        error_statistics(np.linalg.norm(offsets_m, axis=1), independent=False),
+        error_statistics(np.linalg.norm(offsets_m[:, :2], axis=1), independent=False),
     )
 
 

@@ -15,7 +15,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement, TapePoint, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import Rig, Suspect
 
-__all__ = ["LeaveOneOut", "find_outliers"]
+__all__ = ["LeaveOneOut", "find_outliers", "is_gross"]
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,12 @@ _GROSS_M = 0.3
 _GROSS = 3.0
 _MOST_SHARE = 0.2
 _USUAL_TAPE_M = 0.003
+
+
+# An outlier with a larger error, in units of the usual error, is gross. In simulated labs, an exchanged pair
+# of distances has a score above 10, and no good point is an outlier. On the paper's points, no score of the
+# polynomial is above 6.
+_GROSS_SCORE = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +106,11 @@ def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement
     by_id = {place.measurement.id: place for place in places}
     outliers = [_suspect(by_id[name], findings[name]) for name in taken]
     return tuple(sorted(outliers, key=lambda suspect: -float(np.linalg.norm(suspect.residual_m))))
+
+
+def is_gross(suspect: Suspect) -> bool:
+    """Return whether an outlier is a gross error, which no tape, camera or model explains."""
+    return suspect.score >= _GROSS_SCORE
 
 
 def _with_tape(rig: Rig) -> Rig:

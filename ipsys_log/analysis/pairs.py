@@ -192,7 +192,7 @@ def build_pairs(
             if camera_point is not None:
                 mean_m, frames = camera_point
                 row = (measurement.id, marker_id, mean_m, fixed.world_m, frames, fixed.covariance_m2)
-                pairs[camera].append(Pair(*row))
+                pairs[camera].append(Pair(*row, calibration_point=measurement.calibration_point))
     for camera, entered in pairs.items():
         _check_duplicates(camera, entered)
     return pairs

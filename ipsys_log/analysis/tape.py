@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import crossing_angle, multilaterate, tape_covariance
-from ipsys_log.messages import Measurement, Rig
+from ipsys_log.geometry.trilateration import (
+    ON_REFERENCE_SIGMA_M,
+    crossing_angle,
+    multilaterate,
+    tape_covariance,
+)
+from ipsys_log.messages import Distance, Measurement, Rig
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
@@ -18,6 +23,7 @@ __all__ = [
     "TapePoint",
     "WeakPoint",
     "find_weak_points",
+    "is_on_reference",
     "reference_points",
     "world_point",
 ]
@@ -78,7 +84,8 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
     Parameters
     ----------
     measurement : measurement with a world point; or with two or more distances, the height, and the side if
-        the reference points are on one line.
+        the reference points are on one line; or with a height and one distance of 0, for a marker that was
+        laid onto a reference point.
     rig : rig with the reference points and the tape; not used if there is only a world point.
 
     Returns
@@ -190,6 +197,8 @@ def find_weak_points(places: Iterable[RiggedMeasurement]) -> list[WeakPoint]:
 
 
 def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
+    if is_on_reference(measurement.distances) and measurement.height_m is not None:
+        return _on_reference(measurement, rig, where)
     if len(measurement.distances) < 2 or measurement.height_m is None:
         raise IpsysError(
             f"{where} needs a world point, or two or more distances and a height; measure it again"
@@ -209,6 +218,20 @@ def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
     world_m = np.array([*floor.point_m, measurement.height_m])
     _check_point(world_m, where)
     return TapePoint(world_m, _with_height(floor.covariance_m2, measurement, where), floor.residuals_m)
+
+
+def is_on_reference(distances: Sequence[Distance]) -> bool:
+    """Return whether a marker was laid onto a reference point: its only distance is 0."""
+    return len(distances) == 1 and distances[0].distance_m == 0
+
+
+def _on_reference(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
+    (distance,) = measurement.distances
+    (reference_m,) = reference_points(measurement, rig)
+    sigma_m = ON_REFERENCE_SIGMA_M if distance.sigma_m is None else _check_sigma(distance.sigma_m, where)
+    world_m = np.array([*reference_m, measurement.height_m])
+    _check_point(world_m, where)
+    return TapePoint(world_m, _with_height(sigma_m**2 * np.eye(2), measurement, where), np.zeros(0))
 
 
 def _tape_sigmas(measurement: Measurement, rig: Rig, where: str) -> Array | None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
-from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
+from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
 from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import reads_height
 from ipsys_log.runs.execute import LiveRun, copy_messages
@@ -56,6 +56,9 @@ class _LiveView:
     inputs: Mapping[Channel, str]
     model: Model | None
     rig: Rig | None = None
+
+    def calibrations(self) -> dict[str, CameraCalibration]:
+        return {str(message.camera): message.payload for message in self.messages(CALIBRATIONS)}
 
     def run(self, channel: Channel) -> str:
         return self.inputs.get(channel, "")

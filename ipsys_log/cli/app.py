@@ -12,6 +12,7 @@ import typer
 from ipsys_log.cli import (
     align,
     calibrate,
+    calibrate_lab,
     cameras,
     compare,
     imports,
@@ -33,7 +34,8 @@ _STAGES = "Single stages of replay"
 # The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
 _PLACED: dict[str, tuple[str, ...]] = {
     "First day, in this order": (
-        *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
+        *("init", "markers", "cameras", "calibrate", "align", "record", "measure"),
+        *("calibrate-lab", "replay", "live"),
     ),
     "Accuracy, and the next points to measure": ("evaluate", "plan", "report"),
     "Inspect a log": ("info", "runs", "view", "stream", "verify", "diff", "latency", "repair"),
@@ -84,6 +86,11 @@ ipsys measure --rig lab.toml -o cal.mcap --host 0.0.0.0    # on a phone, now
 ipsys measure calibration.mcap                     # in a finished log
 ipsys measure calibration.mcap --terminal          # in this terminal
 ipsys measure calibration.mcap --csv places.csv    # from a sheet
+""",
+    "calibrate-lab": """
+ipsys calibrate-lab drive.mcap cal.mcap --plot floor.png
+ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
+ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
 """,
     "replay": """
 ipsys replay calibration.mcap                      # fit and evaluate poly
@@ -181,7 +188,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _MODULES = (
-    *(setup, markers, cameras, calibrate, align, imports, record, measure, stages),
+    *(setup, markers, cameras, calibrate, align, imports, record, measure),
+    *(calibrate_lab, stages),
     *(plan, inspect, stream, compare),
 )
 for module in _MODULES:

@@ -88,7 +88,8 @@ def ask_numbers(rig: Rig, marker: str, before: TypedEntry | None) -> TypedEntry:
 
 
 def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
-    """Ask for distances until they are consistent with one calibration point."""
+    """Ask for distances until they are consistent with one calibration point; 0 is on a reference point."""
+    from ipsys_log.analysis.tape import is_on_reference
     from ipsys_log.survey.checks import check_entry
     from ipsys_log.survey.entry import TypedEntry, parse_entry
 
@@ -98,6 +99,9 @@ def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
     while True:
         for name in (point.name for point in rig.reference_points):
             distances[name] = _ask(f"distance to {name}, cm", f"d_{name}", distances.get(name, ""), of(name))
+            entry, _ = of(name)(distances[name])
+            if is_on_reference(entry.distances):
+                return {name: distances[name]}
         together = check_entry(*parse_entry(TypedEntry("", distances), rig), rig, None, ())
         faults = [fault.text for fault in together.faults if not fault.field]
         if not faults:

@@ -137,13 +137,14 @@ def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
 
     rig, run = given.pop("rig"), given.pop("run")
     models, calibration = given.pop("model", None) or (), given.pop("calibration", None)
+    lenses = given.pop("lenses", None) or {}
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
     further = {name: given.pop(name) for name in [*given] if name not in known}
     return {
         "models": models,
         "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
-        "calibrations": load_calibrations(calibration, lambda: cameras_of(logs)),
+        "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
         "run": check_name(run, "--run") if run else None,
         "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,
@@ -156,7 +157,8 @@ def derive(
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
-    The texts do not name a log that is not ``kept``.
+    The texts do not name a log that is not ``kept``. ``lenses`` are intrinsics by camera, in addition to the
+    files of ``calibration``.
     """
     from ipsys_log import api
     from ipsys_log.log.dataset import Session

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_opencv_calibration
 from ipsys_log.messages import (
+    IMPORTED,
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
     CameraPoint,
@@ -136,7 +137,9 @@ _RIG = Rig(
 def read_imsel(folder: Path) -> Iterator[Message]:
     """Yield the authors' rig, intrinsics, camera points and measured points, in log order.
 
-    Each point is measured for one camera, and gets a separate second. The 40 training points have the label
+    Each measurement is for one camera, and gets a separate second. Ten points of the floor were measured for
+    two cameras each. Their measurements have different labels, so they stay separate; ``calibration_point``
+    is the same. The 40 training points have the label
     ``train``, and the published subsets the labels ``train_10`` to ``train_40``. The others have ``test``.
 
     Raises
@@ -152,11 +155,14 @@ def read_imsel(folder: Path) -> Iterator[Message]:
         lens = read_opencv_calibration(path, camera, time_ns)
         yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
     time_ns = START_NS
+    names: dict[bytes, str] = {}
     for camera in CAMERAS:
         for number, (point_m, world_m, splits) in enumerate(_places(mats, camera)):
             time_ns += NS_PER_S
-            yield from _place(camera, f"{camera}_{number:02d}", time_ns, point_m, world_m, splits)
-    run = Run(timestamp=time_ns, run="imsel", stage="import", parameters={"format": "imsel"})
+            name = f"{camera}_{number:02d}"
+            first = names.setdefault(world_m.tobytes(), name)
+            yield from _place(camera, name, first, time_ns, point_m, world_m, splits)
+    run = Run(timestamp=time_ns, run="imsel", stage=IMPORTED, parameters={"format": "imsel"})
     yield Message("/runs/imsel/record", time_ns + 2, time_ns, run)
 
 
@@ -203,11 +209,13 @@ def _places(
 def _place(
     camera: str,
     name: str,
+    first: str,
     time_ns: int,
     point_m: NDArray[np.float64],
     world_m: NDArray[np.float64],
     splits: tuple[str, ...],
 ) -> Iterator[Message]:
+    """Yield the camera point and the measurement; ``first`` names the first measurement of the point."""
     points = CameraPoints(time_ns, (CameraPoint(0, *point_m.tolist()),))
     yield Message(f"/runs/imsel/cameras/{camera}/camera_points", time_ns, time_ns, points, camera)
     measurement = Measurement(
@@ -218,5 +226,6 @@ def _place(
         still=Interval(time_ns, time_ns),
         point=WorldPoint(*world_m.tolist()),
         splits=splits,
+        calibration_point=None if first == name else first,
     )
     yield Message(MEASUREMENTS_TOPIC, time_ns + 1, time_ns, measurement)

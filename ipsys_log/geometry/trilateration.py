@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 
 __all__ = [
+    "ON_REFERENCE_SIGMA_M",
     "SIDES",
     "TapePosition",
     "are_collinear",
@@ -25,6 +26,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 SIDES = ("left", "right")
+# A hand lays a marker onto a reference point with this standard deviation, along each axis.
+ON_REFERENCE_SIGMA_M = 0.001
 
 
 def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:

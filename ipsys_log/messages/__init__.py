@@ -51,7 +51,7 @@ from ipsys_log.messages.rig import (
     RigMarker,
     RigStream,
 )
-from ipsys_log.messages.runs import ChannelRead, ChannelWritten, Lens, Run
+from ipsys_log.messages.runs import IMPORTED, ChannelRead, ChannelWritten, Lens, Run
 from ipsys_log.messages.tracks import (
     FrameTransform,
     FrameTransforms,
@@ -66,6 +66,7 @@ from ipsys_log.messages.tracks import (
 __all__ = [
     "EVENTS_TOPIC",
     "FRAME_SKIPPED",
+    "IMPORTED",
     "LATENCY_TOPIC",
     "MEASUREMENTS_TOPIC",
     "RIG_TOPIC",

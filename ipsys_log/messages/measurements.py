@@ -44,3 +44,4 @@ class Measurement:
     still: Interval | None = None
     point: WorldPoint | None = None
     splits: tuple[str, ...] = ()
+    calibration_point: str | None = None

@@ -32,7 +32,10 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A calibration point: mean camera point of the stationary marker, and its world point."""
+    """A calibration point: mean camera point of the stationary marker, and its world point.
+
+    ``calibration_point`` is the name of the point if it is not the id of the measurement.
+    """
 
     measurement: str
     marker_id: int
@@ -40,6 +43,7 @@ class Pair:
     world_m: Vec3
     frames: int
     world_covariance_m2: Mat33 | None = None
+    calibration_point: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,8 +155,16 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
+    """The errors of a model, and the measurements that contradict it.
+
+    ``cameras`` and ``learning`` are without the gross outliers ``excluded``. ``with_excluded`` are the errors
+    with them; it is empty if there are none.
+    """
+
     timestamp: TimeNs
     model: str
     cameras: tuple[CameraEvaluation, ...]
     learning: tuple[LearningPoint, ...] = ()
     suspects: tuple[Suspect, ...] = ()
+    excluded: tuple[Suspect, ...] = ()
+    with_excluded: tuple[CameraEvaluation, ...] = ()

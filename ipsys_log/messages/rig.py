@@ -15,6 +15,7 @@ class RigMarker:
     length_m: float | None = None
     robot: str | None = None
     height_m: float | None = None
+    height_sigma_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,7 @@ class Rig:
     floor: Floor | None = None
     marker_height_m: float | None = None
     tape_sigma_m: float | None = None
+    marker_height_sigma_m: float | None = None
     stream: RigStream | None = None
 
     def camera(self, name: str) -> RigCamera:
@@ -109,6 +111,13 @@ class Rig:
             if marker.id == marker_id and marker.height_m is not None:
                 return marker.height_m
         return self.marker_height_m
+
+    def height_sigma_of(self, marker_id: int) -> float | None:
+        """Return the standard deviation of the height of a marker on its robot, in m; None if unknown."""
+        for marker in self.markers:
+            if marker.id == marker_id and marker.height_sigma_m is not None:
+                return marker.height_sigma_m
+        return self.marker_height_sigma_m
 
     def robot_of(self, marker_id: int) -> str:
         """Return the name of the robot that carries a marker."""

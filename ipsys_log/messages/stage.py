@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from ipsys_log.messages.channels import MODEL, Channel
 from ipsys_log.messages.message import Message
-from ipsys_log.messages.rig import Rig
+from ipsys_log.messages.rig import CameraCalibration, Rig
 
 __all__ = ["Plan", "Progress", "Stage", "StageView", "Step", "model_read"]
 
@@ -32,6 +32,9 @@ class StageView(Protocol):
     @property
     def lenses(self) -> Collection[str]:
         """Return the names of the cameras with intrinsics, from the log or from the user."""
+
+    def calibrations(self) -> dict[str, CameraCalibration]:
+        """Return the first intrinsics of each camera, from the log or from the user."""
 
     def run(self, channel: Channel, /) -> str:
         """Return the run that the stage reads of a derived channel; "" if there is none."""
@@ -87,7 +90,7 @@ class Stage:
     writes : channels; the first is its purpose. Each has other payload types than the others.
     plan : plans a run from a log and the options of the user, by name; or returns the name of an existing run
         to use instead, "" if there is none.
-    rig_part : the part of the rig on which the result depends.
+    rig_part : the part of the rig on which the result depends, with some options of the user.
     method : the method or model of a run, from its parameters and its view; "" for a stage without methods.
     causal : it has steps: live tracking can run it.
     per_camera : a step sees the messages of one camera only, so that cameras can be processed in parallel.
@@ -100,7 +103,7 @@ class Stage:
     reads: tuple[Channel, ...]
     writes: tuple[Channel, ...]
     plan: Callable[[StageView, Mapping[str, str]], Plan | str]
-    rig_part: Callable[[Rig], Any]
+    rig_part: Callable[[Rig, Mapping[str, str]], Any]
     method: Callable[[Mapping[str, str], StageView], str] = lambda parameters, view: ""
     causal: bool = True
     per_camera: bool = True

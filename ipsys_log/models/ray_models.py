@@ -12,9 +12,10 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import intersect_height
+from ipsys_log.models.depths import LEAST_NOISE, depth_terms, fit_depths
 from ipsys_log.models.rays import CalibrationPoints, CameraRays, directions, fit_rays
 
-__all__ = ["RayDepth", "RayPlane", "fit_depths"]
+__all__ = ["RayDepth", "RayPlane"]
 
 Array = NDArray[np.float64]
 
@@ -57,71 +58,14 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         check_is_fitted(self)
         return self.predict_array(np.asarray(X, dtype=np.float64))
 
+    @property
+    def camera_rays(self) -> CameraRays:
+        """Pose and lens correction of the camera."""
+        return CameraRays(self.rotation_, self.origin_, self.lens_)
+
     def predict_array(self, X: Array) -> Array:
         rays = directions(X[:, :3], self.lens_) @ self.rotation_.T
         return intersect_height(self.origin_, rays, X[:, 3])
-
-
-# Prior standard deviation of the terms of the depth correction.
-_TERM_SIGMA = 0.02
-# Relative depth errors above this multiple of the noise get less weight.
-_ROBUST = 2.0
-# Least relative noise of a depth from the size of a marker.
-_LEAST_NOISE = 2e-4
-_ROUNDS = 12
-
-
-def depth_terms(points_m: Array) -> tuple[Array, Array]:
-    """Return the terms of the depth correction, and the relative uncertainty of the depth at each point.
-
-    Parameters
-    ----------
-    points_m : (n, 3), in camera coordinates.
-
-    Returns
-    -------
-    terms : (n, 11): constant, first, second and third order in u = Xc / Zc, v = Yc / Zc, and (u^2 + v^2)^2.
-    growth : (n,): 1 + u^2 + v^2. A pixel of a wide-angle lens covers more of the scene towards the edge of
-        the image. The error of a depth grows by this factor.
-    """
-    u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
-    r2 = u * u + v * v
-    terms = [np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3, r2 * r2]
-    return np.stack(terms, axis=1), 1 + r2
-
-
-def fit_depths(points_m: Array, ratios: Array) -> tuple[Array, Array]:
-    """Fit a smooth correction of depths by Bayesian linear regression with a robust loss.
-
-    Parameters
-    ----------
-    points_m : (n, 3), in camera coordinates.
-    ratios : (n,), true depth over measured depth, minus one.
-
-    Returns
-    -------
-    coefficients : (11,), coefficients of :func:`depth_terms`. A prior moves all coefficients except the
-        constant towards zero, according to the noise. The noise is estimated from leave-one-out residuals.
-    left_out : (n,), leave-one-out residual of each ratio.
-
-    References
-    ----------
-    Soft-L1 weights and leave-one-out residuals of ridge regression: Huber and Ronchetti, Robust
-    Statistics, 2009, sect. 7.8; Hastie et al., Elements of Statistical Learning, eq. (7.64).
-    """
-    terms, growth = depth_terms(points_m)
-    loose = np.r_[0.0, np.ones(terms.shape[1] - 1)] / _TERM_SIGMA**2
-    weights, noise = np.ones(len(ratios)), 0.01
-    for _ in range(_ROUNDS):
-        precision = weights / growth**2
-        inverse = np.linalg.inv((terms.T * precision) @ terms + np.diag(noise**2 * loose))
-        coefficients = inverse @ (terms.T @ (precision * ratios))
-        residuals = ratios - terms @ coefficients
-        leverage = np.einsum("ni,ij,nj->n", terms, inverse, terms) * precision
-        left_out = residuals / np.maximum(1 - leverage, 1e-3)
-        noise = max(1.4826 * float(np.median(np.abs(left_out) / growth)), _LEAST_NOISE)
-        weights = 1 / np.sqrt(1 + (residuals / growth / (_ROBUST * noise)) ** 2)
-    return coefficients, left_out
 
 
 class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
@@ -135,7 +79,7 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     Attributes
     ----------
     rotation_, origin_, lens_ : see :class:`ipsys_log.models.ray_models.RayPlane`.
-    depth_ : (11,), see :func:`fit_depths`.
+    depth_ : (11,), see :func:`ipsys_log.models.depths.fit_depths`.
     heights_ : (3,), mean (m) and variance (m^2) of the measured heights, and the variance (m^2) of a
         height from a depth, at the principal point.
     """
@@ -168,7 +112,7 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         self.depth_, left_out = fit_depths(points_m, depths_m / points_m[:, 2] - 1)
         _, growth = depth_terms(points_m)
         falls = (directions(points_m, camera_rays.lens) @ camera_rays.rotation.T)[:, 2]
-        noise_m2 = np.mean((left_out * points_m[:, 2] * falls / growth) ** 2) + _LEAST_NOISE**2
+        noise_m2 = np.mean((left_out * points_m[:, 2] * falls / growth) ** 2) + LEAST_NOISE**2
         self.heights_ = np.array([world_m[:, 2].mean(), world_m[:, 2].var(), noise_m2])
 
     def predict(self, X: Any) -> Array:

@@ -42,13 +42,20 @@ class CameraRays:
 class CalibrationPoints:
     """Calibration points that one camera measured.
 
-    ``points_m`` (n, 3) are in camera coordinates, ``world_m`` (n, 3) in world coordinates. ``names`` identify
-    the same points in other cameras.
+    ``points_m`` (n, 3) are in camera coordinates, ``world_m`` (n, 3) in world coordinates. ``names`` are the
+    names of the measurements. ``calibration_points`` name the points of the floor: several measurements, also
+    of other cameras, may be of the same point. If it is empty, each measurement has its own point.
     """
 
     points_m: Array
     world_m: Array
     names: tuple[str, ...]
+    calibration_points: tuple[str, ...] = ()
+
+    @property
+    def point_names(self) -> tuple[str, ...]:
+        """The point of the floor of each measurement."""
+        return self.calibration_points or self.names
 
 
 def directions(points_m: Array, lens: Array) -> Array:
@@ -98,7 +105,7 @@ def group_cameras(cameras: Sequence[CalibrationPoints]) -> list[list[int]]:
     """Return groups of cameras that share calibration points, directly or through other cameras."""
     groups: list[tuple[list[int], set[str]]] = []
     for index, places in enumerate(cameras):
-        names = set(places.names)
+        names = set(places.point_names)
         met = [group for group in groups if group[1] & names]
         groups = [group for group in groups if not group[1] & names]
         indices = sorted([index, *(i for group in met for i in group[0])])
@@ -114,7 +121,7 @@ def _fit_group(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
     from ipsys_log.models.rigid import rigid_transform
 
     starts = [rigid_transform(places.points_m, places.world_m) for places in cameras]
-    weights = _weights([name for places in cameras for name in places.names])
+    weights = _weights([name for places in cameras for name in places.point_names])
     first = np.concatenate([np.concatenate([np.zeros(3), t, np.zeros(3)]) for _, t in starts])
     ends = np.cumsum([0, *(len(places.names) for places in cameras)])
 

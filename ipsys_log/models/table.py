@@ -18,17 +18,21 @@ from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 __all__ = [
+    "CORNER_MODELS",
     "MODELS",
     "MODEL_VERSIONS",
     "AppliedModel",
     "CalibrationPoints",
+    "check_name",
     "create",
     "fit_cameras",
     "group_dependent_cameras",
     "inputs",
+    "is_known",
     "min_pairs",
     "parameters",
     "predict_array",
+    "reads_corners",
     "reads_height",
     "restore",
 ]
@@ -100,9 +104,38 @@ MODEL_VERSIONS = {
     "ann": 1,
     "kriging": 1,
     "kriging-regression": 1,
-    "rayplane": 1,
+    "rayplane": 2,
     "best": 1,
+    "joint": 1,
 }
+
+
+# Models of the corners of markers, and the least number of calibration points of each. The fit estimates all
+# cameras together, see ipsys_log.joint.
+CORNER_MODELS: dict[str, int] = {"joint": 0}
+
+
+def is_known(name: str) -> bool:
+    """Return whether this version has a model."""
+    return name in MODELS or reads_corners(name)
+
+
+def check_name(name: str) -> None:
+    """Check that a model is known.
+
+    Raises
+    ------
+    IpsysError
+        This version does not have the model.
+    """
+    if not is_known(name):
+        known = ", ".join((*MODELS, *CORNER_MODELS))
+        raise IpsysError(f"model {name!r} is not known; use one of {known}")
+
+
+def reads_corners(name: str) -> bool:
+    """Return whether a model reads the corners of markers, and not their camera points."""
+    return name in CORNER_MODELS
 
 
 def create(name: str) -> Any:
@@ -113,19 +146,22 @@ def create(name: str) -> Any:
     IpsysError
         The name is not in the table.
     """
-    if name not in MODELS:
-        raise IpsysError(f"model {name!r} is not known; use one of {', '.join(MODELS)}")
+    check_name(name)
     return MODELS[name]()
 
 
 def min_pairs(name: str) -> int:
     """Return the least number of calibration points that a model needs."""
+    if reads_corners(name):
+        return CORNER_MODELS[name]
     return max(int(step.min_pairs) for _, step in _steps(create(name)))
 
 
 @cache
 def reads_height(name: str) -> bool:
     """Return whether a model needs the height of a marker above the floor."""
+    if reads_corners(name):
+        return True
     return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
 
 
@@ -227,10 +263,16 @@ class AppliedModel:
         self._name = name
         self._estimator = restore(name, {p.name: p.values.reshape(p.shape) for p in camera.parameters})
         self._covariance_m2, self._uncertainty, self._volume = camera.covariance_m2, None, None
+        self._height_check = None
         if not camera.pairs:
             return
         fitted_m = np.array([pair.camera_m for pair in camera.pairs])
-        self._volume = Volume(fitted_m, np.array([pair.world_m for pair in camera.pairs]))
+        world_m = np.array([pair.world_m for pair in camera.pairs])
+        self._volume = Volume(fitted_m, world_m)
+        if reads_height(name):
+            from ipsys_log.models.depths import HeightCheck
+
+            self._height_check = HeightCheck(self._estimator.camera_rays, fitted_m, world_m)
         if camera.noise is not None:
             noise = camera.noise
             self._uncertainty = Uncertainty(noise.along, noise.across, noise.growth, noise.fit, fitted_m)
@@ -239,10 +281,16 @@ class AppliedModel:
         """Return world points (n, 3) from camera points (n, 3) and heights (n,), all in m."""
         return predict_array(self._estimator, inputs(self._name, points_m, heights_m))
 
-    def covariances(self, points_m: Array, heights_m: Array) -> Array | None:
-        """Return covariances (n, 3, 3) of the world points in m^2; None if they are unknown."""
+    def covariances(
+        self, points_m: Array, heights_m: Array, height_sigmas_m: Array | None = None
+    ) -> Array | None:
+        """Return covariances (n, 3, 3) of the world points in m^2; None if they are unknown.
+
+        ``height_sigmas_m`` (n,) are the standard deviations of the heights, for models that read heights;
+        None for the usual one of a marker on a robot.
+        """
         if self._uncertainty is not None:
-            return self._uncertainty.covariances(self.predict, points_m, heights_m)
+            return self._uncertainty.covariances(self.predict, points_m, heights_m, height_sigmas_m)
         if self._covariance_m2 is not None:
             return np.broadcast_to(self._covariance_m2, (len(points_m), 3, 3))
         return None
@@ -254,3 +302,14 @@ class AppliedModel:
         points of its fit.
         """
         return self._volume.contains(points_m, world_m[:, 2], sigmas_m) if self._volume else None
+
+    def at_height(
+        self, points_m: Array, world_m: Array, height_sigmas_m: Array, depth_sigmas_m: Array
+    ) -> NDArray[np.bool_]:
+        """Return a mask (n,) of the markers whose depths agree with the heights that the model read.
+
+        All agree if the model reads no heights. See :class:`ipsys_log.models.depths.HeightCheck`.
+        """
+        if self._height_check is None:
+            return np.ones(len(points_m), dtype=bool)
+        return self._height_check.agrees(points_m, world_m, height_sigmas_m, depth_sigmas_m)

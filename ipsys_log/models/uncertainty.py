@@ -16,7 +16,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Predict", "Uncertainty", "Volume", "estimate_uncertainty", "leverage_terms"]
+__all__ = [
+    "HEIGHT_SIGMA_M",
+    "Predict",
+    "Uncertainty",
+    "Volume",
+    "estimate_uncertainty",
+    "leverage_terms",
+    "ruler_sigmas",
+]
 
 Array = NDArray[np.float64]
 
@@ -26,7 +34,7 @@ Predict = Callable[[Array, Array], Array]
 _STEP_M = 0.005
 _STEPS_M = _STEP_M * np.eye(3)
 # Standard deviation of a marker's height on its robot, which is measured once, carefully, with a ruler.
-_HEIGHT_SIGMA_M = 0.0005
+HEIGHT_SIGMA_M = 0.0005
 _FLOOR_M2 = 0.0003**2 * np.eye(3)
 # Prior of the noise: logarithms of its usual values (along, across), and their standard deviation.
 _USUAL_NOISE = np.log([3e-4, 1e-4])
@@ -34,6 +42,9 @@ _NOISE_SPREAD = 2.0
 # Possible powers of the growth of noise towards the edge of the image: 1 for the noise of a pixel, more for a
 # misfit of the model.
 _GROWTHS = (1.0, 2.0, 3.0)
+# A jackknife with few groups is conservative (Efron and Stein 1981). In simulated labs with known heights,
+# this is the ratio of the true variance of the fit to that of the jackknife.
+_JACKKNIFE_SHARE = 0.8
 # Squared Mahalanobis distances above this (the limit of 99.9 % of good calibration points) get less weight.
 _ROBUST = 16.3
 # Tolerance at the outermost calibration points: the accuracy of their positions.
@@ -60,13 +71,20 @@ class Uncertainty:
     fit: Array
     points_m: Array
 
-    def covariances(self, predict: Predict, points_m: Array, heights_m: Array) -> Array:
-        """Return the covariance of the world point of each camera point, (n, 3, 3) in m^2."""
+    def covariances(
+        self, predict: Predict, points_m: Array, heights_m: Array, height_sigmas_m: Array | None = None
+    ) -> Array:
+        """Return the covariance of the world point of each camera point, (n, 3, 3) in m^2.
+
+        ``height_sigmas_m`` (n,) are the standard deviations of the known heights; None for markers on robots,
+        whose heights are measured carefully.
+        """
         slopes, by_height = _slopes(predict, points_m, heights_m)
+        from_height = _height_covariances(by_height, height_sigmas_m)
         wide = _wide(points_m) ** (2 * self.growth)
         leverage = _leverage(self._inverse, points_m)
         inside = wide[:, None, None] * self._noise + leverage[:, None, None] * self.fit
-        covariances: Array = slopes @ inside @ slopes.transpose(0, 2, 1) + by_height
+        covariances: Array = slopes @ inside @ slopes.transpose(0, 2, 1) + from_height
         return covariances
 
     @cached_property
@@ -85,10 +103,7 @@ def _wide(points_m: Array) -> Array:
 
 
 def _slopes(predict: Predict, points_m: Array, heights_m: Array) -> tuple[Array, Array]:
-    """Return the slopes of world points by (u, v, ln Zc), and their covariances from the known heights.
-
-    Both are (n, 3, 3).
-    """
+    """Return the slopes of world points by (u, v, ln Zc), (n, 3, 3), and by the known height, (n, 3)."""
     count = len(points_m)
     # The point itself, one step along each axis, and the point with the marker one step higher.
     points, heights = np.empty((5, count, 3)), np.empty((5, count))
@@ -102,8 +117,13 @@ def _slopes(predict: Predict, points_m: Array, heights_m: Array) -> tuple[Array,
     slopes[:, :, 0] = by_x * depth
     slopes[:, :, 1] = by_y * depth
     slopes[:, :, 2] = by_x * points_m[:, :1] + by_y * points_m[:, 1:2] + by_z * depth
-    height = by_height * _HEIGHT_SIGMA_M
-    return slopes, height[:, :, None] * height[:, None, :] + _FLOOR_M2
+    return slopes, by_height
+
+
+def _height_covariances(by_height: Array, sigmas_m: Array | None) -> Array:
+    """Return the covariances (n, 3, 3) of world points from the errors of their known heights."""
+    height = by_height * (HEIGHT_SIGMA_M if sigmas_m is None else sigmas_m[:, None])
+    return np.asarray(height[:, :, None] * height[:, None, :] + _FLOOR_M2)
 
 
 def _inverse_of_terms(fitted_m: Array) -> Array:
@@ -139,6 +159,7 @@ def estimate_uncertainty(
     tape_m2: Array,
     without: Array,
     left_out: NDArray[np.int64],
+    known_heights: bool = False,
 ) -> Uncertainty:
     """Estimate the uncertainty of a model from models that are fitted without some calibration points.
 
@@ -150,6 +171,9 @@ def estimate_uncertainty(
         then counts as an error of the camera.
     without : (g, n, 3), predictions for all calibration points by models fitted without one of g groups.
     left_out : (n,), the group of each calibration point.
+    known_heights : True if the model gets the measured heights as input. Their errors, with the standard
+        deviation in ``tape_m2``, then move the predicted points along the floor. The predicted heights are
+        the measured ones, so their residuals are zero and say nothing about the noise.
 
     References
     ----------
@@ -164,12 +188,27 @@ def estimate_uncertainty(
     # If a model does not use the depth, the pseudo-inverse sets the covariance of the depth to zero.
     back = np.linalg.pinv(slopes, rcond=1e-6)
     fit = _typical(back @ variances @ back.transpose(0, 2, 1) / leverage[:, None, None])
+    if known_heights:
+        fit *= _JACKKNIFE_SHARE
     # A held-out point has more leverage than a point of the fit.
     more = leverage / np.maximum(1 - leverage, 0.1)
-    known = tape_m2 + by_height + slopes @ (more[:, None, None] * fit) @ slopes.transpose(0, 2, 1)
-    candidates = [(*_noise(residuals, known, slopes, _wide(points_m) ** power), power) for power in _GROWTHS]
+    sigmas_m = ruler_sigmas(tape_m2) if known_heights else None
+    from_height = _height_covariances(by_height, sigmas_m)
+    known = tape_m2 + from_height + slopes @ (more[:, None, None] * fit) @ slopes.transpose(0, 2, 1)
+    size = 2 if known_heights else 3
+    residuals, known, seen = residuals[:, :size], known[:, :size, :size], slopes[:, :size]
+    candidates = [(*_noise(residuals, known, seen, _wide(points_m) ** power), power) for power in _GROWTHS]
     _, along, across, growth = min(candidates)
     return Uncertainty(along, across, growth, fit, points_m)
+
+
+def ruler_sigmas(tape_m2: Array) -> Array:
+    """Return the standard deviation of the measured height of each calibration point, (n,) in m.
+
+    ``tape_m2`` (n, 3, 3) are the covariances of the measured points, 0 if unknown.
+    """
+    variances_m2 = tape_m2[:, 2, 2]
+    return np.where(variances_m2 > 0, np.sqrt(variances_m2), HEIGHT_SIGMA_M)
 
 
 def _fit_variances(shifts: Array, fitted: Array, residuals: Array, left_out: NDArray[np.int64]) -> Array:
@@ -185,7 +224,7 @@ def _fit_variances(shifts: Array, fitted: Array, residuals: Array, left_out: NDA
 def _noise(residuals: Array, known: Array, slopes: Array, wide: Array) -> tuple[float, float, float]:
     """Return the least cost, and the noise along and across, with maximum likelihood of held-out residuals.
 
-    The residuals are (n, 3), in m.
+    The residuals are (n, 3), in m, or (n, 2) on the floor.
     """
     along = slopes[:, :, 2] * wide[:, None]
     across = slopes[:, :, :2] * wide[:, None, None]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats, root_mean_square_m
-from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.analysis.ground_truth import TrackErrors, gather_tracks, track_errors
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     TRUTH_TOPIC,
@@ -18,7 +18,7 @@ from ipsys_log.messages import (
     Suspect,
 )
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
-from ipsys_log.models.table import MODELS, reads_height
+from ipsys_log.models.table import is_known, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
 from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
@@ -33,7 +33,7 @@ class Accuracy:
 
     run: str
     evaluation: Evaluation | None
-    tracks: tuple[ErrorStatistics, ErrorStatistics] | None
+    tracks: TrackErrors | None
 
     @property
     def model(self) -> str:
@@ -44,9 +44,19 @@ class Accuracy:
         rows = self.evaluation.cameras if self.evaluation else ()
         return [row for row in rows if (row.scheme == CROSS_VALIDATION) == cross_validated]
 
+    def rows_with_excluded(self, cross_validated: bool) -> list[CameraEvaluation]:
+        """Return the rows with the gross outliers; the rows of :meth:`rows` if there are none."""
+        rows = self.evaluation.with_excluded if self.evaluation else ()
+        if not rows:
+            return self.rows(cross_validated)
+        return [row for row in rows if (row.scheme == CROSS_VALIDATION) == cross_validated]
+
     def rmse_m(self, row: CameraEvaluation, errors: ErrorStatistics | None) -> float | None:
         """Return the RMSE of the errors of a row, in space or on the floor."""
-        repeats = count_repeats(row, self.evaluation.cameras if self.evaluation else ())
+        rows = self.evaluation.cameras if self.evaluation else ()
+        if self.evaluation and any(other is row for other in self.evaluation.with_excluded):
+            rows = self.evaluation.with_excluded
+        repeats = count_repeats(row, rows)
         return None if errors is None or repeats is None else root_mean_square_m(errors, repeats)
 
 
@@ -86,7 +96,7 @@ def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
 
 def _uses_heights(session: Session, run: str) -> bool:
     models = session.payloads(session.topics(MODEL, run))
-    return bool(models) and models[-1].name in MODELS and reads_height(models[-1].name)
+    return bool(models) and is_known(models[-1].name) and reads_height(models[-1].name)
 
 
 def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
@@ -94,7 +104,8 @@ def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
 
     ``models -> cameras -> 3d / 2d`` are the errors on held-out points. Each camera may also have
     ``cross_validation`` and ``truth``. ``pooled`` has the same over all cameras. ``recommendation`` exists
-    only with learning curves.
+    only with learning curves. If measurements are ``excluded`` as gross outliers, ``with_excluded`` has the
+    errors with them.
     """
     models = {accuracy.model: _model_json(accuracy) for accuracy in accuracies}
     advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])
@@ -102,24 +113,46 @@ def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
 
 
 def _model_json(accuracy: Accuracy) -> dict[str, Any]:
+    rows = (*accuracy.rows(False), *accuracy.rows(True))
+    summary: dict[str, Any] = {"run": accuracy.run, **_rows_json(accuracy, rows)}
+    if accuracy.evaluation is not None:
+        summary["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
+        summary["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
+        if accuracy.evaluation.excluded:
+            rows = (*accuracy.rows_with_excluded(False), *accuracy.rows_with_excluded(True))
+            summary["excluded"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.excluded]
+            summary["with_excluded"] = _rows_json(accuracy, rows)
+    if accuracy.tracks is not None:
+        summary["tracks"] = _tracks_json(accuracy.tracks)
+    return summary
+
+
+def _rows_json(accuracy: Accuracy, rows: Sequence[CameraEvaluation]) -> dict[str, Any]:
     cameras: dict[str, Any] = {}
-    for row in (*accuracy.rows(False), *accuracy.rows(True)):
+    for row in rows:
         target = cameras.setdefault(row.camera, {})
         if row.scheme == CROSS_VALIDATION:
             target = target.setdefault("cross_validation", {})
         if row.against != "tape":
             target = target.setdefault(row.against, {})
         target.update(_row_json(accuracy, row))
-    summary: dict[str, Any] = {"run": accuracy.run}
-    if POOLED in cameras:
-        summary["pooled"] = cameras.pop(POOLED)
-    summary["cameras"] = cameras
-    if accuracy.evaluation is not None:
-        summary["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
-        summary["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
-    if accuracy.tracks is not None:
-        space, floor = (_statistics(errors, root_mean_square_m(errors)) for errors in accuracy.tracks)
-        summary["tracks"] = {"truth": {"3d": space, "2d": floor}}
+    pooled = {"pooled": cameras.pop(POOLED)} if POOLED in cameras else {}
+    return {**pooled, "cameras": cameras}
+
+
+def _tracks_json(tracks: TrackErrors) -> dict[str, Any]:
+    """Return the errors at the instants that count, at the others, and at all; one of them may be missing."""
+
+    def both(space: ErrorStatistics, floor: ErrorStatistics) -> dict[str, Any]:
+        return {
+            "3d": _statistics(space, root_mean_square_m(space)),
+            "2d": _statistics(floor, root_mean_square_m(floor)),
+        }
+
+    instants = {"counted": tracks.counted, "all": tracks.instants}
+    summary: dict[str, Any] = {"truth": both(tracks.space, tracks.floor), "instants": instants}
+    if tracks.others is not None:
+        summary |= {"other_heights": both(*tracks.others), "all_heights": both(*tracks.whole)}
     return summary
 
 
@@ -206,10 +239,13 @@ def _suspect_json(suspect: Suspect) -> dict[str, Any]:
 def gather_outliers(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:
     """Return each outlier, from the last model that names it, with the names of all models that do.
 
-    The outlier with the largest residual is first.
+    A gross outlier, which is excluded from the evaluation of every model, may have no such model. The outlier
+    with the largest residual is first.
     """
     by_measurement: dict[str, tuple[Suspect, list[str]]] = {}
     for accuracy in accuracies:
+        for suspect in accuracy.evaluation.excluded if accuracy.evaluation else ():
+            by_measurement.setdefault(suspect.measurement, (suspect, []))
         for suspect in accuracy.evaluation.suspects if accuracy.evaluation else ():
             models = by_measurement.get(suspect.measurement, (suspect, []))[1]
             by_measurement[suspect.measurement] = (suspect, [*models, accuracy.model])

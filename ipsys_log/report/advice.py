@@ -28,7 +28,7 @@ import numpy as np
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
 from ipsys_log.messages import Evaluation, LearningPoint
-from ipsys_log.models.table import MODELS, reads_height
+from ipsys_log.models.table import is_known, min_pairs, reads_height
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
@@ -114,12 +114,12 @@ def _point(points: Sequence[LearningPoint], places: int, in_space: bool) -> Curv
 # The simplest model first, by free parameters per camera: 6 for a pose, some more for lens distortion, 30 for
 # a polynomial, one per point for kriging, and the weights of a network.
 _SIMPLE_FIRST = (
-    "rigid", "rayplane", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
+    "rigid", "rayplane", "joint", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
     "kriging-regression", "rigid+kriging-regression", "ann", "rigid+ann",
 )  # fmt: skip
 # The paper recommends one of these two, by the number of points.
 _SIMPLE = ("rigid", "poly")
-_OWN = ("rayplane", "best")
+_OWN = ("rayplane", "best", "joint")
 SIMPLE, PAPER, ALL_MODELS, HEIGHT_KNOWN = "simple", "paper", "any", "height_known"
 GROUPS = {
     SIMPLE: "rigid or poly",
@@ -183,7 +183,7 @@ class _Candidate:
 
 def uses_height(model: str) -> bool:
     """Return whether a model gets the height of a marker as input; then its 3D error is a 2D error."""
-    return model in MODELS and reads_height(model)
+    return is_known(model) and reads_height(model)
 
 
 def label(model: str) -> str:
@@ -204,7 +204,8 @@ def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
     if len(table) < 2:
         return None
     choices = {places: _choices(candidates) for places, candidates in sorted(table.items())}
-    return Advice(published, in_space, choices, tuple(_sentences(choices, table)))
+    sentences = (*_sentences(choices, table), *_too_few(evaluations, in_space))
+    return Advice(published, in_space, choices, sentences)
 
 
 def _relative_noise(evaluation: Evaluation, published: bool, in_space: bool) -> float:
@@ -268,6 +269,29 @@ def _sentences(
     ):
         if SIMPLE in choices[most] and other in choices[most]:
             yield from _saving(start, choices[most][other].model, choices[most][SIMPLE], most, table)
+
+
+# A polynomial with so many times the error of the largest number of points has too few points.
+_TOO_FEW = 5.0
+
+
+def _too_few(evaluations: Sequence[Evaluation], in_space: bool) -> Iterable[str]:
+    """Yield the reason for a large error of the polynomial with hardly more points than coefficients.
+
+    The reason is about random subsets if there are some: the learning curve shows them.
+    """
+    for evaluation in evaluations:
+        curve = mean_curve(evaluation, False, in_space) or mean_curve(evaluation, True, in_space)
+        if evaluation.model != "poly" or len(curve) < 2:
+            continue
+        few, many, terms = curve[0], curve[-1], min_pairs("poly")
+        if few.places < 2 * terms and few.mean_m > _TOO_FEW * many.mean_m:
+            yield (
+                f"The error of poly with {few.places} points, {few.mean_m * CM_PER_M:.0f} cm, is no fault of "
+                f"the lab: poly has {terms} coefficients for each coordinate, so it passes through "
+                f"{few.places} points with their errors and is wrong between and beyond them. With "
+                f"{many.places} points, it is {many.mean_m * CM_PER_M:.1f} cm."
+            )
 
 
 def _by_number(models: Mapping[int, str]) -> str:

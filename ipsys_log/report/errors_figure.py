@@ -14,6 +14,7 @@ from matplotlib.transforms import Transform, blended_transform_factory
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.analysis.ground_truth import TrackErrors
 from ipsys_log.messages import ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.units import CM_PER_M
@@ -21,6 +22,8 @@ from ipsys_log.units import CM_PER_M
 __all__ = ["count_rows", "draw_errors"]
 
 _TRACKS = "tracks"
+# Instants at which a marker does not have the height that its model takes it to be at.
+_OTHER_HEIGHTS = "other heights"
 # Above this ratio of the largest error to the median, a logarithmic scale makes the small errors visible.
 _LOG_RATIO = 15.0
 _GAP = 0.7  # between models, in rows
@@ -67,8 +70,15 @@ def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
             errors_cm = np.linalg.norm(offsets_m[:, : 3 if in_space else 2], axis=1) * CM_PER_M
             rows.append(_Row(name, row.camera, row.against, errors_cm, errors))
         if accuracy.tracks is not None:
-            rows.append(_Row(name, _TRACKS, "truth", np.zeros(0), accuracy.tracks[0 if in_space else 1]))
+            rows.append(_Row(name, _TRACKS, "truth", np.zeros(0), _errors(accuracy.tracks, in_space)))
+            if accuracy.tracks.others is not None:
+                others = accuracy.tracks.others[0 if in_space else 1]
+                rows.append(_Row(name, _OTHER_HEIGHTS, "truth", np.zeros(0), others))
     return rows
+
+
+def _errors(tracks: TrackErrors, in_space: bool) -> ErrorStatistics:
+    return tracks.space if in_space else tracks.floor
 
 
 def count_rows(accuracies: Sequence[Accuracy]) -> int:

@@ -17,7 +17,16 @@ from ipsys_log.report.advice import Advice, advise, uses_height
 from ipsys_log.runs.graph import writes
 from ipsys_log.sinks.selection import rig_in_force
 
-__all__ = ["Findings", "PointErrors", "gather_findings", "in_space", "overall_row", "rank", "ranking_errors"]
+__all__ = [
+    "Findings",
+    "PointErrors",
+    "gather_findings",
+    "in_space",
+    "overall_row",
+    "overall_row_with_excluded",
+    "rank",
+    "ranking_errors",
+]
 
 Array = NDArray[np.float64]
 
@@ -146,6 +155,15 @@ def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
 def overall_row(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:
     """Return the row over all cameras; with a single camera, return the row of this camera."""
     rows = [row for row in accuracy.rows(cross_validated) if row.against == against]
+    pooled = [row for row in rows if row.camera == POOLED]
+    return next(iter(pooled or rows), None)
+
+
+def overall_row_with_excluded(accuracy: Accuracy, cross_validated: bool) -> CameraEvaluation | None:
+    """Return the row over all cameras with the gross outliers; None if no measurement is excluded."""
+    if not (accuracy.evaluation and accuracy.evaluation.with_excluded):
+        return None
+    rows = [row for row in accuracy.rows_with_excluded(cross_validated) if row.against == "tape"]
     pooled = [row for row in rows if row.camera == POOLED]
     return next(iter(pooled or rows), None)
 

@@ -14,7 +14,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import GROUPS, Choice, label, uses_height
-from ipsys_log.report.findings import Findings, overall_row
+from ipsys_log.report.findings import Findings, overall_row, overall_row_with_excluded
 from ipsys_log.report.points_figure import hull_m
 from ipsys_log.units import CM_PER_M
 
@@ -50,6 +50,7 @@ def headline(findings: Findings) -> dict[str, Any]:
     best = ranked[0]
     row = overall_row(best, True) or overall_row(best, False)
     assert row is not None  # a model without any row was not evaluated
+    whole = overall_row_with_excluded(best, bool(best.rows(True)))
     errors, truth = findings.errors(row), overall_row(best, bool(best.rows(True)), _TRUTH)
     height_models = [accuracy for accuracy in ranked if uses_height(accuracy.model) and accuracy is not best]
     return {
@@ -63,6 +64,8 @@ def headline(findings: Findings) -> dict[str, Any]:
         "count": errors.count,
         "counts": _counts(best),
         "floor": format_cm(row.error_2d.mean_m, 1),
+        "excluded": [s.measurement for s in best.evaluation.excluded] if best.evaluation else [],
+        "with_excluded": format_cm(findings.errors(whole).mean_m, 1) if whole else None,
         "p95": format_cm(errors.p95_m, 1),
         "truth": format_cm(findings.errors(truth).mean_m, 2) if truth else None,
         "told": [
@@ -122,6 +125,7 @@ def _choice(choice: Choice | None) -> dict[str, str] | None:
 def model_rows(findings: Findings, camera: str = POOLED) -> list[dict[str, Any]]:
     """Return one row per model and reference (tape or truth), for one camera or for all; the best first."""
     against = [a for a in ("tape", _TRUTH) if any(_rows(f, camera, a) for f in findings.accuracies)]
+    excluded = any(evaluation.with_excluded for evaluation in findings.evaluations)
     return [
         {
             "model": label(accuracy.model),
@@ -129,11 +133,20 @@ def model_rows(findings: Findings, camera: str = POOLED) -> list[dict[str, Any]]
             "several": len(against) > 1,
             "held_out": _errors(accuracy, rows.get(False)),
             "crossed": _errors(accuracy, rows.get(True)),
+            "whole": _whole(accuracy, camera, side) if excluded else "",
         }
         for accuracy in findings.ranked()
         for side in against
         if (rows := _rows(accuracy, camera, side))
     ]
+
+
+def _whole(accuracy: Accuracy, camera: str, against: str) -> str:
+    """Return the mean error with the gross outliers, by cross-validation or else on held-out points."""
+    rows = accuracy.rows_with_excluded(True) or accuracy.rows_with_excluded(False)
+    rows = [row for row in rows if row.against == against]
+    same = [row for row in rows if row.camera == camera] or (rows[:1] if camera == POOLED else [])
+    return format_cm((same[0].error_3d or same[0].error_2d).mean_m) if same else "–"
 
 
 def _rows(accuracy: Accuracy, camera: str, against: str) -> dict[bool, CameraEvaluation]:

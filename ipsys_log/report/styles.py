@@ -37,6 +37,7 @@ _MODELS = {
     "kriging-regression": ("#56B4E9", "v"),
     "rayplane": ("#E69F00", "P"),
     "best": ("#000000", "X"),
+    "joint": ("#882255", "*"),
 }
 
 # Colours for the less important parts of a figure.

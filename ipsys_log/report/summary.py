@@ -15,7 +15,7 @@ from ipsys_log.analysis.consistency import FEWEST_POINTS
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
-from ipsys_log.report.findings import in_space, overall_row, rank, ranking_errors
+from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
 from ipsys_log.report.tables import format_interval, name_cell, plain_table, wrap_text
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
@@ -25,6 +25,8 @@ __all__ = ["answer_json", "answer_text", "models_table"]
 # Number of outliers with an explanation in the answer; the other outliers are only named.
 _EXPLAINED = 3
 _TRUTH = "truth"
+# Number of gross outliers that the summary names.
+_NAMED = 3
 
 
 def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
@@ -33,14 +35,58 @@ def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
         return None
     best = rank(accuracies)[0]
     lines: list[str | Text] = [*_best_lines(accuracies, best)]
-    if best.tracks is not None:
-        errors = best.tracks[0] if in_space(accuracies) else best.tracks[1]
-        lines.append(f"Tracks, against the ground truth: {_figures(errors, root_mean_square_m(errors))}.")
+    shown = [best, *([] if (told := _height_model(accuracies, best)) is None else [told])]
+    for accuracy in shown:
+        if accuracy.tracks is not None:
+            lines += _track_lines(accuracy, in_space(accuracies), len(shown) > 1)
     if any(accuracy.evaluation and accuracy.evaluation.cameras for accuracy in accuracies):
         lines += _outlier_lines(accuracies)
     advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])
     lines += advice.sentences if advice else ()
     return Group(*(Text(wrap_text(line)) if isinstance(line, str) else line for line in lines))
+
+
+def _height_model(accuracies: Sequence[Accuracy], best: Accuracy) -> Accuracy | None:
+    """Return the best model that gets heights as input, if it is not the best model of all."""
+    models = [accuracy for accuracy in rank(accuracies) if uses_height(accuracy.model)]
+    return models[0] if models and models[0] is not best else None
+
+
+def _track_lines(accuracy: Accuracy, space: bool, several: bool) -> Iterator[str]:
+    """Yield the errors of the tracks at the instants that count, and at the others."""
+    tracks = accuracy.tracks
+    assert tracks is not None
+    # A known height is no result of the model: its error is that of the input.
+    space = space and not uses_height(accuracy.model)
+    own, whole = (tracks.space, tracks.whole[0]) if space else (tracks.floor, tracks.whole[1])
+    of_model = f" of {name_cell(accuracy.model).plain}" if several else ""
+    text = f"Tracks{of_model}, against the ground truth: {_figures(own, root_mean_square_m(own))}."
+    if tracks.others is None:
+        yield text
+    elif not tracks.counted:
+        yield f"{text} The marker has the height in the rig at none of these {tracks.instants} instants."
+    else:
+        others = tracks.others[0] if space else tracks.others[1]
+        yield (
+            f"{text} This is at the {tracks.counted} of {tracks.instants} instants at which the marker has "
+            f"the height in the rig. At the other {others.count}, the mean error is {_cm(others.mean_m)} cm; "
+            f"over all, it is {_cm(whole.mean_m)} cm."
+        )
+
+
+def _excluded_line(best: Accuracy, row: CameraEvaluation, space: bool) -> str:
+    """Return the gross outliers without which the figures are computed, and the error with them."""
+    assert best.evaluation is not None
+    names = [name_cell(suspect.measurement).plain for suspect in best.evaluation.excluded]
+    listed = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    one = len(names) == 1
+    of = f"the gross outlier {listed}" if one else f"{len(names)} gross outliers: {listed}"
+    text = f"The errors and the advice are without {of}."
+    whole = overall_row_with_excluded(best, row.scheme == CROSS_VALIDATION)
+    if whole is None:
+        return text
+    mean_cm = _cm(ranking_errors(whole, space).mean_m)
+    return f"{text} With {'it' if one else 'them'}, the mean error is {mean_cm} cm."
 
 
 def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str | Text]:
@@ -61,19 +107,17 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
         f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; each pair of "
         "a camera and a point counts as one)."
     )
+    if best.evaluation and best.evaluation.excluded:
+        yield _excluded_line(best, row, space)
     truth = overall_row(best, row.scheme == CROSS_VALIDATION, _TRUTH)
     if truth is not None:
         errors = ranking_errors(truth, space)
         yield f"Against the ground truth: {_figures(errors, best.rmse_m(truth, errors))}."
-    height_models = [accuracy for accuracy in rank(accuracies) if uses_height(accuracy.model)]
-    if (
-        height_models
-        and height_models[0] is not best
-        and (told_row := overall_row(height_models[0], True) or overall_row(height_models[0], False))
-    ):
+    told = _height_model(accuracies, best)
+    if told and (told_row := overall_row(told, True) or overall_row(told, False)):
         errors = ranking_errors(told_row, space)
-        figures = _figures(errors, height_models[0].rmse_m(told_row, errors))
-        yield f"With known marker heights: {height_models[0].model}, {figures} (2D)."
+        figures = _figures(errors, told.rmse_m(told_row, errors))
+        yield f"With known marker heights: {told.model}, {figures} (2D)."
 
 
 def _scheme(row: CameraEvaluation) -> str:
@@ -141,10 +185,17 @@ def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
         return {}
     errors = ranking_errors(row, in_space(accuracies))
     rmse_m = best.rmse_m(row, errors)
-    figures = {"mean_cm": errors.mean_m * CM_PER_M} | (
+    figures: dict[str, Any] = {"mean_cm": errors.mean_m * CM_PER_M} | (
         {} if rmse_m is None else {"rmse_cm": rmse_m * CM_PER_M}
     )
     names = [suspect.measurement for suspect, _ in gather_outliers(accuracies)]
+    excluded = [suspect.measurement for suspect in best.evaluation.excluded] if best.evaluation else []
+    if excluded:
+        figures = {**figures, "excluded": excluded}
+        whole = overall_row_with_excluded(best, row.scheme == CROSS_VALIDATION)
+        if whole is not None:
+            mean_m = ranking_errors(whole, in_space(accuracies)).mean_m
+            figures["mean_with_excluded_cm"] = mean_m * CM_PER_M
     return {"answer": {"model": best.model, "scheme": row.scheme, **figures, "outliers": names}}
 
 
@@ -160,8 +211,10 @@ def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
     crossed = any(rows[True] for _, rows in lines)
     kind, scheme = "3D" if space else "2D", "cross-validated" if crossed else "held out"
     figures = [f"{kind} mean", "95 % CI", "RMSE", "p95", *(["2D mean", "RMSE"] if space else ["max"])]
-    held_out = crossed and any(rows[False] for _, rows in lines)
+    excluded = any(accuracy.evaluation and accuracy.evaluation.with_excluded for accuracy, _ in lines)
+    held_out = crossed and any(rows[False] for _, rows in lines) and not excluded
     figures += [f"held out {kind}"] if held_out else []
+    figures += [f"{kind}, all points"] if excluded else []
     by_camera = len(accuracies) == 1
     table = plain_table(f"Errors in cm, {scheme}", ["camera" if by_camera else "model"], figures)
     for accuracy, rows in lines:
@@ -169,6 +222,7 @@ def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
         assert row is not None
         cells = _cells(accuracy, row, space)
         cells += [_held_out(rows[False], space)] if held_out else []
+        cells += [_with_excluded(accuracy, row, space)] if excluded else []
         table.add_row(name_cell((row.camera or "(all)") if by_camera else label(accuracy.model)), *cells)
     if not by_camera and any(uses_height(accuracy.model) for accuracy, _ in lines):
         table.caption, table.caption_justify, table.caption_style = Text(HEIGHT_NOTE), "left", ""
@@ -199,6 +253,13 @@ def _cells(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> list[str]:
 
 def _held_out(row: CameraEvaluation | None, space: bool) -> str:
     return "-" if row is None else _two(ranking_errors(row, space).mean_m)
+
+
+def _with_excluded(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> str:
+    """Return the mean error of the same camera and scheme with the gross outliers."""
+    rows = accuracy.rows_with_excluded(row.scheme == CROSS_VALIDATION)
+    same = [other for other in rows if (other.camera, other.against) == (row.camera, row.against)]
+    return _two(ranking_errors(same[0], space).mean_m) if same else "-"
 
 
 def _two(value_m: float | None) -> str:

@@ -90,8 +90,9 @@ def _held_out_table(accuracies: Sequence[Accuracy]) -> Table:
         rows = [row for row in accuracy.rows(False) if row.camera != POOLED]
         errors = [(row.camera, row.against, _held_out_cells(accuracy, row)) for row in rows]
         if accuracy.tracks is not None:
-            rmse_m = root_mean_square_m(accuracy.tracks[0])
-            errors.append(("(tracks)", "truth", _cells(*accuracy.tracks, rmse_m)))
+            errors.append(("(tracks)", "truth", _track_cells(accuracy.tracks.space, accuracy.tracks.floor)))
+            if accuracy.tracks.others is not None:
+                errors.append(("(other heights)", "truth", _track_cells(*accuracy.tracks.others)))
         lines += _named(accuracy, errors)
     figures = ("n", "3D mean", "RMSE", "min", "max", "std", "2D mean", "max")
     return _filled("Errors in cm, held-out points", lines, figures)
@@ -143,6 +144,10 @@ def _filled(title: str, lines: Sequence[_Line], figures: Sequence[str]) -> Table
 
 def _held_out_cells(accuracy: Accuracy, row: CameraEvaluation) -> list[str]:
     return _cells(row.error_3d, row.error_2d, accuracy.rmse_m(row, row.error_3d))
+
+
+def _track_cells(space: ErrorStatistics, floor: ErrorStatistics) -> list[str]:
+    return _cells(space, floor, root_mean_square_m(space))
 
 
 def _cells(error_3d: ErrorStatistics | None, error_2d: ErrorStatistics, rmse_3d_m: float | None) -> list[str]:

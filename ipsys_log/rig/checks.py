@@ -27,6 +27,8 @@ _KINDS = {
     "marker_length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "tape_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
+    "marker_height_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
+    "height_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
     "width_m": _Kind("m", 0.0, 100.0, _LENGTHS),
     "depth_m": _Kind("m", 0.0, 100.0, _LENGTHS),
     "x_m": _Kind("m", -100.0, 100.0, _LENGTHS),

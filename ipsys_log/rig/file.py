@@ -297,11 +297,11 @@ def _check_tape(rig: Rig, where: str) -> None:
     # Positions are rounded to 1 mm: two nearer points are probably one point that is in the file twice.
     at_m = ((round(point.x_m, 3), round(point.y_m, 3)) for point in rig.reference_points)
     _check_unique(at_m, f"{where}: two reference points are at")
-    sigma_m = rig.tape_sigma_m
-    if sigma_m is not None and not (math.isfinite(sigma_m) and sigma_m > 0):
-        raise IpsysError(
-            f"{where}: tape_sigma_m = {sigma_m} m is not a standard deviation; it must be above 0"
-        )
+    sigmas_m = {"tape_sigma_m": rig.tape_sigma_m, "marker_height_sigma_m": rig.marker_height_sigma_m}
+    sigmas_m |= {f"height_sigma_m of marker {marker.id}": marker.height_sigma_m for marker in rig.markers}
+    for key, sigma_m in sigmas_m.items():
+        if sigma_m is not None and not (math.isfinite(sigma_m) and sigma_m > 0):
+            raise IpsysError(f"{where}: {key} = {sigma_m} m is not a standard deviation; it must be above 0")
 
 
 def _check_heights(rig: Rig, where: str) -> None:

@@ -41,7 +41,7 @@ from ipsys_log.runs.provenance import check_run_name, find_run, newest_run
 from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.stages.detect import usual_corners
 
-__all__ = ["check_inputs"]
+__all__ = ["check_inputs", "image_sizes"]
 
 # Most messages of a channel that the checks read. Some recorders write a calibration with each frame, so that
 # all of them are spread over the whole log.
@@ -221,6 +221,22 @@ def _check_sizes(session: Session, request: Request) -> None:
         size_px = None if lens is None else _first_size_px(session, topic)
         if lens is not None and size_px is not None:
             check_size(lens, *size_px, name)
+
+
+def image_sizes(session: Session) -> dict[str, tuple[int, int]]:
+    """Return width and height of the images by camera, from the first image or the first markers."""
+    sizes_px: dict[str, tuple[int, int]] = {}
+    for name, topic in session.images.items():
+        size_px = _first_size_px(session, topic)
+        if size_px is not None:
+            sizes_px[name] = size_px
+    run = newest_run(session, MARKERS)
+    for topic in session.topics(MARKERS, run) if run else []:
+        message = next(session.messages([topic]), None)
+        if message is not None and message.camera:
+            size_px = message.payload.width, message.payload.height
+            sizes_px.setdefault(message.camera, size_px)
+    return sizes_px
 
 
 def _first_size_px(session: Session, topic: str) -> tuple[int, int] | None:

@@ -12,14 +12,16 @@ from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CameraModel
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
+    MARKERS,
     POSITIONS,
     RIG,
     Channel,
 )
-from ipsys_log.models.table import AppliedModel, min_pairs, reads_height
+from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.select import copied_run, fitted_in
@@ -58,14 +60,28 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
     world_m = _check_places(places)
     train_m = np.array([world_m[name] for name in sorted(train)]).reshape(-1, 3)
     for model in models:
+        if reads_corners(model):
+            _check_corners(session, model)
         if len(train) < min_pairs(model):
             raise FitError(
                 f"{session}: {model} needs at least {min_pairs(model)} calibration points for each camera, "
                 f"but the log has {len(train)} in all; measure more"
                 + ("" if model == "rigid" else ", or use --model rigid")
             )
-        check_different(model, str(session), train_m)
-    _check_line(session, train_m)
+        if not reads_corners(model):
+            check_different(model, str(session), train_m)
+    # For a model of all corners, a drive is enough beside the line; its fit checks that.
+    if not all(reads_corners(model) for model in models):
+        _check_line(session, train_m)
+
+
+def _check_corners(session: Session, model: str) -> None:
+    """Check that the log has corners of markers, or images to detect them in."""
+    if not session.images and newest_run(session, MARKERS) is None:
+        raise FitError(
+            f"{session}: {model} is fitted to the corners of markers, but the log has only camera points; "
+            "use --model best"
+        )
 
 
 def _check_places(places: Sequence[RiggedMeasurement]) -> dict[str, NDArray[np.float64]]:
@@ -112,7 +128,8 @@ def check_fits(
         for camera, seen in find_pairs(view, points).items()
     }
     for model in models:
-        check_pairs(model, pairs)
+        if not reads_corners(model):
+            check_pairs(model, pairs)
 
 
 def check_evaluated(session: Session, request: Request, models: Sequence[str]) -> None:
@@ -146,7 +163,7 @@ def check_models(
         for name in models:
             model, _ = fitted_in(other, name)
             for camera in model.cameras if {EVALUATION, POSITIONS} & {*written} else ():
-                AppliedModel(model.name, camera)
+                _restore(model.name, camera)
             fitted = {camera.camera for camera in model.cameras}
             if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(
@@ -154,6 +171,14 @@ def check_models(
                     f"{', '.join(sorted(fitted))}, but the log has {', '.join(sorted(cameras))}; give a "
                     "model of these cameras"
                 )
+
+
+def _restore(name: str, camera: CameraModel) -> object:
+    if not reads_corners(name):
+        return AppliedModel(name, camera)
+    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
+
+    return restore_joint(camera)
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Model, Rig
 from ipsys_log.messages.channels import MARKERS, MODEL, RIG
-from ipsys_log.models.table import create
+from ipsys_log.models.table import check_name
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import complete_runs, newest_run
 from ipsys_log.runs.view import LogView
@@ -51,7 +51,7 @@ def wanted_models(
         A name is not in the table, or a log has no fitted model to apply.
     """
     for name in request.models:
-        create(name)
+        check_name(name)
     if request.models:
         return request.models
     if request.model_from is not None:

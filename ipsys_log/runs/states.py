@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
+from ipsys_log.messages import IMPORTED, MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
 from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
 from ipsys_log.runs.provenance import is_complete, recorded_version
@@ -97,6 +97,8 @@ def _judge(session: Session, one: Recorded) -> Recorded:
     run = one.run
     if not is_complete(session, run):
         return replace(one, state="unfinished")
+    if run.stage == IMPORTED:
+        return replace(one, state="not repeatable")
     if newer := made_by_newer(session, run):
         return replace(one, state=newer, is_newer=True)
     names = versioned_names(run.stage, one.method)

@@ -22,7 +22,7 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
-from ipsys_log.messages import CameraCalibration, FrameTransforms, Message, Run
+from ipsys_log.messages import IMPORTED, CameraCalibration, FrameTransforms, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
@@ -43,9 +43,9 @@ def verify(
     """Repeat every run from its recorded input, and compare.
 
     A model that was copied from another log cannot be repeated, and neither can its evaluation; results made
-    with it can. A model cannot be repeated if measurements were added or withdrawn since. Results of another
-    version are not repeated either; a remark reports this. Later stages are repeated from the recorded
-    channels.
+    with it can. A run that was imported from files of another program cannot be repeated either. A model
+    cannot be repeated if measurements were added or withdrawn since. Results of another version are not
+    repeated; a remark reports this. Later stages are repeated from the recorded channels.
 
     Parameters
     ----------
@@ -64,7 +64,12 @@ def verify(
     with Session(paths) as session, one_blas_thread():
         names = session.run_names() if run is None else session.run_names() & {run}
         recorded = [stage for stage in recorded_stages(session) if stage.run.run in names]
-        records = [stage.run for stage in recorded if not _is_of_copied_model(stage.run)]
+        imported = {stage.run.run for stage in recorded if stage.run.stage == IMPORTED}
+        records = [
+            stage.run
+            for stage in recorded
+            if stage.run.stage != IMPORTED and not _is_of_copied_model(stage.run)
+        ]
         if not records:
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
@@ -92,7 +97,7 @@ def verify(
                 key=lambda row: row[0].log_time_ns,
             )
             comparisons += compare_channels(session.stored(sorted(topics)), made)
-        return sorted([*comparisons, *_unrecorded(session, names)], key=lambda one: one.topic)
+        return sorted([*comparisons, *_unrecorded(session, names - imported)], key=lambda one: one.topic)
 
 
 def _is_of_copied_model(run: Run) -> bool:

@@ -39,6 +39,15 @@ class LogView:
         """Return the names of the cameras with intrinsics, from the log or from the user."""
         return {*self.session.calibrations, *self.given_lenses}
 
+    def calibrations(self) -> dict[str, CameraCalibration]:
+        """Return the first intrinsics of each camera, from the log or from the user."""
+        recorded = {
+            camera: next(self.session.messages([topic])).payload
+            for camera, topic in self.session.calibrations.items()
+            if camera not in self.given_lenses
+        }
+        return {**recorded, **self.given_lenses}
+
     def run(self, channel: Channel) -> str:
         """Return the run that the stage reads of a derived channel; "" if there is none."""
         return self.inputs.get(channel, "")

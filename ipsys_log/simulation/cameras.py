@@ -13,7 +13,7 @@ from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
-__all__ = ["FLOOR_M", "Camera", "mount_cameras", "sees"]
+__all__ = ["FLOOR_M", "Camera", "aim_cameras", "mount_cameras", "sees"]
 
 Array = NDArray[np.float64]
 
@@ -63,6 +63,23 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
     return tuple(_mount(settings, index, float(y_m), spacing_m, time_ns) for index, y_m in enumerate(ys_m))
 
 
+def aim_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
+    """Return cameras with large tilts, each aimed at the point of the floor below its place in the row.
+
+    A camera with a tilt of t stands ``height * tan(t)`` beside its place, at most at the walls.
+    :func:`mount_cameras` refuses such tilts, because a tilted camera does not see its part of the floor.
+
+    Parameters
+    ----------
+    settings : settings of the lab.
+    time_ns : time of the calibrations.
+    """
+    count = len(settings.cameras)
+    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
+    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    return tuple(_aim(settings, index, float(y_m), time_ns) for index, y_m in enumerate(ys_m))
+
+
 def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
     """Return a mask (n,) of the world points, (n, 3) in m, that are in the image."""
     points_c = transform(camera.camera_from_world, points_m)
@@ -94,6 +111,23 @@ def _mount(settings: LabSettings, index: int, y_m: float, spacing_m: float, time
         f"with a tilt of {settings.tilt_deg[0]:g} to {settings.tilt_deg[1]:g} degrees; "
         "tilt it less, hang it higher, or use a frame of 16:9 and lower markers"
     )
+
+
+def _aim(settings: LabSettings, index: int, y_m: float, time_ns: int) -> Camera:
+    rng = random_stream(settings.seed, Purpose.GEOMETRY, index)
+    name = settings.cameras[index]
+    for _ in range(_TRIES):
+        lens = _draw_lens(rng, settings, name, time_ns)
+        if _reaches(lens):
+            break
+    tilt = np.radians(rng.uniform(*settings.tilt_deg))
+    towards = rng.uniform(0, 2 * np.pi)
+    axis = np.array([np.cos(towards), np.sin(towards), 0.0])
+    aside = look_down(np.zeros(3), tilt * axis)[2, :3]
+    place_m = np.array([FLOOR_M / 2, y_m]) + settings.mount_height_m * aside[:2] / aside[2]
+    nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
+    origin_m = np.append(np.clip(place_m, 0.0, FLOOR_M), settings.mount_height_m) + nudge_m
+    return Camera(name, lens, look_down(origin_m, tilt * axis))
 
 
 def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array:

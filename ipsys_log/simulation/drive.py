@@ -57,6 +57,11 @@ class Drive:
         heading_rad = float(np.arctan2(dy[0], dx[0]))
         return SimulatedPose(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
 
+    def poses_over(self, marker_id: int, times_s: Array) -> Array:
+        """Return x, y and heading of one marker at times (n,) after the start: (n, 3), in m and rad."""
+        (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.maximum(times_s, 0.0))
+        return np.stack([x_m, y_m, np.arctan2(dy, dx)], axis=1)
+
     def track(self, ahead_s: float, times_s: Array) -> Array:
         """Return the centres of a marker at times (n,): (n, 3) in m."""
         (x_m, y_m), _ = self._follow(ahead_s, times_s)

@@ -28,6 +28,13 @@ class Purpose(IntEnum):
     FRAME = 8
     BOARD = 9
     LYING = 10
+    UNEVENNESS = 11
+    INTRINSICS = 12
+    CLOCK = 13
+    CORNERS = 14
+    WOBBLE = 15
+    GEOMETRY = 16
+    PRINTS = 17
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

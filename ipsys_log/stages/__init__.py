@@ -85,8 +85,8 @@ METHOD = StageParameter(
 )
 MODEL = StageParameter(
     name="model",
-    help="Model: rigid, poly, ann, kriging, kriging-regression, rayplane, best, or a hybrid such as "
-    "rigid+poly; repeat it for several.",
+    help="Model: rigid, poly, ann, kriging, kriging-regression, rayplane, best, joint, or a hybrid such "
+    "as rigid+poly; repeat it for several.",
     metavar="NAME",
     kind=list[str] | None,
 )

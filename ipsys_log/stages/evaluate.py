@@ -1,21 +1,24 @@
-"""Evaluation of a model: its errors, the effect of the number of points, and suspect measurements."""
+"""The stage *evaluate*: errors of a model, effect of the number of points, and suspect measurements."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import evaluate_cross_validated, evaluate_held_out
 from ipsys_log.analysis.calibration_points import (
+    JOINT_READS,
     find_pairs,
     has_measurements,
     held_out_ids,
     measured,
+    measured_part,
     split_parameters,
 )
+from ipsys_log.analysis.camera_models import fit_camera_models
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
     REPEATS,
@@ -27,19 +30,22 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
-from ipsys_log.analysis.outliers import find_outliers
+from ipsys_log.analysis.outliers import find_outliers, is_gross
 from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.errors import FitError
-from ipsys_log.messages import Evaluation, LearningPoint, Model, Pair, Suspect
+from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
-from ipsys_log.models.table import CalibrationPoints, min_pairs
+from ipsys_log.models.table import CalibrationPoints, min_pairs, reads_corners
 
 __all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
 
 # Models that check the measurements. They fit in milliseconds, and they follow the calibration points
 # closely enough to show an error of some centimetres.
 SCREENING = ("poly", "rayplane", "best")
+# The same model selects the gross outliers for all evaluations, so that all models have the same points. The
+# polynomial is a hundred times as fast; with fewer points of a camera, it is too uncertain.
+_GROSS_MODEL, _GROSS_MODEL_FEW, _FEW = "poly", "best", 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +75,9 @@ def evaluate_model(
 ) -> Evaluation:
     """Compute errors on held-out points and by cross-validation, learning curve and suspect measurements.
 
+    Gross outliers come first. The errors and the learning curve are without them, in the fit and in the test;
+    the errors with them are in ``with_excluded``.
+
     Parameters
     ----------
     model : fitted model.
@@ -76,33 +85,81 @@ def evaluate_model(
     notes : list of remarks; each impossible step adds a remark.
     progress : called with the number of steps done, and the number of all steps.
     """
+    if study.seed is None:
+        return Evaluation(time_ns, model.name, tuple(_held_out_rows(model, study)))
+    cameras = gather_points(_fitted_pairs(model, study))
+    excluded = _gross_outliers(cameras, study.places)
+    reduced, clean = _without(model, study, {suspect.measurement for suspect in excluded}, notes)
+    if reduced is model:
+        excluded = ()
+    remaining = gather_points(_fitted_pairs(reduced, clean))
+    total = 2 + len(learning_sizes(model.name, remaining))
+    progress(0, total)
+    rows = _rows(reduced, clean, notes)
+    progress(1, total)
+    learning: list[LearningPoint] = published_curve(model.name, remaining, study.subsets, clean.held_out)
+    for done, points in enumerate(learning_curve(model.name, remaining, study.seed), 2):
+        learning += points
+        progress(done, total)
+    suspects = _suspects(model.name, cameras, study.places) if model.name in SCREENING else ()
+    with_excluded = _rows(model, study, []) if excluded else ()
+    progress(total, total)
+    return Evaluation(time_ns, model.name, rows, tuple(learning), suspects, excluded, with_excluded)
+
+
+def _fitted_pairs(model: Model, study: Study) -> dict[str, Sequence[Pair]]:
+    fitted = {camera.camera for camera in model.cameras}
+    return {camera: camera_pairs for camera, camera_pairs in study.pairs.items() if camera in fitted}
+
+
+def _held_out_rows(model: Model, study: Study) -> list[CameraEvaluation]:
     held_out = {
         camera: [pair for pair in camera_pairs if pair.measurement in study.held_out]
         for camera, camera_pairs in study.pairs.items()
     }
-    rows = evaluate_held_out(model, held_out, study.truth)
-    learning: list[LearningPoint] = []
-    suspects: tuple[Suspect, ...] = ()
-    if study.seed is not None:
-        fitted = {camera.camera for camera in model.cameras}
-        pairs = {camera: camera_pairs for camera, camera_pairs in study.pairs.items() if camera in fitted}
-        cameras = gather_points(pairs)
-        sizes = learning_sizes(model.name, cameras)
-        total = 2 + len(sizes)
-        progress(0, total)
-        if _enough(model.name, pairs, notes):
-            try:
-                rows += evaluate_cross_validated(model, pairs, study.truth, study.seed)
-            except FitError as error:
-                notes.append(f"no cross-validation: {error}")
-        progress(1, total)
-        learning = published_curve(model.name, cameras, study.subsets, study.held_out)
-        for done, points in enumerate(learning_curve(model.name, cameras, study.seed), 2):
-            learning += points
-            progress(done, total)
-        suspects = _suspects(model.name, cameras, study.places)
-        progress(total, total)
-    return Evaluation(time_ns, model.name, tuple(rows), tuple(learning), suspects)
+    return evaluate_held_out(model, held_out, study.truth)
+
+
+def _rows(model: Model, study: Study, notes: list[str]) -> tuple[CameraEvaluation, ...]:
+    """Return the errors on held-out points and by cross-validation."""
+    assert study.seed is not None
+    rows, pairs = _held_out_rows(model, study), _fitted_pairs(model, study)
+    if _enough(model.name, pairs, notes):
+        try:
+            rows += evaluate_cross_validated(model, pairs, study.truth, study.seed)
+        except FitError as error:
+            notes.append(f"no cross-validation: {error}")
+    return tuple(rows)
+
+
+def _gross_outliers(
+    cameras: Mapping[str, CalibrationPoints], places: Sequence[RiggedMeasurement]
+) -> tuple[Suspect, ...]:
+    fewest = min((len(points.names) for points in cameras.values()), default=0)
+    name = _GROSS_MODEL if fewest >= _FEW else _GROSS_MODEL_FEW
+    return tuple(suspect for suspect in _suspects(name, cameras, places) if is_gross(suspect))
+
+
+def _without(model: Model, study: Study, names: set[str], notes: list[str]) -> tuple[Model, Study]:
+    """Return the model and the data without some measurements; both unchanged if this is impossible."""
+    if not names:
+        return model, study
+    pairs = {camera: _remaining(camera_pairs, names) for camera, camera_pairs in study.pairs.items()}
+    fitted = {camera.camera: _remaining(camera.pairs, names) for camera in model.cameras}
+    if any(len(camera_pairs) < min_pairs(model.name) for camera_pairs in fitted.values()):
+        notes.append("gross outliers are not excluded: too few calibration points remain")
+        return model, study
+    try:
+        cameras = tuple(fit_camera_models(model.name, gather_points(fitted), fitted))
+    except FitError as error:
+        notes.append(f"gross outliers are not excluded: {error}")
+        return model, study
+    clean = replace(study, pairs=pairs, held_out=study.held_out - names)
+    return replace(model, cameras=cameras), clean
+
+
+def _remaining(pairs: Sequence[Pair], names: set[str]) -> list[Pair]:
+    return [pair for pair in pairs if pair.measurement not in names]
 
 
 def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) -> bool:
@@ -120,7 +177,7 @@ def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) ->
 def _suspects(
     name: str, cameras: Mapping[str, CalibrationPoints], places: Sequence[RiggedMeasurement]
 ) -> tuple[Suspect, ...]:
-    if name not in SCREENING or any(len(p.names) <= min_pairs(name) + 1 for p in cameras.values()):
+    if any(len(points.names) <= min_pairs(name) + 1 for points in cameras.values()):
         return ()
     seen = {place for camera_places in cameras.values() for place in camera_places.names}
     try:
@@ -150,12 +207,28 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         return ""
     again = _is_fitted_here(view, options, model.name)
     seed = options.get("seed", "0")
-    reads = (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
+    joint = reads_corners(model.name)
+    reads = (*JOINT_READS, MODEL, TRUTH) if joint else (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
     notes: list[str] = []
 
     def compute(progress: Progress) -> Evaluation:
         points = measured(view)
         measurements = [point.measurement for point in points]
+        if joint:
+            # Late: scipy takes 1 s, and most commands need no joint model.
+            from ipsys_log.analysis.joint_calibration import observe
+            from ipsys_log.analysis.joint_evaluation import evaluate_joint
+
+            return evaluate_joint(
+                model,
+                observe(view),
+                find_pairs(view, points),
+                held_out_ids(measurements, options),
+                true_points(points, gather_tracks(view.messages(TRUTH))),
+                int(seed) if again else None,
+                notes,
+                progress,
+            )
         study = Study(
             points,
             find_pairs(view, points),
@@ -166,7 +239,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         )
         return evaluate_model(model, study, view.last_ns(*reads), notes, progress)
 
-    folds = {"folds": str(FOLDS), "repeats": str(REPEATS), "seed": seed}
+    folds = {"folds": str(FOLDS), "repeats": "1" if joint else str(REPEATS), "seed": seed}
     return Plan(
         run=view.run(MODEL),
         parameters={**split_parameters(view, options), **folds} if again else {},
@@ -178,11 +251,11 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
 STAGE = Stage(
     name="evaluate",
-    versions={"evaluate": 1},
-    reads=(RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH),
+    versions={"evaluate": 2},
+    reads=(*JOINT_READS, MODEL, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,
-    rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
+    rig_part=measured_part,
     method=model_read,
     causal=False,
 )

@@ -8,41 +8,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibration_points import (
+    JOINT_READS,
     find_pairs,
     has_measurements,
     measured,
+    measured_part,
     split_ids,
     split_parameters,
 )
-from ipsys_log.analysis.cross_validation import gather_points, make_folds, predict_without
+from ipsys_log.analysis.camera_models import fit_camera_models
+from ipsys_log.analysis.cross_validation import gather_points
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
+from ipsys_log.messages import Model, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
-from ipsys_log.models.table import (
-    MODEL_VERSIONS,
-    CalibrationPoints,
-    fit_cameras,
-    inputs,
-    min_pairs,
-    parameters,
-)
-from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
+from ipsys_log.models.table import MODEL_VERSIONS, CalibrationPoints, min_pairs, reads_corners
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["BESIDE_LINE_M", "STAGE", "check_different", "check_pairs", "fit_model", "model_run"]
 
 Array = NDArray[np.float64]
 
-# No hand-held tape is more accurate; this floor keeps the covariance of a flat data set invertible.
-_FLOOR_SIGMA_M = 0.001
-
 # Two calibration points closer than this are the same point; points closer to a line (RMS) lie on it.
 _SAME_PLACE_M = 0.01
 BESIDE_LINE_M = 0.03
-# Groups of calibration points; the uncertainty is estimated by leaving out one group after the other.
-_GROUPS = 10
 
 
 def fit_model(
@@ -71,22 +61,7 @@ def fit_model(
         A camera has fewer pairs than the model needs, or no camera has a pair.
     """
     cameras = check_pairs(name, pairs)
-    models = fit_cameras(name, cameras)
-    without = _predict_without_groups(name, cameras, progress)
-    fitted = []
-    for camera, places in cameras.items():
-        arrays = parameters(models[camera])
-        stored = tuple(
-            Parameter(key, array.shape, array.reshape(-1)) for key, array in sorted(arrays.items())
-        )
-        covariance, noise = None, None
-        if without is not None:
-            residuals, groups = _left_out(places, without[0], without[1][camera])
-            covariance = residuals.T @ residuals / len(residuals) + _FLOOR_SIGMA_M**2 * np.eye(3)
-            tape_m2 = np.array([_tape(pair) for pair in pairs[camera]])
-            noise = _noise(name, models[camera], places, tape_m2, without[1][camera], groups)
-        fitted.append(CameraModel(camera, stored, covariance, tuple(pairs[camera]), noise))
-    return Model(time_ns, name, tuple(fitted))
+    return Model(time_ns, name, tuple(fit_camera_models(name, cameras, pairs, progress)))
 
 
 def check_pairs(name: str, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, CalibrationPoints]:
@@ -144,58 +119,6 @@ def check_different(name: str, where: str, targets: Array) -> None:
         )
 
 
-def _predict_without_groups(
-    name: str, cameras: Mapping[str, CalibrationPoints], progress: Callable[[int, int], None]
-) -> tuple[list[frozenset[str]], dict[str, Array]] | None:
-    """Return the groups, and predictions of models fitted without each group, (g, n, 3) by camera.
-
-    The result is None for too few calibration points.
-    """
-    fewest = min(len(places.names) for places in cameras.values())
-    if fewest <= min_pairs(name):
-        return None
-    most = max(len(places.names) for places in cameras.values())
-    groups = make_folds(cameras, min(most, _GROUPS), np.random.default_rng(0))
-    predicted = []
-    for done, group in enumerate(groups, 1):
-        try:
-            predicted.append(predict_without(name, cameras, group))
-        except FitError:
-            return None
-        progress(done, len(groups))
-    return groups, {camera: np.array([by_camera[camera] for by_camera in predicted]) for camera in cameras}
-
-
-def _left_out(
-    places: CalibrationPoints, groups: Sequence[frozenset[str]], without: Array
-) -> tuple[Array, NDArray[np.int64]]:
-    """Return errors (n, 3) of the models fitted without a point, and the group (n,) of each point."""
-    index = np.array([next(g for g, group in enumerate(groups) if name in group) for name in places.names])
-    return without[index, np.arange(len(index))] - places.world_m, index
-
-
-def _tape(pair: Pair) -> Array:
-    return np.zeros((3, 3)) if pair.world_covariance_m2 is None else pair.world_covariance_m2
-
-
-def _noise(
-    name: str,
-    estimator: object,
-    places: CalibrationPoints,
-    tape_m2: Array,
-    without: Array,
-    groups: NDArray[np.int64],
-) -> Noise | None:
-    def predict(points_m: Array, heights_m: Array) -> Array:
-        world_m: Array = estimator.predict(inputs(name, points_m, heights_m))  # type: ignore[attr-defined]
-        return world_m
-
-    uncertainty: Uncertainty = estimate_uncertainty(
-        predict, places.points_m, places.world_m, tape_m2, without, groups
-    )
-    return Noise(uncertainty.along, uncertainty.across, uncertainty.growth, uncertainty.fit)
-
-
 def model_run(model: str) -> str:
     """Return the name of the run of a model, unless it is taken."""
     return model.replace("+", "_").replace("-", "_")
@@ -208,6 +131,9 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         if copied is not None:
             return copied
     notes: list[str] = []
+    parameters = {"model": name, **split_parameters(view, options)}
+    if reads_corners(name):
+        return _plan_joint(view, options, parameters)
 
     def compute(progress: Progress) -> Model:
         points = measured(view)
@@ -227,8 +153,27 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
     return Plan(
         run=model_run(name),
-        parameters={"model": name, **split_parameters(view, options)},
+        parameters=parameters,
         reads=(RIG, CAMERA_POINTS, MEASUREMENTS),
+        compute=compute,
+        notes=notes,
+    )
+
+
+def _plan_joint(view: StageView, options: Mapping[str, str], parameters: Mapping[str, str]) -> Plan:
+    notes: list[str] = []
+
+    def compute(progress: Progress) -> Model:
+        # Late: scipy takes 1 s, and most commands fit nothing.
+        from ipsys_log.analysis.joint_calibration import fit_joint_model
+
+        train, _ = split_ids([point.measurement for point in measured(view)], options)
+        return fit_joint_model(view, train, view.last_ns(*JOINT_READS), notes, progress)
+
+    return Plan(
+        run=model_run(parameters["model"]),
+        parameters=parameters,
+        reads=JOINT_READS,
         compute=compute,
         notes=notes,
     )
@@ -255,10 +200,10 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str
 STAGE = Stage(
     name="fit",
     versions={"fit": 1, **MODEL_VERSIONS},
-    reads=(RIG, CAMERA_POINTS, MEASUREMENTS),
+    reads=JOINT_READS,
     writes=(MODEL,),
     plan=_plan,
-    rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
+    rig_part=measured_part,
     method=lambda parameters, view: parameters.get("model", ""),
     causal=False,
     of_model=True,

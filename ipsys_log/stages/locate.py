@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
-from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, POSITIONS, RIG
+from ipsys_log.messages import (
+    CameraPoint,
+    CameraPoints,
+    Marker,
+    Markers,
+    Message,
+    Model,
+    Position,
+    Positions,
+    Rig,
+)
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, POSITIONS, RIG
 from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
-from ipsys_log.models.table import AppliedModel, reads_height
+from ipsys_log.models.table import AppliedModel, reads_corners, reads_height
+from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
+from ipsys_log.units import NS_PER_S
 
-__all__ = ["STAGE", "Locate"]
+if TYPE_CHECKING:
+    from ipsys_log.joint.model import JointModel
+
+__all__ = ["STAGE", "Locate", "LocateCorners"]
 
 Array = NDArray[np.float64]
 
@@ -43,24 +58,25 @@ class Locate:
         if applied is not None:
             points = message.payload.points
             heights_m = np.array([self._height(point.id) for point in points])
-            yield Positions(message.publish_time_ns, _positions(applied, points, heights_m) if points else ())
+            sigmas_m = np.array([self._height_sigma(point.id) for point in points])
+            positions = _positions(applied, points, heights_m, sigmas_m) if points else ()
+            yield Positions(message.publish_time_ns, positions)
 
     def _height(self, marker_id: int) -> float:
-        if not reads_height(self._name):
-            return 0.0
-        height_m = self._rig.height_of(marker_id) if self._rig else None
-        if height_m is None:
-            raise IpsysError(
-                f"{self._name} needs the height of marker {marker_id} above the floor: write "
-                "marker_height_m, or height_m of that marker, into lab.toml and give it with --rig lab.toml"
-            )
-        return height_m
+        return _height(self._name, self._rig, marker_id) if reads_height(self._name) else 0.0
+
+    def _height_sigma(self, marker_id: int) -> float:
+        sigma_m = self._rig.height_sigma_of(marker_id) if self._rig else None
+        return HEIGHT_SIGMA_M if sigma_m is None else sigma_m
 
 
 def _positions(
-    applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array
+    applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array, height_sigmas_m: Array
 ) -> tuple[Position, ...]:
-    """Return the positions of the markers; a marker whose ray does not meet its height has none."""
+    """Return the positions of the markers; a marker whose ray does not meet its height has none.
+
+    A marker whose depth contradicts its height is not inside: its position is valid at that height only.
+    """
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
     # The model maps a second point, a little along the heading: the two points give the world heading.
     angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
@@ -68,9 +84,12 @@ def _positions(
     both = applied.predict(np.vstack([points_m, ahead]), np.concatenate([heights_m, heights_m]))
     world, along = both[: len(points)], both[len(points) :] - both[: len(points)]
     headings = np.arctan2(along[:, 1], along[:, 0]).tolist()
-    covariances = applied.covariances(points_m, heights_m)
+    covariances = applied.covariances(points_m, heights_m, height_sigmas_m)
     sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
     inside = applied.inside(points_m, world, sigmas_m)
+    if inside is not None:
+        depth_sigmas_m = np.sqrt([0.0 if p.covariance_m2 is None else p.covariance_m2[2, 2] for p in points])
+        inside &= applied.at_height(points_m, world, height_sigmas_m, depth_sigmas_m)
     return tuple(
         Position(
             point.id,
@@ -87,8 +106,93 @@ def _positions(
     )
 
 
+# Corners without a covariance have about this error.
+_CORNER_SIGMA_PX = 0.25
+# A marker that is not where its corners say that it is, at its height, has larger residuals: with five
+# degrees of freedom, one in a million is larger by chance.
+_MOST_CHI2 = 37.0
+
+
+class LocateCorners:
+    """The stage *locate* for the model of all corners: each marker is level, at the height of the rig."""
+
+    def __init__(self, model: Model) -> None:
+        # Late: scipy takes 1 s, and most commands need no joint model.
+        from ipsys_log.joint.payload import restore_joint
+
+        self._name = model.name
+        self._cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
+        self._rig: Rig | None = None
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        if isinstance(message.payload, Rig):
+            self._rig = message.payload
+            return
+        if not isinstance(message.payload, Markers):
+            return
+        camera = self._cameras.get(str(message.camera))
+        if camera is not None:
+            markers = message.payload.markers
+            positions = self._positions(camera, markers) if markers else ()
+            yield Positions(message.publish_time_ns, positions)
+
+    def _positions(self, camera: JointModel, markers: tuple[Marker, ...]) -> tuple[Position, ...]:
+        from ipsys_log.joint.locate import locate_markers
+
+        unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
+        located = locate_markers(
+            camera,
+            np.array([marker.corners_px for marker in markers], dtype=np.float64),
+            np.array([m.covariance_px2 if m.covariance_px2 is not None else unknown for m in markers]),
+            np.array([_height(self._name, self._rig, marker.id) for marker in markers]),
+            np.array([self._rig.length_of(marker.id) if self._rig else 0.0 for marker in markers]),
+        )
+        headings_rad = located.headings_rad.tolist()
+        return tuple(
+            Position(
+                marker.id,
+                x_m,
+                y_m,
+                z_m,
+                headings_rad[n],
+                located.covariances_m2[n],
+                bool(located.chi2[n] < _MOST_CHI2),
+                _time_offset_ns(camera, marker),
+            )
+            for n, (marker, (x_m, y_m, z_m)) in enumerate(
+                zip(markers, located.points_m.tolist(), strict=True)
+            )
+            if np.isfinite(x_m)
+        )
+
+
+def _time_offset_ns(camera: JointModel, marker: Marker) -> int | None:
+    """Return the time from the stamp of the frame to the exposure of the marker, by the common clock."""
+    rows = float(marker.corners_px[:, 1].mean())
+    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s - camera.clock_s) * NS_PER_S)
+    return offset_ns if offset_ns or marker.time_offset_ns is not None else None
+
+
+def _height(model: str, rig: Rig | None, marker_id: int) -> float:
+    """Return the height of a marker above the floor, in m."""
+    height_m = rig.height_of(marker_id) if rig else None
+    if height_m is None:
+        raise IpsysError(
+            f"{model} needs the height of marker {marker_id} above the floor: write "
+            "marker_height_m, or height_m of that marker, into lab.toml and give it with --rig lab.toml"
+        )
+    return height_m
+
+
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
     model: Model = view.payloads(MODEL)[-1]
+    if reads_corners(model.name):
+        return Plan(
+            run=view.run(MODEL),
+            parameters={},
+            reads=(RIG, MARKERS, MODEL),
+            step=lambda run: LocateCorners(model),
+        )
     return Plan(
         run=view.run(MODEL),
         parameters={},
@@ -97,12 +201,23 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
     )
 
 
+def _rig_part(rig: Rig, options: Mapping[str, str]) -> object:
+    part = (
+        rig.marker_height_m,
+        rig.marker_height_sigma_m,
+        {(m.id, m.height_m, m.height_sigma_m) for m in rig.markers},
+    )
+    if not reads_corners(options.get("model", "")):
+        return part
+    return part, rig.marker_length_m, {(m.id, m.length_m) for m in rig.markers}
+
+
 STAGE = Stage(
     name="locate",
-    versions={"locate": 1},
-    reads=(RIG, CAMERA_POINTS, MODEL),
+    versions={"locate": 2},
+    reads=(RIG, MARKERS, CAMERA_POINTS, MODEL),
     writes=(POSITIONS,),
     plan=_plan,
-    rig_part=lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),
+    rig_part=_rig_part,
     method=model_read,
 )

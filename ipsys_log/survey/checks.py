@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.pairs import active_measurements
-from ipsys_log.analysis.tape import TapePoint, reference_points, world_point
+from ipsys_log.analysis.tape import TapePoint, is_on_reference, reference_points, world_point
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
 from ipsys_log.messages import Measurement, Model, Rig
@@ -122,7 +122,8 @@ def check_entry(
     if missing == {"side"} and len(entry.distances) >= 2 and entry.height_m is not None:
         sides_m, fault = _both_sides(read, rig)
         return EntryCheck(name, tuple(all_faults + fault), tuple(warnings), sides_m=sides_m)
-    if missing or len(entry.distances) < 2 or entry.height_m is None:
+    placed = len(entry.distances) >= 2 or is_on_reference(entry.distances)
+    if missing or not placed or entry.height_m is None:
         return EntryCheck(name, tuple(all_faults), tuple(warnings))
     try:
         # With the usual tape sigma, the covariance shows a flat crossing of the circles. The written

@@ -17,6 +17,7 @@ from ipsys_log.units import CM_PER_M
 __all__ = ["Entry", "Fault", "TypedEntry", "check_references", "needs_side", "parse_entry"]
 
 _NUMBER = re.compile(r"\d+(?:[.,]\d*)?|[.,]\d+")
+_ZERO = re.compile(r"0+(?:[.,]0*)?")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 # Longest distance if the rig has no floor, and largest height of a marker.
 _LONGEST_M = 30.0
@@ -105,6 +106,11 @@ def parse_entry(typed: TypedEntry, rig: Rig) -> tuple[Entry, list[Fault]]:
     (1.505, 0.1)
     >>> faults[0].text
     'distance to B: 1.234 cm looks like metres; type 123.4'
+
+    A marker on a reference point has the distance 0, and needs no other:
+
+    >>> parse_entry(TypedEntry("3", {"A": "0"}, "", "0"), rig)[1]
+    []
     """
     faults: list[Fault] = []
     doubts: list[str] = []
@@ -147,6 +153,10 @@ def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
 def _distances(typed: TypedEntry, rig: Rig, faults: list[Fault], doubts: list[str]) -> Iterator[Distance]:
     texts = {name: text.strip() for name, text in typed.distances.items() if text.strip()}
     count = len(rig.reference_points)
+    on_reference = [p.name for p in rig.reference_points if _ZERO.fullmatch(_bare(texts.get(p.name, "")))]
+    if on_reference and len(texts) == 1:
+        yield Distance(on_reference[0], 0.0)
+        return
     for point in rig.reference_points:
         text = _bare(texts.pop(point.name, ""))
         if text:
@@ -173,7 +183,7 @@ def _distance_fault(text: str, value_cm: float, point: ReferencePoint, rig: Rig)
     """Return a fault if a number cannot be a distance in cm, else None."""
     longest_cm = _reach_m(rig, point.x_m, point.y_m) * CM_PER_M
     if value_cm == 0:
-        reason = "0 is not a distance; type a number above 0"
+        reason = "0 means on this point: leave the other distances empty, or type a number above 0"
     elif value_cm < _NEAR_CM and _METRES.fullmatch(text):
         reason = f"{text} cm looks like metres; type {_times(value_cm)}"
     elif value_cm > longest_cm:

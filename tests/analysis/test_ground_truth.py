@@ -63,3 +63,26 @@ def test_ground_truth_is_exact_at_its_own_times() -> None:
     errors_m = np.linalg.norm(rows_m, axis=1)
     assert (found[0].count, found[0].mean_m) == (200, errors_m.mean())
     assert (found[0].min_m, found[0].max_m) == (errors_m.min(), errors_m.max())
+
+
+def test_instants_at_other_heights_are_counted_and_shown() -> None:
+    def lifted(time_ms: float, x_m: float, z_m: float) -> Message:
+        time_ns = START_NS + round(time_ms * MS)
+        return Message("t", time_ns, time_ns, Tracks(time_ns, (Track("robot_0", 0, x_m, 0.0, z_m),)))
+
+    truth = gather_tracks([lifted(0, 0.0, 0.1), lifted(30, 0.0, 0.1), lifted(60, 0.0, 0.2)])
+    tracks = gather_tracks([lifted(0, 0.001, 0.1), lifted(30, 0.003, 0.1), lifted(60, 0.1, 0.1)])
+    found = track_errors(tracks, truth, at_track_height=True)
+    assert found is not None
+    assert (found.counted, found.instants, found.floor.count) == (2, 3, 2)
+    assert found.floor.mean_m == pytest.approx(0.002)
+    assert found.others is not None
+    assert found.others[1].mean_m == pytest.approx(0.1)
+    assert found.whole[1].mean_m == pytest.approx(0.104 / 3)
+    every = track_errors(tracks, truth)
+    assert every is not None
+    assert (every.counted, every.others, every.floor) == (3, None, found.whole[1])
+    none = track_errors({0: Sightings(tracks[0].times_ns[2:], tracks[0].points_m[2:])}, truth, True)
+    assert none is not None
+    assert none.counted == 0
+    assert none.floor.mean_m == pytest.approx(0.1)

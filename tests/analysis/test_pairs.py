@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ipsys_log.analysis.pairs import (
     valid_measurements,
 )
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -213,3 +215,17 @@ def test_invalid_world_point_is_refused(value: float) -> None:
     measurement = Measurement(0, "a", marker_id=0, point=WorldPoint(1.0, 2.0, value))
     with pytest.raises(IpsysError, match="measurement a: its world point"):
         build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])
+
+
+def test_points_of_two_cameras_have_one_name_in_the_paper_data(data: Path) -> None:
+    log = list(read_imsel(data / "imsel"))
+    pairs = build_pairs(gather_sightings(log), valid_measurements(log, None))
+    names = {
+        camera: {pair.calibration_point or pair.measurement for pair in found}
+        for camera, found in pairs.items()
+    }
+    assert {camera: len(own) for camera, own in names.items()} == dict.fromkeys(("red", "white", "black"), 50)
+    assert len(names["red"] & names["white"]) == len(names["white"] & names["black"]) == 5
+    assert not names["red"] & names["black"]
+    # The labels of the paper belong to a camera, so the measurements stay separate.
+    assert len({pair.measurement for found in pairs.values() for pair in found}) == 150

@@ -178,3 +178,16 @@ def test_crossing_angle_counts_without_a_sigma() -> None:
     assert (
         find_weak_points([RiggedMeasurement(Measurement(0, "b", point=WorldPoint(2.4, 2.5, 0)), RIG)]) == []
     )
+
+
+def test_marker_on_a_reference_point_has_its_position() -> None:
+    rig = RIG
+    b = rig.reference_points[1]
+    on_b = Measurement(0, "b", marker_id=0, distances=(Distance(b.name, 0.0),), height_m=0.0)
+    point = world_point(on_b, rig)
+    np.testing.assert_array_equal(point.world_m, [b.x_m, b.y_m, 0.0])
+    # A hand lays the marker to 1 mm; the sigma of the tape does not matter.
+    assert point.covariance_m2 is not None
+    np.testing.assert_allclose(np.sqrt(point.covariance_m2.diagonal()), 0.001)
+    with pytest.raises(IpsysError, match="needs a world point, or two or more distances"):
+        world_point(replace(on_b, distances=(Distance(b.name, 0.5),)), rig)

@@ -178,6 +178,8 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
 
     day("record", "--rig", "lab.toml", *lenses, "-o", "session.mcap", "--seconds", 10)
     day("measure", "session.mcap", "--csv", "lab_tape.csv")
+    lab = json.loads(day("calibrate-lab", "session.mcap", *lenses, "--json"))
+    assert 0.1 < lab["mean_mm"] < 5
     day("replay", "session.mcap")
     day("live", "--rig", "lab.toml", *lenses, "--model-from", "session.mcap", "-o", "a.mcap", "--seconds", 8)
     errors = errors_m(day.folder / "a.mcap")

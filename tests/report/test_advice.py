@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -166,3 +167,20 @@ def test_single_model_advice_gives_the_gain_of_more_points() -> None:
     assert advice.sentences == (
         "The mean error of best is 3.0 cm with 10 points per camera, 1.5 cm with 40.",
     )
+
+
+def test_large_error_of_few_points_is_explained(paper: Findings) -> None:
+    """With ten points for ten coefficients, the polynomial has tens of centimetres on the paper's data."""
+    assert paper.advice is not None
+    found = re.fullmatch(
+        r"The error of poly with 10 points, (\d+) cm, is no fault of the lab: poly has 10 coefficients for "
+        r"each coordinate, so it passes through 10 points with their errors and is wrong between and beyond "
+        r"them. With 40 points, it is ([\d.]+) cm.",
+        paper.advice.sentences[-1],
+    )
+    assert found is not None, paper.advice.sentences
+    assert int(found[1]) > 20
+    assert float(found[2]) < 3
+    small = advise([evaluation("rigid", {10: 3.0, 40: 2.0}), evaluation("poly", {10: 3.0, 40: 1.5})])
+    assert small is not None
+    assert not any("no fault" in sentence for sentence in small.sentences)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from ipsys_log.analysis.accuracy import error_statistics
+from ipsys_log.analysis.ground_truth import TrackErrors
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -67,7 +68,8 @@ def evaluation(
 def accuracy(
     model: str, cameras: tuple[str, ...] = ("red", "white", "black"), truth: bool = False
 ) -> Accuracy:
-    tracks = (ErrorStatistics(500, 0.012, 0.001, 0.16, 0.011), ErrorStatistics(500, 0.01, 0.001, 0.12, 0.01))
+    both = (ErrorStatistics(500, 0.012, 0.001, 0.16, 0.011), ErrorStatistics(500, 0.01, 0.001, 0.12, 0.01))
+    tracks = TrackErrors(*both, 500, 500, None, both)
     name = model.replace("+", "_")
     return Accuracy(name, evaluation(model, cameras, truth), tracks if truth else None)
 

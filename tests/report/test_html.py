@@ -219,3 +219,32 @@ def test_page_fits_screens_and_follows_the_colour_scheme(page: str, tmp_path: Pa
         browser.send("Emulation.setEmulatedMedia", media="print", features=[dark])
         assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
         assert low_contrasts(browser) == []
+
+
+def test_one_exchanged_pair_does_not_change_the_title(tmp_path: Path) -> None:
+    def exchanged(message: Message) -> Message:
+        taped = message.payload
+        if not isinstance(taped, Measurement) or taped.id != "m13":
+            return message
+        to_a, to_b = taped.distances
+        swap = replace(to_a, distance_m=to_b.distance_m), replace(to_b, distance_m=to_a.distance_m)
+        return replace(message, payload=replace(taped, distances=swap))
+
+    pages = []
+    for name, messages in (
+        ("right", lab_messages(cameras=1)),
+        ("wrong", list(map(exchanged, lab_messages(cameras=1)))),
+    ):
+        write_log(tmp_path / f"{name}.mcap", messages)
+        outcomes = replay([tmp_path / f"{name}.mcap"], Request(models=("rigid", "poly")), "evaluate")
+        with Session([tmp_path / f"{name}.mcap"]) as session:
+            pages.append(render_report(session, read_accuracy(session, outcomes)))
+    titles = [re.search("<h1>Mean position error: ([0-9.]+) cm", page) for page in pages]
+    assert titles[0] is not None
+    assert titles[1] is not None
+    assert float(titles[1][1]) == pytest.approx(float(titles[0][1]), abs=0.11)
+    right, wrong = (" ".join(re.sub("<[^>]+>", "", page).split()) for page in pages)
+    assert "gross outlier" not in right
+    assert "The gross outlier m13 is excluded from all errors, figures and advice. With it, the mean" in wrong
+    assert "look exchanged" in wrong
+    assert "with gross outliers, mean" in wrong

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from ipsys_log.analysis.accuracy import POOLED, error_statistics, root_mean_square_m
+from ipsys_log.analysis.ground_truth import TrackErrors
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, Suspect
 from ipsys_log.pipeline import replay
@@ -49,6 +50,14 @@ def with_suspects(accuracy: Accuracy, count: int) -> Accuracy:
         for n, name in enumerate(NAMES[:count])
     )
     return replace(accuracy, evaluation=replace(accuracy.evaluation, suspects=suspects))
+
+
+def with_gross_outlier(accuracy: Accuracy, factor: float = 10.0) -> Accuracy:
+    """Return the accuracy with an excluded point; with it, all errors are ``factor`` times as large."""
+    assert accuracy.evaluation is not None
+    wrong = Suspect("gross_1", ("white",), np.array([2.0, 0.0, 0.0]), 90.0, "swapped", "they look exchanged")
+    whole = scale(accuracy.evaluation, factor).cameras
+    return replace(accuracy, evaluation=replace(accuracy.evaluation, excluded=(wrong,), with_excluded=whole))
 
 
 def errors_of(rows: Sequence[CameraEvaluation], row: CameraEvaluation, axes: int) -> np.ndarray:
@@ -141,6 +150,51 @@ def test_answer_of_all_models_fits_a_window(paper: Findings, truth: bool, factor
     assert all(any(line.startswith(model) for line in lines) for model in ALL_MODELS)
     assert "With known marker heights: rayplane, " in text
     assert ("Against the ground truth: " in text) == truth
+
+
+def test_figures_are_without_gross_outliers_and_those_with_them_beside(paper: Findings) -> None:
+    accuracies = [with_gross_outlier(a) for a in many_models(paper.accuracies)]
+    text = printed(accuracies)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80, text
+    clean = accuracy_json(many_models(paper.accuracies))["models"]
+    found = accuracy_json(accuracies)["models"]
+    best = answer_json(accuracies)["answer"]
+    model = found[best["model"]]
+    mean_cm = model["pooled"]["cross_validation"]["3d"]["mean_cm"]
+    assert model["pooled"] == clean[best["model"]]["pooled"]
+    whole = model["with_excluded"]["pooled"]["cross_validation"]["3d"]["mean_cm"]
+    assert whole == pytest.approx(10 * mean_cm)
+    assert [row["measurement"] for row in model["excluded"]] == ["gross_1"]
+    assert (best["mean_cm"], best["excluded"], best["outliers"][0]) == (mean_cm, ["gross_1"], "gross_1")
+    assert best["mean_with_excluded_cm"] == pytest.approx(10 * mean_cm)
+    words = " ".join(text.split())
+    assert f"Mean position error: {mean_cm:.1f} cm" in words
+    assert (
+        "The errors and the advice are without the gross outlier gross_1. With it, the mean error is "
+        f"{10 * mean_cm:.1f} cm."
+    ) in words
+    assert "gross_1, error 200.0 cm: they look exchanged." in words
+    assert "3D, all points" in words
+
+
+def test_tracks_name_the_instants_that_count(paper: Findings) -> None:
+    (accuracy,) = only(paper, "rigid").accuracies
+    assert accuracy.evaluation is not None
+    near, far, every = (
+        error_statistics(np.full(n, m), False) for n, m in ((228, 0.001), (292, 0.05), (520, 0.029))
+    )
+    tracks = TrackErrors(near, near, 228, 520, (far, far), (every, every))
+    told = replace(accuracy, evaluation=replace(accuracy.evaluation, model="rayplane"), tracks=tracks)
+    words = " ".join(printed([told]).split())
+    assert (
+        "This is at the 228 of 520 instants at which the marker has the height in the rig. At the other 292, "
+        "the mean error is 5.0 cm; over all, it is 2.9 cm."
+    ) in words
+    found = accuracy_json([told])["models"]["rayplane"]["tracks"]
+    assert found["instants"] == {"counted": 228, "all": 520}
+    assert found["truth"]["2d"]["mean_cm"] == pytest.approx(0.1)
+    assert found["other_heights"]["2d"]["n"] == 292
+    assert found["all_heights"]["2d"]["mean_cm"] == pytest.approx(2.9)
 
 
 def test_single_model_has_one_row_per_camera(paper: Findings) -> None:

@@ -59,7 +59,7 @@ STAGE = Stage(
     reads=(TRACKS,),
     writes=(SMOOTHED_TRACKS,),
     plan=_plan,
-    rig_part=lambda rig: None,
+    rig_part=lambda rig, options: None,
     per_camera=False,
 )
 

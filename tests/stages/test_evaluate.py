@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from ipsys_log.analysis.accuracy import POOLED, error_statistics, evaluate_cross_validated, evaluate_held_out
+from ipsys_log.analysis.camera_models import height_sigmas
 from ipsys_log.analysis.cross_validation import (
+    FOLDS,
     gather_points,
     labelled_subsets,
     learning_curve,
@@ -20,9 +23,11 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError
-from ipsys_log.messages import Message, Pair, Track, Tracks
-from ipsys_log.models.table import AppliedModel, CalibrationPoints, min_pairs
+from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
+from ipsys_log.models.table import AppliedModel, CalibrationPoints, group_dependent_cameras, min_pairs
+from ipsys_log.stages.evaluate import Study, evaluate_model
 from ipsys_log.stages.fit import fit_model
 from tests import labs
 
@@ -72,6 +77,37 @@ def test_repeats_at_one_point_do_not_narrow_the_interval() -> None:
     assert (four_times.mean_low_m, four_times.mean_high_m) == pytest.approx(
         (once.mean_low_m, once.mean_high_m), rel=1e-9
     )
+
+
+def test_two_errors_at_one_point_are_one_draw() -> None:
+    errors = np.random.default_rng(1).gamma(2.0, 0.005, 30)
+    names = [f"m{n}" for n in range(30)]
+    twice = error_statistics(np.r_[errors, errors], points=names * 2)
+    assert twice.count == 60
+    once, apart = error_statistics(errors), error_statistics(np.r_[errors, errors])
+    assert (twice.mean_low_m, twice.mean_high_m) == pytest.approx((once.mean_low_m, once.mean_high_m))
+    assert twice.mean_high_m is not None
+    assert twice.mean_low_m is not None
+    assert apart.mean_high_m is not None
+    assert apart.mean_low_m is not None
+    assert twice.mean_high_m - twice.mean_low_m > 1.3 * (apart.mean_high_m - apart.mean_low_m)
+
+
+def test_interval_of_all_cameras_draws_shared_points_once() -> None:
+    rng = np.random.default_rng(4)
+    model = fit_model("rigid", {"red": pairs(np.zeros(3)), "white": pairs(np.zeros(3))}, 0)
+    moved = [replace(p, world_m=p.world_m + rng.normal(0, 0.01, 3)) for p in pairs(np.zeros(3))]
+    renamed = [replace(p, measurement=f"w{n}") for n, p in enumerate(moved)]
+    tied = [replace(p, calibration_point=f"m{n}") for n, p in enumerate(renamed)]
+
+    def width_m(white: list[Pair]) -> float:
+        rows = evaluate_held_out(model, {"red": moved, "white": white}, {})
+        found = next(row.error_2d for row in rows if row.camera == POOLED)
+        assert found.mean_high_m is not None
+        assert found.mean_low_m is not None
+        return found.mean_high_m - found.mean_low_m
+
+    assert width_m(moved) == width_m(tied) > 1.2 * width_m(renamed)
 
 
 def test_errors_in_space_and_on_the_floor() -> None:
@@ -138,6 +174,88 @@ def test_cross_validation_is_that_of_a_loop_written_out() -> None:
     assert row.error_3d.mean_m > 1.3 * inside.mean()
     again = evaluate_cross_validated(model, {"red": found}, {}, seed=8)
     assert again[0].error_3d != row.error_3d
+
+
+def test_cross_validated_errors_are_compared_with_the_model_of_their_fold() -> None:
+    """Twenty points: a fold's model is much less certain than the model of all points."""
+    found, _, _ = lab(0, 20)
+    model = fit_model("poly", {"red": found}, 0)
+    (row,) = evaluate_cross_validated(model, {"red": found}, {}, seed=7)
+    within = 0
+    for fold in make_folds(gather_points({"red": found}), FOLDS, np.random.default_rng(7)):
+        rest = [p for p in found if p.measurement not in fold]
+        applied = AppliedModel("poly", fit_model("poly", {"red": rest}, 0).cameras[0])
+        for pair in (p for p in found if p.measurement in fold):
+            point, height = pair.camera_m[None], pair.world_m[2:]
+            covariances = applied.covariances(point, height)
+            assert covariances is not None
+            assert pair.world_covariance_m2 is not None
+            offset = applied.predict(point, height)[0] - pair.world_m
+            square = offset @ np.linalg.inv(covariances[0] + pair.world_covariance_m2) @ offset
+            within += square <= chi2.ppf(0.68, 3)
+    assert row.within_68 == pytest.approx(within / 20)
+
+
+def test_measurements_of_one_point_are_in_one_fold_and_tie_cameras() -> None:
+    found, _, _ = lab(0, 20)
+    twins = [replace(p, measurement=f"w{n}", calibration_point=p.measurement) for n, p in enumerate(found)]
+    cameras = gather_points({"red": found, "white": twins})
+    for fold in make_folds(cameras, 5, np.random.default_rng(0)):
+        assert {f"w{p[1:].lstrip('0') or 0}" for p in fold if p[0] == "m"} == {p for p in fold if p[0] == "w"}
+    assert group_dependent_cameras("best", cameras) == [["red", "white"]]
+    left_out = leave_one_out("best", cameras)(frozenset())["red"]["m03"]
+    predicted = predict_without("best", cameras, {"m03", "w3"})["red"][3]
+    np.testing.assert_array_equal(left_out, predicted)
+
+
+def swapped(model: str, wrong: int | None) -> Evaluation:
+    """Evaluate a model on 30 tape points; the two distances of one of them are exchanged."""
+    rng = np.random.default_rng(5)
+    world = labs.places(rng, 30)
+    points = labs.camera(rng).see(world, rng)
+    rig = replace(labs.RIG, tape_sigma_m=0.003)
+    places, own = [], []
+    for n, (world_m, point_m) in enumerate(zip(world, points, strict=True)):
+        to_a, to_b = (
+            float(np.hypot(*(world_m[:2] - end)) + rng.normal(0, 0.003)) for end in (labs.A, labs.B)
+        )
+        if n == wrong:
+            to_a, to_b = to_b, to_a
+        place = RiggedMeasurement(
+            Measurement(
+                n, f"m{n:02d}", marker_id=0, distances=(Distance("A", to_a), Distance("B", to_b)),
+                side="right", height_m=float(world_m[2]),
+            ),
+            rig,
+        )  # fmt: skip
+        point = world_point(place.measurement, rig)
+        places.append(place)
+        own.append(Pair(f"m{n:02d}", 0, point_m, point.world_m, 1, point.covariance_m2))
+    train = {"red": own[:24]}
+    study = Study(places, {"red": own}, {p.measurement for p in own[24:]}, {}, {}, 0)
+    return evaluate_model(fit_model(model, train, 0), study, 0, [], lambda done, total: None)
+
+
+@pytest.mark.parametrize(
+    ("model", "wrong"),
+    [("rigid", 3), ("poly", 3), ("poly", 27), pytest.param("best", 3, marks=pytest.mark.slow)],
+)
+def test_exchanged_distances_of_one_point_change_no_conclusion(model: str, wrong: int) -> None:
+    right, found = swapped(model, None), swapped(model, wrong)
+    assert (right.excluded, right.with_excluded) == ((), ())
+    assert [(s.measurement, s.kind) for s in found.excluded] == [(f"m{wrong:02d}", "swapped")]
+    for row, clean, whole in zip(found.cameras, right.cameras, found.with_excluded, strict=True):
+        assert (row.scheme, row.camera) == (clean.scheme, clean.camera) == (whole.scheme, whole.camera)
+        assert row.error_3d is not None
+        assert clean.error_3d is not None
+        assert whole.error_3d is not None
+        assert row.error_3d.mean_m == pytest.approx(clean.error_3d.mean_m, rel=0.4)
+        assert all(residual.measurement != f"m{wrong:02d}" for residual in row.residuals)
+        if row.scheme == "cross_validation":
+            assert row.error_3d.count == clean.error_3d.count - 1
+            assert whole.error_3d.mean_m > 5 * row.error_3d.mean_m
+    for point, clean_point in zip(found.learning, right.learning, strict=False):
+        assert point.mean_3d_m < 3 * clean_point.mean_3d_m
 
 
 def test_point_of_two_cameras_is_held_out_from_both() -> None:
@@ -239,6 +357,33 @@ def test_covariance_includes_most_of_a_model_misfit() -> None:
     within_68, within_95 = regions("rigid", 0.0004, range(40))
     assert 0.55 <= within_68 <= 0.76
     assert 0.80 <= within_95 <= 0.98
+
+
+def test_sigma_of_a_measured_height_is_that_of_its_ruler() -> None:
+    world = labs.places(np.random.default_rng(0), 3)
+    seen = labs.pairs(world, world, labs.tape_covariances(world, 0.001, 0.005))
+    np.testing.assert_allclose(height_sigmas(seen), 0.005)
+    np.testing.assert_allclose(height_sigmas([replace(seen[0], world_covariance_m2=None)]), 0.0005)
+
+
+@pytest.mark.parametrize("ruler_m", [0.001, 0.005])
+def test_covariance_of_known_heights_includes_their_sigma(ruler_m: float) -> None:
+    """Held-out points by an accurate tape and a ruler: the error of the height moves the ray's point."""
+    within: list[float] = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        camera = labs.camera(rng)
+        seen = []
+        for count in (40, 60):
+            world = labs.places(rng, count)
+            covariances = labs.tape_covariances(world, 0.001, ruler_m)
+            roots = np.linalg.cholesky(covariances)
+            tape = world + np.einsum("nij,nj->ni", roots, rng.normal(size=world.shape))
+            seen.append(labs.pairs(camera.see(world, rng), tape, covariances, f"{count}_"))
+        (row,) = evaluate_held_out(fit_model("rayplane", {"red": seen[0]}, 0), {"red": seen[1]}, {})
+        assert row.within_68 is not None
+        within.append(row.within_68)
+    assert 0.62 <= np.mean(within) <= 0.76, np.mean(within)
 
 
 def test_uncertainty_grows_away_from_the_calibration_points() -> None:

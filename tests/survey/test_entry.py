@@ -53,6 +53,15 @@ def test_a_distance_that_cannot_be_in_centimetres(text: str, said: str | None) -
         assert said in faults(typed)["d_A"]
 
 
+@pytest.mark.parametrize("text", ["0", "0.0", "0,0 cm"])
+def test_a_marker_on_a_reference_point_needs_no_tape(text: str) -> None:
+    typed = TypedEntry("0", {"A": "", "B": text}, "", "0")
+    entry, wrong = parse_entry(typed, labs.RIG)
+    assert wrong == []
+    assert [(d.reference, d.distance_m) for d in entry.distances] == [("B", 0.0)]
+    assert set(faults(replace(typed, distances={"A": "", "B": "120"}, side="left"))) == {"d_A"}
+
+
 @pytest.mark.parametrize("text", ["0,1", "0.5", "0.9 cm"])
 def test_a_height_that_may_be_in_metres_is_asked_for(text: str) -> None:
     entry, wrong = parse_entry(replace(GOOD, height=text), labs.RIG)

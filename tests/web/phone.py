@@ -94,7 +94,7 @@ class Phone:
         script = f"Boolean({script})"
         end = time.monotonic() + _PATIENCE_S
         while not self.run(script):
-            assert time.monotonic() < end, f"{script}: never, but {self.text()}\n{self.console}"
+            assert time.monotonic() < end, f"{script}: never, but {self.state()}"
             time.sleep(0.05)
 
     def tap(self, selector: str) -> None:
@@ -121,11 +121,21 @@ class Phone:
         self.tap(selector)
         self.wait(f"document.activeElement === document.querySelector({json.dumps(selector)})")
         for key in text:
-            self.send("Input.dispatchKeyEvent", type="char", text=key)
+            # A bare "char" may be lost: the browser can ignore all events up to the next "keyDown".
+            self.send("Input.dispatchKeyEvent", type="keyDown", text=key, key=key)
+            self.send("Input.dispatchKeyEvent", type="keyUp", key=key)
         self.wait(f"document.querySelector({json.dumps(selector)}).value.endsWith({json.dumps(text)})")
 
     def text(self, selector: str = "body") -> str:
         return str(self.run(f"document.querySelector({json.dumps(selector)}).innerText"))
+
+    def state(self) -> str:
+        """Return the text of the page, its fields, its focus, and the messages of the browser."""
+        fields = self.run(
+            "JSON.stringify([document.activeElement?.id, document.hasFocus(),"
+            "...[...document.querySelectorAll('input')].map((e) => [e.id, e.value])])"
+        )
+        return f"{self.text()}\n{fields}\n{self.console}"
 
     def picture(self, path: Path) -> None:
         """Save the whole page as an image."""

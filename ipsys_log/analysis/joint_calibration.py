@@ -1,0 +1,87 @@
+"""The joint calibration of a log: its observations, and the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from ipsys_log.analysis.calibration_points import find_pairs, measured
+from ipsys_log.errors import FitError
+from ipsys_log.joint.diagnosis import find_faults
+from ipsys_log.joint.fit import JointFit, fit_jointly
+from ipsys_log.joint.from_messages import gather_observations
+from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.payload import joint_payload
+from ipsys_log.joint.selection import seeing_cameras, without_points
+from ipsys_log.messages import CameraCalibration, Markers, Model
+from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.messages.stage import Progress, StageView
+
+__all__ = ["fit_joint_model", "fit_without", "is_nominal", "observe"]
+
+
+def observe(view: StageView) -> Observations:
+    """Return the observations of a log: all its calibration points, and the drives of its robots.
+
+    Raises
+    ------
+    FitError
+        The log has no rig, or no markers.
+    """
+    points = measured(view)
+    rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
+    markers: dict[str, list[Markers]] = {}
+    for message in view.messages(MARKERS):
+        markers.setdefault(str(message.camera), []).append(message.payload)
+    if rig is None or not markers:
+        raise FitError("joint is fitted to the corners of markers, but the log has none; use best")
+    lenses = view.calibrations()
+    nominal = {camera for camera, lens in lenses.items() if is_nominal(lens)}
+    return gather_observations(rig, lenses, markers, [point.measurement for point in points], nominal)
+
+
+def is_nominal(lens: CameraCalibration) -> bool:
+    """Return whether intrinsics come from a data sheet: a calibration by images gives a distortion."""
+    return not lens.D.any()
+
+
+def fit_without(
+    observations: Observations, left_out: Collection[str], progress: Progress = lambda done, total: None
+) -> JointFit:
+    """Fit the cameras that saw something, without some calibration points."""
+    # The number of steps is not known before; each brings the fit nearer to its end.
+    return fit_jointly(
+        seeing_cameras(without_points(observations, left_out)),
+        progress=lambda step, cost: progress(step, step + 1),
+    )
+
+
+# More remarks on probable faults hide the first ones, which often cause the others.
+_MOST_FAULTS = 10
+
+
+def fit_joint_model(
+    view: StageView, train: Collection[str], time_ns: int, notes: list[str], progress: Progress
+) -> Model:
+    """Fit the joint model of a log to the calibration points ``train`` and to all drives.
+
+    Probable faults of the observations, and cameras without a model, go to ``notes``.
+    """
+    points = measured(view)
+    left_out = {point.measurement.id for point in points} - set(train)
+    observations = observe(view)
+    fit = fit_without(observations, left_out, progress)
+    fitted = {camera.name for camera in fit.observations.cameras}
+    notes.extend(
+        f"camera {camera.name} saw no calibration point and no robot: it has no model"
+        for camera in observations.cameras
+        if camera.name not in fitted
+    )
+    faults = [fault.text for fault in find_faults(fit)]
+    notes.extend(faults[:_MOST_FAULTS])
+    if len(faults) > _MOST_FAULTS:
+        notes.append(f"{len(faults) - _MOST_FAULTS} more probable faults; correct the first ones")
+    pairs = {
+        camera: [pair for pair in seen if pair.measurement in train]
+        for camera, seen in find_pairs(view, points).items()
+    }
+    return joint_payload(fit, pairs, time_ns)

@@ -1,0 +1,102 @@
+"""Full poses of markers from their corners, by a joint model, if the heights are unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.lenses import undistort
+from ipsys_log.geometry.markers import pixel_slopes
+from ipsys_log.geometry.square_pose import fit_squares
+from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
+from ipsys_log.joint.model import JointModel
+from ipsys_log.joint.rotations import rotate
+
+__all__ = ["Poses", "locate_poses"]
+
+Array = NDArray[np.float64]
+
+# Markers face up, to about this angle. It selects one of the two poses if the corners do not.
+_TILT_RAD = np.radians(3.0)
+_STEPS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Poses of n markers in the world.
+
+    Attributes
+    ----------
+    points_m, turns : (n, 3) and (n, 3, 3), centres and axes; NaN for corners that the lens cannot reach.
+    covariances_m2 : (n, 3, 3), of the points: noise and calibration.
+    chi2 : (n,), squared residuals in units of the noise, with two degrees of freedom.
+    modes_m : (n, 3, m), errors of the points by the modes of the calibration.
+    """
+
+    points_m: Array
+    turns: Array
+    covariances_m2: Array
+    chi2: Array
+    modes_m: Array
+
+    @property
+    def headings_rad(self) -> Array:
+        """The headings (n,), as ``Position.heading_rad``."""
+        return np.asarray(np.arctan2(self.turns[:, 1, 1], self.turns[:, 0, 1]))
+
+
+def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, lengths_m: Array) -> Poses:
+    """Return the poses of markers of any height and tilt.
+
+    Parameters
+    ----------
+    model : the calibrated camera.
+    corners_px : (n, 4, 2), in px of the raw image, in OpenCV's order.
+    covariances_px2 : (n, 8, 8), of x0 y0 .. x3 y3.
+    lengths_m : (n,), nominal sides of the markers.
+    """
+    inward, sizes_m = edge_motion(corners_px), lengths_m * model.scale
+    variances = covariances_px2 + model.corner_floor_px**2 * np.eye(8)
+    points_m, turns = _start(model, corners_px - model.edge_offset_px * inward, variances, sizes_m)
+    weights = np.linalg.inv(variances)
+    for _ in range(_STEPS):
+        now = linearise_corners(model, corners_px, inward, points_m, turns, sizes_m)
+        across = now.by_pose.swapaxes(1, 2) @ weights
+        spread = np.linalg.inv(across @ now.by_pose)
+        gains = spread @ across
+        change = (gains @ now.residuals[:, :, None])[:, :, 0]
+        points_m, turns = points_m - change[:, :3], rotate(-change[:, 3:]) @ turns
+    left = now.residuals[:, :, None] - now.by_pose @ change[:, :, None]
+    count = now.by_camera.shape[2]
+    modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes[:count]
+    return Poses(
+        points_m,
+        turns,
+        spread[:, :3, :3] + modes_m @ modes_m.swapaxes(1, 2),
+        (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0],
+        modes_m,
+    )
+
+
+def _start(model: JointModel, corners_px: Array, variances: Array, sizes_m: Array) -> tuple[Array, Array]:
+    """Return points (n, 3) and axes (n, 3, 3) in the world, from the two solutions for a square."""
+    count, lens = len(corners_px), model.calibration
+    uv = undistort(corners_px.reshape(-1, 2), lens)
+    valid = np.isfinite(uv.reshape(count, 8)).all(axis=1)
+    points_m, turns = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    if not valid.any():
+        return points_m, turns
+    own = uv.reshape(count, 4, 2)[valid]
+    whitening = np.linalg.inv(np.linalg.cholesky(variances[valid])).reshape(-1, 8, 4, 2)
+    slopes = pixel_slopes(own.reshape(-1, 2), lens).reshape(-1, 4, 2, 2)
+    by_uv = np.einsum("nrci,ncij->nrcj", whitening, slopes).reshape(-1, 8, 8)
+    poses = fit_squares(own, by_uv, sizes_m[valid])
+    world = model.camera_from_world.T @ poses.rotations
+    tilts2_rad2 = 2 * (1 - world[..., 2, 2])
+    best = (poses.chi2 + tilts2_rad2 / _TILT_RAD**2).argmin(axis=1)
+    rows = np.arange(len(best))
+    points_m[valid] = poses.centres_m[rows, best] @ model.camera_from_world + model.origin_m
+    turns[valid] = world[rows, best]
+    return points_m, turns

@@ -1,0 +1,141 @@
+"""The joint model of a camera: intrinsics, pose and floor with their joint covariance, as named arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.lens_models import LensModel
+from ipsys_log.joint.fit import JointFit
+from ipsys_log.joint.floor_field import FloorField
+from ipsys_log.joint.observations import lens_model_of
+from ipsys_log.messages import CameraCalibration
+
+__all__ = ["JointModel", "build_models"]
+
+Array = NDArray[np.float64]
+
+# Modes of the joint covariance below this share of a prior variance are left out.
+_LEAST_SHARE = 1e-10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointModel:
+    """A calibrated camera above a floor.
+
+    The errors of all cameras and of the floor are linear functions of the same m independent standard normal
+    numbers. The covariance of any two cameras is therefore the product of their modes.
+
+    Attributes
+    ----------
+    lens_model : ``kannala_brandt``, ``plumb_bob`` or ``rational_polynomial``, see ``lens``.
+    camera_from_world : (3, 3), rotation.
+    origin_m : (3,), position of the camera in the world.
+    lens : (q,), intrinsics: fx, fy, cx, cy in px, and the coefficients of the distortion.
+    edge_offset_px, clock_s, row_time_s : offset of edges, of the clock, and time between rows.
+    scale : factor on the nominal size of a marker: the mean of all bodies.
+    floor : the field of the floor, and ``amplitudes`` (f,) of its modes.
+    modes : (6 + q + 3 + 1 + f, m), by turn (3), origin (3), lens (q), edge offset, clock, row time, scale,
+        amplitudes of the floor.
+    corner_floor_px : repeatable part of the error of a corner.
+    """
+
+    lens_model: LensModel
+    camera_from_world: Array
+    origin_m: Array
+    lens: Array
+    edge_offset_px: float
+    clock_s: float
+    row_time_s: float
+    scale: float
+    floor: FloorField
+    amplitudes: Array
+    modes: Array
+    corner_floor_px: float
+
+    @property
+    def calibration(self) -> CameraCalibration:
+        """The estimated intrinsics, without an image size."""
+        fx, fy, cx, cy = self.lens[:4].tolist()
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return CameraCalibration(0, "", 0, 0, self.lens_model.distortion_model, self.lens[4:], K)
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return the model as named arrays of floats."""
+        return {
+            "camera_from_world": self.camera_from_world,
+            "origin_m": self.origin_m,
+            "lens": self.lens,
+            "offsets": np.array([self.edge_offset_px, self.clock_s, self.row_time_s, self.scale]),
+            "corner_floor_px": np.array([self.corner_floor_px]),
+            "floor_grid_m": np.array([*self.floor.origin_m, self.floor.spacing_m]),
+            "floor_along_x": self.floor.along_x,
+            "floor_along_y": self.floor.along_y,
+            "floor_pairs": self.floor.pairs.astype(np.float64),
+            "floor_amplitudes": self.amplitudes,
+            "modes": self.modes,
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array], lens: CameraCalibration) -> JointModel:
+        """Return the model from its named arrays; ``lens`` names the lens model of the camera."""
+        grid_m = arrays["floor_grid_m"]
+        floor = FloorField(
+            grid_m[:2],
+            float(grid_m[2]),
+            arrays["floor_along_x"],
+            arrays["floor_along_y"],
+            arrays["floor_pairs"].astype(np.intp).reshape(-1, 2),
+        )
+        edge_px, clock_s, row_s, scale = arrays["offsets"].tolist()
+        return cls(
+            lens_model_of(lens),
+            arrays["camera_from_world"],
+            arrays["origin_m"],
+            arrays["lens"],
+            edge_px,
+            clock_s,
+            row_s,
+            scale,
+            floor,
+            arrays["floor_amplitudes"],
+            arrays["modes"],
+            float(arrays["corner_floor_px"][0]),
+        )
+
+
+def build_models(fit: JointFit) -> dict[str, JointModel]:
+    """Return the model of each camera, by its name."""
+    layout, state = fit.problem.layout, fit.state
+    modes = covariance_modes(fit.covariance)
+    models = {}
+    for number, (camera, block) in enumerate(zip(fit.observations.cameras, layout.cameras, strict=True)):
+        edge_px, clock_s, row_s = state.values[block.edge : block.stop].tolist()
+        own = [modes[block.start : block.stop], modes[layout.scales].mean(axis=0)[None], modes[layout.modes]]
+        models[camera.name] = JointModel(
+            block.model,
+            state.camera_turns[number],
+            state.values[block.start + 3 : block.start + 6],
+            state.values[block.lens],
+            edge_px,
+            clock_s,
+            row_s,
+            float(state.values[layout.scales].mean()),
+            layout.floor,
+            state.values[layout.modes],
+            np.concatenate(own),
+            fit.settings.corner_floor_px,
+        )
+    return models
+
+
+def covariance_modes(covariance: Array) -> Array:
+    """Return the modes (g, m) of a covariance (g, g): their product is the covariance."""
+    sigma = np.sqrt(covariance.diagonal())
+    units = np.where(sigma > 0, sigma, 1.0)
+    variances, axes = np.linalg.eigh(covariance / units[:, None] / units)
+    kept = variances > _LEAST_SHARE
+    return np.asarray(units[:, None] * axes[:, kept] * np.sqrt(variances[kept]))

@@ -1,0 +1,145 @@
+"""Observations of a lab as arrays: cameras, bodies, calibration points, and sightings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.lens_models import LENS_MODELS, LensModel
+from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.messages import CameraCalibration
+
+__all__ = [
+    "Body",
+    "CalibrationPoint",
+    "CameraPrior",
+    "Observations",
+    "Sightings",
+    "lens_model_of",
+    "marker_body",
+]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_MODELS = {
+    model.distortion_model: model
+    for model in (LENS_MODELS["fisheye"], LENS_MODELS["pinhole"], LENS_MODELS["pinhole8"])
+}
+
+
+def lens_model_of(lens: CameraCalibration) -> LensModel:
+    """Return the lens model of a calibration."""
+    return _MODELS[lens.distortion_model]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """A camera before the fit: its name and its intrinsics.
+
+    ``nominal`` intrinsics come from a data sheet and not from a chessboard. ``row_time_s`` None: the time
+    between two rows is unknown, and the fit estimates it.
+    """
+
+    name: str
+    lens: CameraCalibration
+    nominal: bool = False
+    row_time_s: float | None = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A rigid set of points, such as the corners of a marker or of a board.
+
+    ``points_m`` (p, 3) are the nominal positions. The fit estimates one scale factor, with the prior
+    standard deviation ``scale_sigma``; infinity if the size is unknown. ``height_m`` is the height at which
+    a robot carries the body, with its standard deviation.
+    """
+
+    name: str
+    points_m: Array
+    scale_sigma: float
+    height_m: float | None = None
+    height_sigma_m: float = 0.001
+
+    @property
+    def length_m(self) -> float:
+        """The nominal distance of its first two points."""
+        return float(np.linalg.norm(self.points_m[1] - self.points_m[0]))
+
+
+def marker_body(
+    name: str,
+    length_m: float,
+    scale_sigma: float,
+    height_m: float | None = None,
+    height_sigma_m: float = 0.001,
+) -> Body:
+    """Return the body of a marker with a side of ``length_m``: its four corners, in OpenCV's order."""
+    return Body(name, marker_corners(length_m), scale_sigma, height_m, height_sigma_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationPoint:
+    """A place where a body was stationary, with everything that was measured there.
+
+    ``distances_m`` (k,) with ``distance_sigmas_m`` (k,) are tape distances from ``references_m`` (k, 2), in
+    the plane of the floor. ``start_m`` (2,) is a rough position, from these distances. ``point_m`` (2,) with
+    ``covariance_m2`` (2, 2) is a given world point. ``height_m`` is the height above the floor.
+    """
+
+    name: str
+    body: int
+    references_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    distances_m: Array = field(default_factory=lambda: np.zeros(0))
+    distance_sigmas_m: Array = field(default_factory=lambda: np.zeros(0))
+    start_m: Array | None = None
+    point_m: Array | None = None
+    covariance_m2: Array | None = None
+    height_m: float | None = None
+    height_sigma_m: float = 0.001
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Sightings of bodies with p points each by one camera.
+
+    Attributes
+    ----------
+    body : (n,), indices of bodies.
+    point : (n,), indices of the calibration points at which the bodies are stationary; -1: the body moves.
+    times_s : (n,), instants of exposure by the camera's own clock.
+    pixels : (n, p, 2), in px of the raw image; NaN for a point that is not visible.
+    covariances_px2 : (n, 2 p, 2 p), of x0 y0 x1 y1 ...; without correlation with points that are not visible.
+    """
+
+    body: Indices
+    point: Indices
+    times_s: Array
+    pixels: Array
+    covariances_px2: Array
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+    def select(self, mask: NDArray[np.bool_] | Indices) -> Sightings:
+        """Return some of the sightings, by a mask (n,) or by indices."""
+        return Sightings(
+            self.body[mask],
+            self.point[mask],
+            self.times_s[mask],
+            self.pixels[mask],
+            self.covariances_px2[mask],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Everything that was observed in a lab; ``sightings`` has one entry for each camera."""
+
+    cameras: tuple[CameraPrior, ...]
+    bodies: tuple[Body, ...]
+    points: tuple[CalibrationPoint, ...]
+    sightings: tuple[Sightings, ...]

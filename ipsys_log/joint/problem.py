@@ -1,0 +1,92 @@
+"""The estimation problem: all factors of a lab, its unknowns, and their prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.joint.normal import NormalEquations
+from ipsys_log.joint.parameters import Layout, State
+from ipsys_log.joint.point_factors import PointFactors
+from ipsys_log.joint.robust import limit_of, robust_loss
+from ipsys_log.joint.sighting_factors import SightingFactors
+from ipsys_log.joint.trajectories import Kind, Trajectories
+
+__all__ = ["Problem"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """All factors of a lab and the order of its unknowns."""
+
+    layout: Layout
+    trajectories: Trajectories
+    sightings: tuple[SightingFactors, ...]
+    points: PointFactors
+
+    def cost(self, state: State, ease: float) -> float:
+        """Return half the sum of the losses; ``ease`` multiplies the limits between error and outlier."""
+        total = self.points.cost(state, self.layout, ease)
+        for factors in self.sightings:
+            chi2 = (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1)
+            total += float(robust_loss(chi2, factors.limit * ease)[0].sum()) / 2
+        total += float((self.trajectories.acceleration_residuals(state) ** 2).sum()) / 2
+        return total + float(self._prior_loss(state)[1].sum()) / 2
+
+    def prior_residuals(self, state: State) -> Array:
+        """Return the differences from the prior, (g,), in standard deviations."""
+        sigma = self.layout.sigma
+        known = np.isfinite(sigma) & (sigma > 0)
+        return np.where(known, (state.values - self.layout.mean) / np.where(known, sigma, 1.0), 0.0)
+
+    def linearise(self, state: State, ease: float) -> NormalEquations:
+        """Return the normal equations at a state."""
+        layout, trajectories = self.layout, self.trajectories
+        normal = NormalEquations(trajectories.local_count, len(layout.mean), trajectories.bandwidth)
+        for factors in self.sightings:
+            factors.add_to(normal, state, layout, trajectories, ease)
+        self.points.add_to(normal, state, layout, ease)
+        trajectories.add_accelerations(normal, state)
+        residuals, loss, weights = self._prior_loss(state)
+        normal.cost += float(loss.sum()) / 2
+        sigma = layout.sigma
+        scales = np.where(np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1.0), 0.0)
+        normal.dense[np.diag_indices_from(normal.dense)] += weights * scales**2
+        normal.global_gradient += weights * scales * residuals
+        return normal
+
+    def _prior_loss(self, state: State) -> tuple[Array, Array, Array]:
+        """Return standardised differences from the prior, their losses, and their weights, all (g,).
+
+        The size and the height of a marker in the rig may be wrong: then they must not distort the rest.
+        """
+        residuals = self.prior_residuals(state)
+        loss, weights = residuals**2, np.ones(len(residuals))
+        bodies = slice(self.layout.scales.start, self.layout.heights.stop)
+        loss[bodies], weights[bodies] = robust_loss(residuals[bodies] ** 2, float(limit_of(1.0)))
+        return residuals, loss, weights
+
+    def reweighted(self, state: State, tilt_sigma_rad: float) -> Problem:
+        """Return the problem with the wobble of moving bodies in the covariances of their corners."""
+        return replace(
+            self,
+            sightings=tuple(
+                factors.reweighted(state, self.layout, self.trajectories, tilt_sigma_rad)
+                if factors.kind is Kind.FLOOR
+                else factors
+                for factors in self.sightings
+            ),
+        )
+
+    def ease(self, state: State) -> float:
+        """Return the factor by which the limits of the loss must grow so that half of the sightings fit."""
+        chi2 = [
+            (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1) / factors.limit
+            for factors in self.sightings
+        ]
+        every = np.concatenate(chi2) if chi2 else np.zeros(1)
+        return max(1.0, 2 * float(np.median(every)))

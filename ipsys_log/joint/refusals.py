@@ -1,0 +1,72 @@
+"""Observations that cannot determine a lab: they are refused, with a sentence that says what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import FitError
+from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.start import PlacedCamera
+
+__all__ = ["check_observations", "check_spread"]
+
+Array = NDArray[np.float64]
+
+# Places are on one line if none is farther from it than this.
+_BESIDE_LINE_M = 0.1
+
+
+def check_observations(observations: Observations) -> None:
+    """Check that there are sightings, a length, and two measured points.
+
+    Raises
+    ------
+    FitError
+        Something of it is missing.
+    """
+    for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
+        if not len(sightings):
+            raise FitError(
+                f"camera {camera.name}: it saw no marker at a measured point or on a robot; leave it out"
+            )
+    measured = [point for point in observations.points if len(point.distances_m) or point.point_m is not None]
+    has_tape = any(len(point.distances_m) for point in measured) or len(measured) > 1
+    if not has_tape and all(np.isinf(body.scale_sigma) for body in observations.bodies):
+        raise FitError("no length is known; give the side of the markers, or measure distances with a tape")
+    if len(measured) < 2:
+        raise FitError(
+            f"{len(measured)} measured points; measure at least two with the tape, some metres apart: "
+            "they define the coordinates of the floor"
+        )
+
+
+def check_spread(observations: Observations, placed: list[PlacedCamera]) -> None:
+    """Check that no camera saw markers along one line alone.
+
+    Parameters
+    ----------
+    observations : all sightings.
+    placed : rough poses of the cameras.
+
+    Raises
+    ------
+    FitError
+        All places of a camera are on one line, so that its tilt across the line is unknown.
+    """
+    for camera, view, sightings in zip(observations.cameras, placed, observations.sightings, strict=True):
+        places_m = view.points_m[np.isfinite(view.points_m).all(axis=1), :2]
+        if len(places_m) < 3 or _beside_line_m(places_m) > _BESIDE_LINE_M:
+            continue
+        kind = "measured points" if (sightings.point >= 0).all() else "places of the markers"
+        raise FitError(
+            f"camera {camera.name}: all {kind} that it saw are on one line; measure points beside the line, "
+            "or drive a curve"
+        )
+
+
+def _beside_line_m(places_m: Array) -> float:
+    """Return the largest distance of places (n, 2) from their best line; the 95th percentile of many."""
+    centred_m = places_m - places_m.mean(axis=0)
+    across = np.linalg.svd(centred_m, full_matrices=False)[2][1]
+    return float(np.percentile(np.abs(centred_m @ across), 95))

@@ -1,0 +1,134 @@
+"""Levenberg-Marquardt method for the joint calibration, with a robust loss that becomes strict in steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipsys_log.errors import FitError
+from ipsys_log.joint.normal import Factorisation, NormalEquations
+from ipsys_log.joint.parameters import State
+from ipsys_log.joint.problem import Problem
+
+__all__ = ["SHORT", "Solution", "solve"]
+
+_FIRST_DAMPING = 1e-4
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
+_MOST_STEPS = 200
+# Share of the standard deviation: the optimum is exact to a thousandth of its uncertainty.
+SHORT = 1e-3
+# Before the loss is strict, a step need not be so exact.
+_ROUGH = 0.3
+_TOLERABLE = 0.03
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The state of least cost, its normal equations and their factors, and the number of steps."""
+
+    state: State
+    cost: float
+    normal: NormalEquations
+    factorisation: Factorisation
+    steps: int
+
+
+def solve(
+    problem: Problem,
+    state: State,
+    progress: Callable[[int, float], None] = lambda step, cost: None,
+    short: float = SHORT,
+) -> Solution:
+    """Minimise the cost of a problem, from a start.
+
+    Outliers in the start are unknown. At first, the loss treats errors up to twice the median as normal. The
+    limit then falls with the median until it is that of the noise.
+
+    Parameters
+    ----------
+    problem : factors and unknowns.
+    state : the start.
+    progress : called with the number of steps and the cost after each step.
+    short : the fit has converged if a full step is shorter than this share of the standard deviation.
+
+    Raises
+    ------
+    FitError
+        The method does not converge, or the observations do not determine the unknowns.
+
+    References
+    ----------
+    Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000.
+    """
+    ease, damping = problem.ease(state), _FIRST_DAMPING
+    normal = problem.linearise(state, ease)
+    for step in range(_MOST_STEPS):
+        state, cost, decrement, damping = _descend(problem, state, normal, damping, ease)
+        progress(step + 1, cost)
+        long = short if ease == 1.0 else _ROUGH
+        settled = decrement <= long**2
+        if settled and ease == 1.0:
+            normal = problem.linearise(state, ease)
+            return Solution(state, cost, normal, _factorise(problem, normal), step + 1)
+        if ease > 1.0 and (settled or step % 3 == 2):
+            ease = min(ease, problem.ease(state))
+            # The last stage is strict, even if more than half of the sightings have errors above the noise.
+            ease = ease / 4 if settled else ease
+            ease = 1.0 if ease < 2.0 else ease
+        normal = problem.linearise(state, ease)
+    if ease == 1.0 and decrement <= _TOLERABLE**2:
+        # Outliers at the limit of the loss slow the last steps, without an effect on the result.
+        return Solution(state, cost, normal, _factorise(problem, normal), _MOST_STEPS)
+    raise FitError(
+        f"the joint fit did not converge in {_MOST_STEPS} steps; look at the residuals of the sightings, and "
+        "remove wrong measurements"
+    )
+
+
+def _descend(
+    problem: Problem, state: State, normal: NormalEquations, damping: float, ease: float
+) -> tuple[State, float, float, float]:
+    """Return the next state, its cost, the expected decrease of twice the cost, and the damping."""
+    while True:
+        try:
+            by_global, by_local = Factorisation(normal, problem.layout.free, damping).step(normal)
+        except np.linalg.LinAlgError:
+            damping = _more(damping)
+            continue
+        expected = -float(by_global @ normal.global_gradient + by_local @ normal.local_gradient)
+        trial = state.moved(problem.layout, by_global, by_local)
+        with np.errstate(all="ignore"):
+            cost = problem.cost(trial, ease) if _possible(problem, trial) else np.inf
+        if np.isfinite(cost) and cost <= normal.cost:
+            # A short step by strong damping is no sign of a minimum.
+            decrement = expected if damping <= _FIRST_DAMPING else np.inf
+            # Weak directions converge only without damping: a step as good as expected ends it soon.
+            relief = 100.0 if normal.cost - cost > 0.25 * expected else 3.0
+            return trial, cost, decrement, max(damping / relief, _LEAST_DAMPING)
+        if expected <= SHORT**2:
+            # Rounding errors hide the decrease: this is the minimum.
+            return state, normal.cost, 0.0, damping
+        damping = _more(damping)
+
+
+def _possible(problem: Problem, state: State) -> bool:
+    return all((state.values[block.lens][:2] > 0).all() for block in problem.layout.cameras)
+
+
+def _more(damping: float) -> float:
+    if damping >= _MOST_DAMPING:
+        raise FitError(
+            "the observations do not determine the cameras; add calibration points, spread over the floor"
+        )
+    return max(damping * 8, 1e-8)
+
+
+def _factorise(problem: Problem, normal: NormalEquations) -> Factorisation:
+    try:
+        return Factorisation(normal, problem.layout.free)
+    except np.linalg.LinAlgError as error:
+        raise FitError(
+            "the observations do not determine the cameras; add calibration points, spread over the floor"
+        ) from error

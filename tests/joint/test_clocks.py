@@ -1,0 +1,35 @@
+"""Clock offsets of cameras: a camera that sees no moving marker is no reference for the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.from_messages import gather_observations
+from ipsys_log.joint.model import build_models
+from ipsys_log.messages import Markers, Measurement
+from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
+from ipsys_log.simulation.settings import LabSettings
+
+
+def test_reference_clock_is_of_a_camera_that_saw_the_drive() -> None:
+    lab = build_lab(
+        GeometricSettings(lab=LabSettings(seed=3, rate_hz=10.0, drive_s=20.0, markers=2), points=20)
+    )
+    messages = list(simulate_session(lab))
+    measurements = [m.payload for m in messages if isinstance(m.payload, Measurement)]
+    markers = {
+        camera.name: [
+            m.payload for m in messages if isinstance(m.payload, Markers) and m.camera == camera.name
+        ]
+        for camera in lab.cameras
+    }
+    gathered = gather_observations(geometric_rig(lab), lab.calibrations, markers, measurements)
+    first, *others = gathered.sightings
+    observations = replace(gathered, sightings=(first.select(first.point >= 0), *others))
+    clocks_s = [model.clock_s for model in build_models(fit_jointly(observations)).values()]
+    # All clocks of this lab agree.
+    np.testing.assert_allclose(clocks_s, 0.0, atol=0.0005)

@@ -1,0 +1,127 @@
+"""Calibration by driving: paths, clocks and floor, from the messages of simulated sessions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ipsys_log.errors import FitError
+from ipsys_log.joint.diagnosis import find_faults
+from ipsys_log.joint.fit import JointFit, fit_jointly
+from ipsys_log.joint.from_messages import gather_observations
+from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.settings import JointSettings
+from ipsys_log.messages import CameraCalibration, Markers, Measurement, Rig
+from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.settings import LabSettings
+from tests.joint.differences import jacobian_of, residuals_of
+
+COARSE = JointSettings(floor_length_m=2.0)
+
+
+def observe(lab: GeometricLab) -> Observations:
+    """Return the observations of a session from its messages."""
+    messages = list(simulate_session(lab))
+    markers: dict[str, list[Markers]] = {}
+    calibrations: dict[str, CameraCalibration] = {}
+    measurements = []
+    for message in messages:
+        if isinstance(message.payload, Markers):
+            markers.setdefault(str(message.camera), []).append(message.payload)
+        elif isinstance(message.payload, CameraCalibration):
+            calibrations[str(message.camera)] = message.payload
+        elif isinstance(message.payload, Measurement):
+            measurements.append(message.payload)
+        elif isinstance(message.payload, Rig):
+            rig = message.payload
+    return gather_observations(rig, calibrations, markers, measurements)
+
+
+def make_drive(seconds: float = 30.0, points: int = 8, seed: int = 3) -> GeometricLab:
+    lab = LabSettings(seed=seed, rate_hz=10.0, drive_s=seconds, markers=2, cameras=("red", "white"))
+    delays_s = (0.0, 0.011)
+    return build_lab(GeometricSettings(lab=lab, points=points, clock_offset_s=0.025, frame_delays_s=delays_s))
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[GeometricLab, JointFit]:
+    lab = make_drive()
+    return lab, fit_jointly(observe(lab), COARSE)
+
+
+def test_clock_offset_is_estimated(driven: tuple[GeometricLab, JointFit]) -> None:
+    lab, fit = driven
+    # A stamp is late by the offset, so that the true time of a sighting is earlier.
+    true_s = 1e-9 * (lab.clock_offsets_ns["red"] - lab.clock_offsets_ns["white"])
+    column = fit.problem.layout.cameras[1].edge + 1
+    sigma_s = float(np.sqrt(fit.covariance[column, column]))
+    assert sigma_s < 0.001
+    assert abs(fit.state.values[column] - true_s) < 4 * sigma_s
+
+
+def test_camera_positions_are_as_accurate_as_stated(driven: tuple[GeometricLab, JointFit]) -> None:
+    lab, fit = driven
+    for camera, block in zip(fit.observations.cameras, fit.problem.layout.cameras, strict=True):
+        rows = slice(block.start + 3, block.start + 6)
+        error_m = fit.state.values[rows] - lab.camera(camera.name).origin_m
+        covariance = fit.covariance[rows, rows]
+        assert error_m @ np.linalg.solve(covariance, error_m) < 22.0
+        assert np.linalg.norm(error_m[:2]) < 0.005
+
+
+def test_exchanged_robots_are_named() -> None:
+    observations = observe(make_drive(30.0, points=12))
+    steps_m = (0.05, -0.05)
+    wrong = tuple(
+        replace(body, height_m=(body.height_m or 0.0) + step_m)
+        for body, step_m in zip(observations.bodies, steps_m, strict=True)
+    )
+    faults = find_faults(fit_jointly(replace(observations, bodies=wrong), COARSE))
+    assert {(fault.kind, fault.subject) for fault in faults} == {("robot_height", "0"), ("robot_height", "1")}
+    assert "at 100 mm, not at 150 mm" in "".join(fault.text for fault in faults)
+
+
+def test_slopes_of_paths_match_differences() -> None:
+    fit = fit_jointly(observe(make_drive(4.0, points=6)), COARSE)
+    problem, values = fit.problem, fit.state.values.copy()
+    # The slopes leave out the effect of a knot on the speed within a frame: it is zero without a row time.
+    values[[block.edge + 2 for block in problem.layout.cameras]] = 0.0
+    state = replace(fit.state, values=values)
+    normal = problem.linearise(state, 1e9)
+    jacobian = jacobian_of(problem, state, lambda one: residuals_of(problem, one, 1e9))
+    free = problem.layout.free
+    count = int(free.sum())
+    squares = jacobian.T @ jacobian
+    scale = np.sqrt(squares.diagonal())
+    squares /= np.outer(scale, scale)
+    dense = normal.dense[np.ix_(free, free)] / np.outer(scale[:count], scale[:count])
+    assert np.abs(dense - squares[:count, :count]).max() < 1e-5
+    mixed = normal.mixed[:, free] / np.outer(scale[count:], scale[:count])
+    assert np.abs(mixed - squares[count:, :count]).max() < 1e-5
+    for below, diagonal in enumerate(normal.band):
+        rows = np.arange(len(diagonal) - below)
+        units = scale[count + below + rows] * scale[count + rows]
+        banded = diagonal[: len(rows)] / units
+        assert np.abs(banded - squares[count + below + rows, count + rows]).max() < 1e-5
+
+
+def test_drive_without_two_measured_points_is_refused() -> None:
+    observations = observe(make_drive(25.0, points=4))
+    with pytest.raises(FitError, match="1 measured points"):
+        fit_jointly(
+            replace(
+                observations,
+                points=observations.points[:1],
+                sightings=tuple(one.select(one.point < 1) for one in observations.sightings),
+            )
+        )
+
+
+def test_fit_twice_is_identical() -> None:
+    observations = observe(make_drive(5.0, points=6))
+    first, second = (fit_jointly(observations, COARSE) for _ in range(2))
+    assert first.state.values.tobytes() == second.state.values.tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()

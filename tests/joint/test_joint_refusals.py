@@ -1,0 +1,76 @@
+"""Observations that cannot determine a lab are refused with a sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ipsys_log.errors import FitError
+from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.observations import Observations, marker_body
+from tests.joint.small_lab import make_lab
+
+
+def keep_points(observations: Observations, keep: set[int]) -> Observations:
+    """Return the observations with the tape readings of some points alone."""
+    none = np.zeros(0)
+    return replace(
+        observations,
+        points=tuple(
+            point
+            if number in keep
+            else replace(
+                point,
+                references_m=np.zeros((0, 2)),
+                distances_m=none,
+                distance_sigmas_m=none,
+                start_m=None,
+            )
+            for number, point in enumerate(observations.points)
+        ),
+    )
+
+
+def test_camera_without_overlap_and_tape_is_refused() -> None:
+    observations, _ = make_lab(1, points=16)
+    first, second = (set(one.point.tolist()) for one in observations.sightings)
+    alone = np.array([number not in first for number in observations.sightings[1].point.tolist()])
+    cut = replace(
+        observations, sightings=(observations.sightings[0], observations.sightings[1].select(alone))
+    )
+    assert second - first
+    with pytest.raises(FitError, match="camera c1: it sees fewer than two measured points"):
+        fit_jointly(keep_points(cut, first))
+
+
+def test_points_on_a_line_are_refused() -> None:
+    observations, _ = make_lab(1, points=40, cameras=1)
+    own = observations.sightings[0]
+    places_m = np.array([observations.points[number].start_m for number in own.point.tolist()])
+    row = np.abs(places_m[:, 1] - np.median(places_m[:, 1])) < 0.1
+    assert row.sum() > 3
+    with pytest.raises(FitError, match="camera c0: all measured points that it saw are on one line"):
+        fit_jointly(replace(observations, sightings=(own.select(row),)))
+
+
+def test_one_measured_point_is_refused() -> None:
+    observations, _ = make_lab(1, points=6)
+    with pytest.raises(FitError, match="1 measured points; measure at least two"):
+        fit_jointly(keep_points(observations, {2}))
+
+
+def test_unknown_length_is_refused() -> None:
+    observations, _ = make_lab(1, points=6)
+    unknown = replace(observations, bodies=(marker_body("0", 0.2, np.inf),))
+    with pytest.raises(FitError, match="no length is known"):
+        fit_jointly(keep_points(unknown, set()))
+
+
+def test_camera_without_sightings_is_refused() -> None:
+    observations, _ = make_lab(1, points=6)
+    first, second = observations.sightings
+    empty = second.select(np.zeros(len(second), dtype=bool))
+    with pytest.raises(FitError, match="camera c1: it saw no marker"):
+        fit_jointly(replace(observations, sightings=(first, empty)))

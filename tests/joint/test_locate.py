@@ -1,0 +1,158 @@
+"""Positions of markers by a joint model: exactness, covariance, storage, and speed of use."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
+from ipsys_log.joint.fit import JointFit, fit_jointly
+from ipsys_log.joint.locate import locate_markers
+from ipsys_log.joint.locate_poses import locate_poses
+from ipsys_log.joint.model import JointModel, build_models
+from ipsys_log.joint.parameters import State
+from tests.joint.small_lab import LENGTH_M, Array, make_lab
+
+POSES = [(1.6, 1.2, 0.1, 0.3), (2.4, 2.2, 0.0, -2.0), (3.1, 1.9, 0.2, 1.5)]
+HEIGHTS_M, LENGTHS_M = np.array([pose[2] for pose in POSES]), np.full(3, LENGTH_M)
+
+
+@pytest.fixture(scope="module")
+def fit() -> JointFit:
+    return fit_jointly(make_lab(4, points=20)[0])
+
+
+@pytest.fixture(scope="module")
+def model(fit: JointFit) -> JointModel:
+    return build_models(fit)["c0"]
+
+
+def see(model: JointModel, poses: list[Array]) -> Array:
+    """Return exact corners of markers with poses in the world, by OpenCV's projection."""
+    camera = make_pose(model.camera_from_world, np.zeros(3))
+    camera[:3, 3] = -model.camera_from_world @ model.origin_m
+    corners_m = [transform(camera @ pose, marker_corners(model.scale * LENGTH_M)) for pose in poses]
+    pixels = np.stack([project(one, model.calibration) for one in corners_m])
+    after, before = (np.roll(pixels, shift, axis=1) - pixels for shift in (-1, 1))
+    units = [side / np.linalg.norm(side, axis=2, keepdims=True) for side in (after, before)]
+    # Edges of black lie too far inside the black.
+    return np.asarray(pixels + model.edge_offset_px * (units[0] + units[1]))
+
+
+def level_poses(model: JointModel) -> list[Array]:
+    """Return poses on the estimated floor."""
+    flat = np.array(POSES)[:, :2]
+    floor_m, _ = model.floor.heights(flat, model.amplitudes)
+    return [pose_facing_up(x, y, z + f, h) for (x, y, z, h), f in zip(POSES, floor_m.tolist(), strict=True)]
+
+
+def noise(sigma_px: float = 0.02) -> Array:
+    return np.tile(sigma_px**2 * np.eye(8), (3, 1, 1))
+
+
+def test_locate_of_exact_corners_is_exact(model: JointModel) -> None:
+    corners_px = see(model, level_poses(model))
+    found = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
+    assert np.abs(found.points_m[:, :2] - np.array(POSES)[:, :2]).max() < 2e-5
+    assert np.abs(found.headings_rad - np.array(POSES)[:, 3]).max() < 1e-4
+    assert found.chi2.max() < 0.1
+
+
+def test_locate_covariance_is_that_of_calibration_and_noise(fit: JointFit, model: JointModel) -> None:
+    """Disturb the calibration by its covariance, and the corners by their noise: positions spread alike."""
+    rng = np.random.default_rng(0)
+    corners_px = see(model, level_poses(model))
+    stated = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M, 0.0, 0.0).covariances_m2
+    layout, count = fit.problem.layout, 400
+    root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(len(fit.covariance)))
+    local = np.zeros(fit.problem.trajectories.local_count)
+    points = []
+    for _ in range(count):
+        state: State = fit.state.moved(layout, root @ rng.standard_normal(len(root)), local)
+        block = layout.cameras[0]
+        other = JointModel(
+            model.lens_model,
+            state.camera_turns[0],
+            state.values[block.start + 3 : block.start + 6],
+            state.values[block.lens],
+            float(state.values[block.edge]),
+            0.0,
+            0.0,
+            float(state.values[layout.scales].mean()),
+            layout.floor,
+            state.values[layout.modes],
+            model.modes[:, :1],
+            0.0,
+        )
+        moved_px = corners_px + rng.normal(0.0, 0.02, corners_px.shape)
+        points.append(locate_markers(other, moved_px, noise(), HEIGHTS_M, LENGTHS_M).points_m)
+    spread = np.stack([np.cov(np.array(points)[:, n].T) for n in range(3)])
+    ratio = np.sqrt(np.einsum("nii->ni", spread) / np.einsum("nii->ni", stated))
+    assert np.abs(ratio - 1).max() < 0.15
+
+
+def test_height_error_is_in_the_covariance(model: JointModel) -> None:
+    corners_px = see(model, level_poses(model))
+    low, high = (
+        locate_markers(model, corners_px, noise(), HEIGHTS_M + step, LENGTHS_M).points_m
+        for step in (-0.005, 0.005)
+    )
+    without, with_height = (
+        locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M, sigma_m).covariances_m2
+        for sigma_m in (0.0, 0.005)
+    )
+    half = (high - low) / 2
+    assert np.abs(with_height - without - half[:, :, None] * half[:, None]).max() < 1e-8
+
+
+def test_poses_of_tilted_markers_are_exact(model: JointModel) -> None:
+    tilted = [
+        pose @ make_pose(rotation(np.array([0.1, -0.05, 0.0])), np.zeros(3)) for pose in level_poses(model)
+    ]
+    found = locate_poses(model, see(model, tilted), noise(0.01), LENGTHS_M)
+    assert np.abs(found.points_m - np.stack([pose[:3, 3] for pose in tilted])).max() < 1e-5
+    assert np.abs(found.turns - np.stack([pose[:3, :3] for pose in tilted])).max() < 1e-4
+    assert (np.linalg.eigvalsh(found.covariances_m2) > 0).all()
+
+
+def test_pose_agrees_with_scipy(model: JointModel) -> None:
+    rng = np.random.default_rng(2)
+    corners_px = see(model, level_poses(model)) + rng.normal(0, 0.05, (3, 4, 2))
+    found = locate_poses(model, corners_px, noise(0.05), LENGTHS_M)
+
+    def misses(values: Array) -> Array:
+        pose = make_pose(rotation(values[3:]) @ found.turns[1], values[:3])
+        return np.asarray((see(model, [pose])[0] - corners_px[1]).ravel())
+
+    start = np.r_[found.points_m[1] + 0.01, np.full(3, 0.01)]
+    solved = least_squares(misses, start, xtol=1e-12, ftol=1e-12, x_scale=1e-3)
+    assert np.abs(solved.x[:3] - found.points_m[1]).max() < 2e-5
+
+
+def test_model_from_its_arrays_is_identical(model: JointModel) -> None:
+    again = JointModel.from_arrays(model.to_arrays(), model.calibration)
+    corners_px = see(model, level_poses(model))
+    first, second = (locate_markers(one, corners_px, noise(), HEIGHTS_M, LENGTHS_M) for one in (model, again))
+    assert first.points_m.tobytes() == second.points_m.tobytes()
+    assert first.covariances_m2.tobytes() == second.covariances_m2.tobytes()
+
+
+def test_modes_of_two_cameras_give_their_covariance(fit: JointFit) -> None:
+    models = build_models(fit)
+    layout = fit.problem.layout
+    rows = [slice(block.start + 3, block.start + 6) for block in layout.cameras]
+    product = models["c0"].modes[3:6] @ models["c1"].modes[3:6].T
+    expected = fit.covariance[rows[0], rows[1]]
+    assert np.abs(product - expected).max() < 1e-4 * np.abs(fit.covariance[rows[0], rows[0]]).max()
+
+
+def test_marker_beside_the_lens_has_no_position(model: JointModel) -> None:
+    corners_px = see(model, level_poses(model))
+    corners_px[1] += 1e6
+    with np.errstate(all="ignore"):
+        found = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
+    assert np.isnan(found.points_m[1]).all()
+    assert np.isfinite(found.points_m[[0, 2]]).all()

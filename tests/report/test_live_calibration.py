@@ -1,0 +1,67 @@
+"""The calibration beside a recording: its lines, and its independence of errors."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+from ipsys_log.messages import Markers, Measurement, Message, Rig
+from ipsys_log.report.live_calibration import LiveCalibration
+from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
+from ipsys_log.simulation.settings import LabSettings
+
+LAB = build_lab(GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=12.0, seed=3), points=6))
+
+
+def lines_of(messages: list[Message], rig: Rig, goal_m: float = 0.05) -> tuple[list[str], LiveCalibration]:
+    lines: list[str] = []
+    live = LiveCalibration(rig, LAB.calibrations, goal_m, lines.append, every_s=4.0)
+    for message in messages:
+        live(message)
+        if live._fitting is not None:
+            live._fitting.result()
+    live(None)
+    live.close()
+    return lines, live
+
+
+def test_lines_show_coverage_and_then_the_expected_error() -> None:
+    lines, live = lines_of(list(simulate_session(LAB)), geometric_rig(LAB))
+    assert live.lab is not None
+    assert live.lab.is_enough
+    assert [camera.camera for camera in live.lab.cameras] == ["black", "red", "white"]
+    assert lines[-1].startswith("expected mean error in mm: black ")
+    assert lines[-1].endswith("; enough: Ctrl-C ends the recording")
+    assert live.lab.mean_m < 0.004
+
+
+def test_no_measured_point_gives_coverage_only() -> None:
+    messages = [m for m in simulate_session(LAB) if not isinstance(m.payload, Measurement)]
+    lines, live = lines_of(messages, geometric_rig(LAB))
+    assert live.lab is None
+    assert lines
+    assert all(line.startswith("markers were in these parts of the images: ") for line in lines)
+    first, last = (sum(map(int, re.findall(r"(\d+)%", line))) for line in (lines[0], lines[-1]))
+    assert last > first
+
+
+def test_goal_that_is_not_reached_names_the_next_step() -> None:
+    lines, _ = lines_of(list(simulate_session(LAB)), geometric_rig(LAB), goal_m=0.0005)
+    assert "; drive through x " in lines[-1] or "; tape a point near x " in lines[-1]
+
+
+def test_an_impossible_fit_is_a_line() -> None:
+    """Camera black sees no marker that another camera sees, and no measured point."""
+
+    def apart(message: Message) -> Message:
+        payload = message.payload
+        if isinstance(payload, Markers) and message.camera == "black":
+            moved = tuple(replace(marker, id=marker.id + 6) for marker in payload.markers)
+            return replace(message, payload=replace(payload, markers=moved))
+        return message
+
+    rig = replace(geometric_rig(LAB), markers=())
+    lines, live = lines_of([apart(message) for message in simulate_session(LAB)], rig)
+    assert live.lab is None
+    assert lines[-1].startswith("no fit yet: camera black")

@@ -35,7 +35,8 @@ class JointModel:
     camera_from_world : (3, 3), rotation.
     origin_m : (3,), position of the camera in the world.
     lens : (q,), intrinsics: fx, fy, cx, cy in px, and the coefficients of the distortion.
-    edge_offset_px, clock_s, row_time_s : offset of edges, of the clock, and time between rows.
+    edge_offset_px, clock_s, row_time_s : offset of edges; the time to add to the stamps of the camera; the
+        time between rows.
     scale : factor on the nominal size of a marker: the mean of all bodies.
     floor : the field of the floor, and ``amplitudes`` (f,) of its modes.
     modes : (6 + q + 3 + 1 + f, m), by turn (3), origin (3), lens (q), edge offset, clock, row time, scale,

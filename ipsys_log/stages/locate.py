@@ -169,7 +169,7 @@ class LocateCorners:
 def _time_offset_ns(camera: JointModel, marker: Marker) -> int | None:
     """Return the time from the stamp of the frame to the exposure of the marker, by the common clock."""
     rows = float(marker.corners_px[:, 1].mean())
-    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s - camera.clock_s) * NS_PER_S)
+    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s + camera.clock_s) * NS_PER_S)
     return offset_ns if offset_ns or marker.time_offset_ns is not None else None
 
 

@@ -30,6 +30,7 @@ def evaluate_joint(
     held_out: Collection[str],
     ground_truth: Mapping[str, Array],
     seed: int | None,
+    time_ns: int,
     notes: list[str],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Evaluation:
@@ -43,6 +44,7 @@ def evaluate_joint(
     held_out : ids of the held-out measurements.
     ground_truth : world points (3,) in m by id; empty outside a simulated lab.
     seed : of the folds; None for a model of another log, which is not fitted again.
+    time_ns : of the last input.
     notes : list of remarks; each impossible step adds a remark.
     progress : called with the number of fits done, and the number of all fits.
     """
@@ -62,7 +64,7 @@ def evaluate_joint(
             rows += _error_rows(model, parts, ground_truth, CROSS_VALIDATION)
         except FitError as error:
             notes.append(f"no cross-validation: {error}")
-    return Evaluation(model.timestamp, model.name, tuple(rows))
+    return Evaluation(time_ns, model.name, tuple(rows))
 
 
 # Pairs of a camera, with their predictions (n, 3) and covariances (n, 3, 3).

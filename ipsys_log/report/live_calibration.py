@@ -71,6 +71,8 @@ class LiveCalibration:
             self._add(camera, payload)
         self._next_ns = self._next_ns or message.log_time_ns + self._every_ns
         if message.log_time_ns >= self._next_ns and (self._fitting is None or self._fitting.done()):
+            if self._fitting is not None:
+                self._fitting.result()  # raises a bug of the fit
             self._next_ns = message.log_time_ns + self._every_ns
             self._fitting = self._worker.submit(self._report)
 

@@ -226,6 +226,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
                 held_out_ids(measurements, options),
                 true_points(points, gather_tracks(view.messages(TRUTH))),
                 int(seed) if again else None,
+                view.last_ns(*reads),
                 notes,
                 progress,
             )

@@ -298,6 +298,7 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "models.rigid.RigidTransform.fit": _FIT,
     "models.rigid.rigid_transform": _FIT,
     "models.table.check_name": ("model",),
+    "models.table.create": _CHECKED,
     "models.table.fit_cameras": _FIT,
     "models.table.restore": ("incomplete_model",),
     "stages.camera_frame.CameraFrame._settings": ("no_rig", "no_calibration"),

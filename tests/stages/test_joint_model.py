@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from ipsys_log.api import load_model
+from ipsys_log.errors import IpsysError
 from ipsys_log.messages import TRUTH_TOPIC, Markers, Message, Run, Tracks
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
@@ -107,3 +109,12 @@ def test_log_with_camera_points_only_is_refused(ipsys: Ipsys, tmp_path: Path, da
     assert (done.code, done.err.count("\n")) == (1, 1)
     assert "joint is fitted to the corners of markers, but the log has only camera points" in done.err
     assert log.read_bytes() == before
+
+
+def test_joint_model_for_camera_points_is_refused_in_one_line(ipsys: Ipsys, log: Path) -> None:
+    assert ipsys("fit", log, "--model", "joint").code == 0
+    done = ipsys("plan", log, "--model", "joint")
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert "cannot be used with camera points" in done.err
+    with pytest.raises(IpsysError, match="cannot be used with camera points"):
+        load_model(log, "joint")

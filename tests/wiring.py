@@ -30,7 +30,7 @@ def wired(
         reads=reads,
         writes=writes,
         plan=plan,
-        rig_part=lambda rig, options: rig,
+        rig_part=lambda rig, method: rig,
         per_camera=per_camera,
     )
     return wire(stage, run, inputs or {}, step)

@@ -70,10 +70,10 @@ def split_parameters(view: StageView, options: Mapping[str, str]) -> dict[str, s
     return {"train": options.get("train", "train")} if labelled else {"seed": options.get("seed", "0")}
 
 
-def measured_part(rig: Rig, options: Mapping[str, str]) -> object:
-    """Return the part of the rig on which fits depend, for the model in the options of the user."""
+def measured_part(rig: Rig, model: str) -> object:
+    """Return the part of the rig on which the fit of a model, and its evaluation, depend."""
     points = (rig.reference_points, {m.id for m in rig.markers})
-    if not reads_corners(options.get("model", "")):
+    if not reads_corners(model):
         return points
     markers = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
     cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}

@@ -90,7 +90,7 @@ class Stage:
     writes : channels; the first is its purpose. Each has other payload types than the others.
     plan : plans a run from a log and the options of the user, by name; or returns the name of an existing run
         to use instead, "" if there is none.
-    rig_part : the part of the rig on which the result depends, with some options of the user.
+    rig_part : the part of the rig on which the result depends, by its method or model.
     method : the method or model of a run, from its parameters and its view; "" for a stage without methods.
     causal : it has steps: live tracking can run it.
     per_camera : a step sees the messages of one camera only, so that cameras can be processed in parallel.
@@ -103,7 +103,7 @@ class Stage:
     reads: tuple[Channel, ...]
     writes: tuple[Channel, ...]
     plan: Callable[[StageView, Mapping[str, str]], Plan | str]
-    rig_part: Callable[[Rig, Mapping[str, str]], Any]
+    rig_part: Callable[[Rig, str], Any]
     method: Callable[[Mapping[str, str], StageView], str] = lambda parameters, view: ""
     causal: bool = True
     per_camera: bool = True

@@ -148,7 +148,8 @@ def plan_stage(
     The task; or the name of an existing run to use instead, "" if there is none.
     """
     other_lenses = _other_lenses(session, lenses or {}) if CALIBRATIONS in stage.reads else {}
-    view = LogView(session, inputs, _other_rig(session, stage, options, rig), other_lenses)
+    method = stage.method(options, LogView(session, inputs)) if rig is not None else ""
+    view = LogView(session, inputs, _other_rig(session, stage, method, rig), other_lenses)
     plan = stage.plan(view, options)
     if not isinstance(plan, Plan):
         return plan
@@ -168,11 +169,11 @@ def plan_stage(
     )
 
 
-def _other_rig(session: Session, stage: Stage, options: Mapping[str, str], rig: Rig | None) -> Rig | None:
+def _other_rig(session: Session, stage: Stage, method: str, rig: Rig | None) -> Rig | None:
     """Return a rig that the user gives if it differs, for a stage, from those of the log."""
     rigs = session.payloads(session.topics(RIG)) if rig is not None else []
     if rig is None or (
-        rigs and all(stage.rig_part(recorded, options) == stage.rig_part(rig, options) for recorded in rigs)
+        rigs and all(stage.rig_part(recorded, method) == stage.rig_part(rig, method) for recorded in rigs)
     ):
         return None
     return rig

@@ -236,6 +236,6 @@ STAGE = Stage(
     reads=(RIG, CALIBRATIONS, MARKERS),
     writes=(CAMERA_POINTS, RUN_EVENTS),
     plan=_plan,
-    rig_part=lambda rig, options: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
+    rig_part=lambda rig, method: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
     method=lambda parameters, view: parameters.get("method", PERIMETER),
 )

@@ -181,6 +181,6 @@ STAGE = Stage(
     reads=(RIG, POSITIONS, EVENTS),
     writes=(TRACKS, POSES),
     plan=_plan,
-    rig_part=lambda rig, options: {(m.id, m.robot) for m in rig.markers},
+    rig_part=lambda rig, method: {(m.id, m.robot) for m in rig.markers},
     per_camera=False,
 )

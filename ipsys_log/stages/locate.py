@@ -201,13 +201,13 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
     )
 
 
-def _rig_part(rig: Rig, options: Mapping[str, str]) -> object:
+def _rig_part(rig: Rig, model: str) -> object:
     part = (
         rig.marker_height_m,
         rig.marker_height_sigma_m,
         {(m.id, m.height_m, m.height_sigma_m) for m in rig.markers},
     )
-    if not reads_corners(options.get("model", "")):
+    if not reads_corners(model):
         return part
     return part, rig.marker_length_m, {(m.id, m.length_m) for m in rig.markers}
 

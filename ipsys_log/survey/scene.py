@@ -17,7 +17,7 @@ from ipsys_log.analysis.stationary import FEWEST_FRAMES, is_near, is_stationary
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
-from ipsys_log.models.table import AppliedModel
+from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.stages.fit import fit_model
 
 __all__ = [
@@ -86,6 +86,9 @@ def predict(model: Model, points_m: Mapping[str, Array], world_m: Array) -> tupl
 
 @lru_cache(maxsize=2)
 def _applied(model: Model) -> dict[str, AppliedModel]:
+    # A model of corners cannot predict a point from camera points: it checks no entry.
+    if reads_corners(model.name):
+        return {}
     return {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
 
 

@@ -59,7 +59,7 @@ STAGE = Stage(
     reads=(TRACKS,),
     writes=(SMOOTHED_TRACKS,),
     plan=_plan,
-    rig_part=lambda rig, options: None,
+    rig_part=lambda rig, method: None,
     per_camera=False,
 )
 

@@ -118,3 +118,14 @@ def test_joint_model_for_camera_points_is_refused_in_one_line(ipsys: Ipsys, log:
     assert "cannot be used with camera points" in done.err
     with pytest.raises(IpsysError, match="cannot be used with camera points"):
         load_model(log, "joint")
+
+
+def test_joint_results_with_another_rig_are_verified(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "lab.toml"
+    assert ipsys("init", rig, "--from", log).code == 0
+    rig.write_text(rig.read_text().replace("tape_sigma_m = 0.003", "tape_sigma_m = 0.009"))
+    rig.write_text(rig.read_text().replace("marker_height_m = 0.1\n", "marker_height_m = 0.11\n"))
+    assert "0.11" in rig.read_text()
+    assert ipsys("replay", log, "--model", "joint", "--rig", rig).code == 0
+    verified = ipsys("verify", log)
+    assert verified.code == 0, verified.out + verified.err

@@ -317,7 +317,7 @@ def _why_stock(camera: str) -> str:
     )
 
 
-def _rig_part(rig: Rig, _options: Mapping[str, str]) -> object:
+def _rig_part(rig: Rig, _method: str) -> object:
     shutters = {(camera.name, camera.row_time_ns, camera.edge_offset_px) for camera in rig.cameras}
     return rig.dictionary, {m.id for m in rig.markers}, {shutter for shutter in shutters if any(shutter[1:])}
 

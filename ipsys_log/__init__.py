@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from ipsys_log.api import (
         CalibrationResult,
         Comparison,
+        Export,
         Failure,
         FittedModel,
         Listing,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CalibrationResult",
     "Comparison",
+    "Export",
     "Failure",
     "FittedModel",
     "IpsysError",

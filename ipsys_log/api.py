@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CalibrationResult",
     "Comparison",
+    "Export",
     "Failure",
     "FittedModel",
     "Listing",
@@ -112,6 +113,14 @@ class _ChannelRow(NamedTuple):
     run: str | None
     topic: str
     messages: int
+
+
+class Export(NamedTuple):
+    """An exported file: its path, the number of its rows, and their runs."""
+
+    path: Path
+    rows: int
+    runs: tuple[str, ...]
 
 
 class Log:
@@ -225,10 +234,45 @@ class Log:
 
         if name not in TABLES:
             raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
-        channel = _channel_named(name)
-        wanted = [run] if run is None or isinstance(run, str) else list(run)
-        runs = [self._run_of(channel, name) for name in wanted]
+        runs = self._runs_of(_channel_named(name), run)
         return read_table(self._session, name, runs, _ns(start), _ns(end))
+
+    def export(
+        self,
+        path: StrPath,
+        table: str = "tracks",
+        run: str | Sequence[str] | None = None,
+        robot: str | None = None,
+    ) -> Export:
+        """Write a channel to a file for other programs; the suffix of the file is its format.
+
+        Parameters
+        ----------
+        path : ``.csv`` or ``.parquet`` for the table; ``.tum`` or ``.kitti`` for the trajectory of a robot.
+        table, run : as for :meth:`table`; a trajectory has one run.
+        robot : only this robot, in a table of tracks.
+
+        Raises
+        ------
+        IpsysError
+            There is no such format, table, run or robot; a library is missing; the file is one of the
+            logs.
+        """
+        from ipsys_log.exchange.data_frames import TABLES
+        from ipsys_log.exchange.export import export_file
+
+        file = Path(path)
+        if any(file.exists() and file.samefile(log) for log in self.paths):
+            raise IpsysError(f"{file}: this is the log itself; name another file")
+        if table not in TABLES:
+            raise IpsysError(f"table {table!r} is not known; use one of {', '.join(TABLES)}")
+        runs = self._runs_of(_channel_named(table), run)
+        rows = export_file(self._session, table, runs, file, robot)
+        return Export(file, rows, tuple(name for name in runs if name is not None))
+
+    def _runs_of(self, channel: Channel, run: str | Sequence[str] | None) -> list[str | None]:
+        wanted = [run] if run is None or isinstance(run, str) else list(run)
+        return [self._run_of(channel, name) for name in wanted]
 
     def _run_of(self, channel: Channel, run: str | None) -> str | None:
         if not channel.is_derived:

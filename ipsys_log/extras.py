@@ -20,6 +20,7 @@ class Library(NamedTuple):
 # By the name of the module.
 LIBRARIES = {
     "pandas": Library("pandas", "table"),
+    "pyarrow": Library("PyArrow", "table"),
     "rerun": Library("Rerun", "view"),
     "matplotlib": Library("Matplotlib", "report"),
     "jinja2": Library("Jinja2", "report"),

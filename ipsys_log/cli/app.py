@@ -15,6 +15,7 @@ from ipsys_log.cli import (
     calibrate_lab,
     cameras,
     compare,
+    export,
     imports,
     inspect,
     markers,
@@ -38,7 +39,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("calibrate-lab", "replay", "live"),
     ),
     "Accuracy, and the next points to measure": ("evaluate", "plan", "report"),
-    "Inspect a log": ("info", "runs", "view", "stream", "verify", "diff", "latency", "repair"),
+    "Inspect a log": (*("info", "runs", "view", "export", "stream", "verify", "diff", "latency", "repair"),),
     _STAGES: (),
     "Without cameras": ("simulate", "import"),
 }
@@ -117,6 +118,12 @@ ipsys report calibration.mcap                      # calibration.html
     "info": """
 ipsys info monday.mcap
 """,
+    "export": """
+ipsys export monday.mcap -o tracks.csv
+ipsys export monday.mcap -o tracks.parquet --run poly --run best
+ipsys export monday.mcap -o robot.tum --robot robot_0    # for evo
+ipsys export monday.mcap -o truth.tum --robot robot_0 --table truth
+""",
     "stream": """
 ipsys stream monday.mcap --udp 127.0.0.1:9870 --rate 2
 ipsys stream monday.mcap --udp 192.168.1.20:9870 --host 0.0.0.0 --loop
@@ -190,7 +197,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, inspect, stream, compare),
+    *(plan, inspect, export, stream, compare),
 )
 for module in _MODULES:
     module.add_commands(app)

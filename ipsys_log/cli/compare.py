@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, Logs
+from ipsys_log.cli.options import AsJson, ReadLogs
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.differences import Comparison
@@ -27,7 +27,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def verify(
-    logs: Logs,
+    logs: ReadLogs,
     run: Annotated[_Run, typer.Option("--run", metavar="NAME", help="Use only this run.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -109,7 +109,7 @@ def diff(
 
 
 def latency(
-    logs: Logs,
+    logs: ReadLogs,
     plot: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(metavar="FILE", help="Draw the processing steps: .png, .pdf, .svg or .jpg."),

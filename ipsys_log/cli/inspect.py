@@ -9,7 +9,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
-from ipsys_log.cli.options import AsJson, Logs
+from ipsys_log.cli.options import AsJson, ReadLogs
 from ipsys_log.cli.stages import MORE, build_command, derive, options_until
 
 __all__ = ["add_commands"]
@@ -44,7 +44,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command("report", help=_HELP)(build_command({**options, "html": _HTML}, _report))
 
 
-def info(logs: Logs, as_json: AsJson = False) -> None:
+def info(logs: ReadLogs, as_json: AsJson = False) -> None:
     """Show cameras, channels, counts, rates, gaps and runs of a log."""
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.contents import contents_json, contents_tables
@@ -60,7 +60,7 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
             console.print(table)
 
 
-def runs(logs: Logs, as_json: AsJson = False) -> None:
+def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
     """Show the runs of a log: stage, inputs, parameters, version of ipsys, and state.
 
     The state is: current; out of date, with the reason (replay computes it again as a new run); not
@@ -105,7 +105,7 @@ def repair(
         remarks.print(f"unfinished runs cannot be completed: {error}", style="yellow", markup=False)
 
 
-def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
+def view(logs: ReadLogs, run: Runs = None, save: Save = None) -> None:
     """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun."""
     from ipsys_log.extras import check_installed
     from ipsys_log.log.dataset import Session

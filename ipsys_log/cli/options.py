@@ -27,6 +27,7 @@ __all__ = [
     "NewLog",
     "Only",
     "Port",
+    "ReadLogs",
     "RigFile",
     "RigNow",
     "annotate",
@@ -60,6 +61,7 @@ Logs = Annotated[
     typer.Argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
 ]
 
+ReadLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
 
 # File name extensions of other input and output files: a log with such a name is a mistake.
 _OTHER_FILES = (

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from ipsys_log.messages.channels import (
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["TABLES", "import_pandas", "read_table"]
+__all__ = ["TABLES", "import_pandas", "read_table", "read_table_parts"]
 
 # The six different elements of a 3 x 3 covariance of x, y, z, by their index in row-major order.
 _COVARIANCE = {"xx": 0, "xy": 1, "xz": 2, "yy": 4, "yz": 5, "zz": 8}
@@ -88,20 +89,8 @@ def read_table(
     IpsysError
         pandas is not installed, or there is no such table.
     """
-    pandas = import_pandas()
-    if name not in TABLES:
-        raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
-    if name in _ITEMS:
-        tables = [_item_table(pandas, session, _ITEMS[name], run, start_ns, end_ns) for run in runs]
-    else:
-        channel, row = _ROWS[name]
-        messages = list(session.messages(session.topics(channel), start_ns, end_ns))
-        return _typed(
-            pandas,
-            pandas.DataFrame(
-                [_times(message) | row(message) for message in messages], columns=_COLUMNS[name]
-            ),
-        )
+    pandas = _import_for(name)
+    tables = [_read_run(pandas, session, name, run, start_ns, end_ns) for run in runs]
     if len(runs) == 1:
         return tables[0]
     named = [table.assign(run=run) for run, table in zip(runs, tables, strict=True)]
@@ -109,39 +98,69 @@ def read_table(
     return joined
 
 
-def _item_table(
-    pd: Any, session: Session, table: _Table, run: str | None, start_ns: int | None, end_ns: int | None
+def read_table_parts(
+    session: Session, name: str, run: str | None, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[pd.DataFrame]:
+    """Yield a channel as tables of limited size, in log order: at least one, which may be empty.
+
+    Parameters
+    ----------
+    name : one of :data:`TABLES`.
+    run : the run to read; None for a recorded channel.
+    start_ns, end_ns : log times; the end is not included.
+
+    Raises
+    ------
+    IpsysError
+        pandas is not installed, or there is no such table.
+    """
+    pandas = _import_for(name)
+    if name in _ITEMS:
+        for part in _item_parts(session, _ITEMS[name], run, start_ns, end_ns):
+            yield _typed(pandas, pandas.DataFrame(part, copy=False))
+    else:
+        yield _read_run(pandas, session, name, run, start_ns, end_ns)
+
+
+def _import_for(name: str) -> Any:
+    pandas = import_pandas()
+    if name not in TABLES:
+        raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
+    return pandas
+
+
+def _read_run(
+    pd: Any, session: Session, name: str, run: str | None, start_ns: int | None, end_ns: int | None
 ) -> pd.DataFrame:
+    if name in _ITEMS:
+        parts = list(_item_parts(session, _ITEMS[name], run, start_ns, end_ns))
+        joined = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+        return _typed(pd, pd.DataFrame(joined, copy=False))
+    channel, row = _ROWS[name]
+    messages = session.messages(session.topics(channel), start_ns, end_ns)
+    rows = [_times(message) | row(message) for message in messages]
+    return _typed(pd, pd.DataFrame(rows, columns=_COLUMNS[name]))
+
+
+def _item_parts(
+    session: Session, table: _Table, run: str | None, start_ns: int | None, end_ns: int | None
+) -> Iterator[dict[str, Any]]:
     topics = session.topics(table.channel, run)
     items = session.part_counter()
-    parts: list[dict[str, Any]] = []
-    times: list[tuple[int, int]] = []
-    cameras: list[str | None] = []
-    encoded: list[bytes] = []
-
-    def flush() -> None:
-        if encoded or not parts:
-            try:
-                columns = read_columns(schema_name(table.payload), encoded, table.fields, items)
-            except LogError as error:
-                raise LogError(f"{session}: {table.channel.name}: {error}") from error
-            parts.append(_part(columns, np.array(times, np.int64).reshape(-1, 2), cameras, table))
-        times.clear()
-        cameras.clear()
-        encoded.clear()
-
     has_camera = "{camera}" in table.channel.topic
     by_topic = {topic: camera_of_topic(topic) for topic in topics}
-    for topic, log_time_ns, publish_time_ns, data in session.encoded(topics, start_ns, end_ns):
-        times.append((publish_time_ns, log_time_ns))
-        if has_camera:
-            cameras.append(by_topic[topic])
-        encoded.append(data)
-        if len(encoded) == _BATCH:
-            flush()
-    flush()
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _typed(pd, pd.DataFrame(joined, copy=False))
+    messages = session.encoded(topics, start_ns, end_ns)
+    is_first = True
+    while (batch := list(islice(messages, _BATCH))) or is_first:
+        is_first = False
+        times = np.array([(publish_ns, log_ns) for _, log_ns, publish_ns, _ in batch], np.int64)
+        cameras = [by_topic[topic] for topic, *_ in batch] if has_camera else []
+        encoded = [data for *_, data in batch]
+        try:
+            columns = read_columns(schema_name(table.payload), encoded, table.fields, items)
+        except LogError as error:
+            raise LogError(f"{session}: {table.channel.name}: {error}") from error
+        yield _part(columns, times.reshape(-1, 2), cameras, table)
 
 
 def _part(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
+from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.lock import describe_broken_link
@@ -165,17 +166,10 @@ def _check_writable(folder: Path, where: str) -> None:
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write files into a folder, all of them or none; create the folder if it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
-    partials = {folder / name: folder / f"{name}.{os.getpid()}.partial" for name in files}
-    try:
-        for (path, partial), content in zip(partials.items(), files.values(), strict=True):
-            if path.is_dir():
-                raise IpsysError(f"{path}: is a folder; move it away")
-            with partial.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())  # without it, a power cut may leave an empty file with the new name
-        for path, partial in partials.items():
-            partial.replace(path)
-    finally:
-        for partial in partials.values():
-            partial.unlink(missing_ok=True)
+    with ExitStack() as replaced:
+        for name, content in files.items():
+            if (folder / name).is_dir():
+                raise IpsysError(f"{folder / name}: is a folder; move it away")
+            file = replaced.enter_context(replacement_of(folder / name))
+            file.write(content)
+            file.flush()  # a full disk is found before the first file is replaced

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ipsys_log.messages import CameraCalibration, Rig
-    from ipsys_log.report.lab_calibration import LabCalibration
+    from ipsys_log.survey.lab_calibration import LabCalibration
 
 __all__ = ["add_commands", "nominal_lenses"]
 
@@ -139,9 +139,9 @@ def calibrate_lab(
     from ipsys_log.errors import IpsysError
     from ipsys_log.messages.channels import MODEL, RIG
     from ipsys_log.report.files import check_figure_file
-    from ipsys_log.report.lab_calibration import describe_lab
     from ipsys_log.runs.graph import writes
     from ipsys_log.sinks.selection import rig_in_force
+    from ipsys_log.survey.lab_calibration import describe_lab
 
     if not 0 < goal_mm <= _MOST_GOAL_MM:
         raise IpsysError(f"--goal-mm {goal_mm:g}: is not a length above 0 and up to {_MOST_GOAL_MM:g} mm")

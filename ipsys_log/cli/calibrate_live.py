@@ -49,8 +49,8 @@ def record_drive(
     """
     from ipsys_log import pipeline
     from ipsys_log.extras import check_installed
-    from ipsys_log.report.live_calibration import LiveCalibration
     from ipsys_log.runs.options import Request
+    from ipsys_log.survey.live_calibration import LiveCalibration
 
     if page is not None:
         check_installed("the measuring page needs", "starlette", "uvicorn")

@@ -15,8 +15,8 @@ from matplotlib.ticker import MaxNLocator
 
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
-from ipsys_log.report.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.report.styles import NOTE, REST, shorten
+from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
 
 __all__ = ["draw_lab"]
 

@@ -13,7 +13,7 @@ from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.report.lab_calibration import LabCalibration, describe_fit
+from ipsys_log.survey.lab_calibration import LabCalibration, describe_fit
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LiveCalibration"]

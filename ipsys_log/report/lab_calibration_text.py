@@ -8,7 +8,9 @@ from typing import Any
 
 from rich.table import Table
 
-from ipsys_log.survey.lab_calibration import LabCalibration
+from ipsys_log.analysis.expected_error import FloorGap
+from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
+from ipsys_log.units import CM_PER_M, MM_PER_M
 
 __all__ = ["lab_advice", "lab_headline", "lab_json", "lab_table"]
 
@@ -27,7 +29,7 @@ def lab_headline(lab: LabCalibration) -> Iterator[str]:
     else:
         yield (
             f"Not enough: the expected mean error of {worst.camera} is {_mm(worst.mean_m)} mm; the goal is "
-            f"{lab.goal_m * 1000:g} mm."
+            f"{lab.goal_m * MM_PER_M:g} mm."
         )
     if lab.faults:
         count = len(lab.faults)
@@ -40,7 +42,7 @@ def lab_headline(lab: LabCalibration) -> Iterator[str]:
 
 def lab_table(lab: LabCalibration) -> Table:
     """Return a table with the expected errors, coverage and residuals of each camera."""
-    title = f"Expected 2D error over the floor, {lab.height_m * 100:g} cm above it, by run {lab.run}"
+    title = f"Expected 2D error over the floor, {lab.height_m * CM_PER_M:g} cm above it, by run {lab.run}"
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     table.add_column("camera", overflow="fold")
     for name in ("mean mm", "p95 mm", "covered", "points", "drive", "residual px", "clock ms"):
@@ -65,16 +67,16 @@ def lab_advice(lab: LabCalibration) -> Iterator[str]:
     yield ""
     if lab.gap is not None:
         low, high = (
-            [f"{value * 100:.0f}" for value in corner_m] for corner_m in (lab.gap.low_m, lab.gap.high_m)
+            [f"{value * CM_PER_M:.0f}" for value in corner_m] for corner_m in (lab.gap.low_m, lab.gap.high_m)
         )
         yield (
             f"Drive a robot through x {low[0]} to {high[0]}, y {low[1]} to {high[1]} cm: camera "
             f"{lab.gap.camera} saw no marker there."
         )
     for number, point in enumerate(lab.points):
-        x_cm, y_cm = (f"{value * 100:.0f}" for value in point.point_m)
+        x_cm, y_cm = (f"{value * CM_PER_M:.0f}" for value in point.point_m)
         tapes = ", ".join(
-            f"{p.name} {math.hypot(point.point_m[0] - p.x_m, point.point_m[1] - p.y_m) * 100:.0f}"
+            f"{p.name} {math.hypot(point.point_m[0] - p.x_m, point.point_m[1] - p.y_m) * CM_PER_M:.0f}"
             for p in lab.rig.reference_points
         )
         yield (
@@ -85,55 +87,27 @@ def lab_advice(lab: LabCalibration) -> Iterator[str]:
 
 def lab_json(lab: LabCalibration) -> dict[str, Any]:
     """Return the result as plain data for JSON; an error without a value is None."""
-
-    def number(value: float | None) -> float | None:
-        return None if value is None or not math.isfinite(value) else value
-
-    def gap(one: Any) -> dict[str, Any]:
-        return {
-            "camera": one.camera,
-            "area_m2": one.area_m2,
-            "low_m": one.low_m.tolist(),
-            "high_m": one.high_m.tolist(),
-            "error_mm": one.error_m * 1000,
-        }
-
-    cameras = [
-        {
-            "camera": camera.camera,
-            "mean_mm": number(camera.mean_m * 1000),
-            "p95_mm": number(camera.p95_m * 1000),
-            "covered": camera.covered,
-            "points": camera.sightings[0],
-            "moving": camera.sightings[1],
-            "residual_px": number(camera.rmse_px),
-            "clock_ms": None if camera.clock_s is None else camera.clock_s * 1000,
-            "nominal": camera.nominal,
-            "gaps": [gap(one) for one in camera.gaps],
-        }
-        for camera in lab.cameras
-    ]
     return {
         "enough": lab.is_enough,
-        "goal_mm": lab.goal_m * 1000,
-        "mean_mm": lab.mean_m * 1000,
-        "p95_mm": lab.p95_m * 1000,
+        "goal_mm": lab.goal_m * MM_PER_M,
+        "mean_mm": lab.mean_m * MM_PER_M,
+        "p95_mm": lab.p95_m * MM_PER_M,
         "run": lab.run,
         "marker_height_m": lab.height_m,
         "calibration_points": len(lab.points_m),
-        "cameras": cameras,
+        "cameras": [_camera_json(camera) for camera in lab.cameras],
         "missing": list(lab.missing),
         "ignored_sightings": lab.ignored,
         "faults": [
             {"kind": f.kind, "subject": f.subject, "score": f.score, "text": f.text} for f in lab.faults
         ],
-        "drive": None if lab.gap is None or lab.is_enough else gap(lab.gap),
+        "drive": None if lab.gap is None or lab.is_enough else _gap_json(lab.gap),
         "tape": [
             {
                 "x_m": float(point.point_m[0]),
                 "y_m": float(point.point_m[1]),
                 "cameras": list(point.cameras),
-                "mean_after_mm": point.mean_after_m * 1000,
+                "mean_after_mm": point.mean_after_m * MM_PER_M,
             }
             for point in lab.points
         ],
@@ -141,5 +115,34 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
     }
 
 
+def _camera_json(camera: CameraResult) -> dict[str, Any]:
+    return {
+        "camera": camera.camera,
+        "mean_mm": _finite(camera.mean_m * MM_PER_M),
+        "p95_mm": _finite(camera.p95_m * MM_PER_M),
+        "covered": camera.covered,
+        "points": camera.sightings[0],
+        "moving": camera.sightings[1],
+        "residual_px": _finite(camera.rmse_px),
+        "clock_ms": None if camera.clock_s is None else camera.clock_s * 1000,
+        "nominal": camera.nominal,
+        "gaps": [_gap_json(gap) for gap in camera.gaps],
+    }
+
+
+def _gap_json(gap: FloorGap) -> dict[str, Any]:
+    return {
+        "camera": gap.camera,
+        "area_m2": gap.area_m2,
+        "low_m": gap.low_m.tolist(),
+        "high_m": gap.high_m.tolist(),
+        "error_mm": gap.error_m * MM_PER_M,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _mm(length_m: float) -> str:
-    return f"{length_m * 1000:.1f}"
+    return f"{length_m * MM_PER_M:.1f}"

@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
 from ipsys_log.survey.lab_calibration import LabCalibration, describe_fit
-from ipsys_log.units import NS_PER_S
+from ipsys_log.units import MM_PER_M, NS_PER_S
 
 __all__ = ["LiveCalibration"]
 
@@ -22,7 +22,6 @@ __all__ = ["LiveCalibration"]
 _STEP_NS = NS_PER_S // 5
 # Cells of an image, along its width and height, for the coverage before the first fit.
 _CELLS = 8, 5
-_MM_PER_M = 1000.0
 
 
 class LiveCalibration:
@@ -112,7 +111,7 @@ class LiveCalibration:
 
 def _line(lab: LabCalibration) -> str:
     """Return the expected error of each camera, and the next step, on one line."""
-    errors = ", ".join(f"{one.camera} {one.mean_m * _MM_PER_M:.1f}" for one in lab.cameras)
+    errors = ", ".join(f"{one.camera} {one.mean_m * MM_PER_M:.1f}" for one in lab.cameras)
     text = f"expected mean error in mm: {errors}"
     if lab.causes:
         return f"{text}; {lab.causes[0].text}"
@@ -126,4 +125,4 @@ def _line(lab: LabCalibration) -> str:
     if lab.points:
         x_cm, y_cm = (100 * lab.points[0].point_m).round().astype(int).tolist()
         return f"{text}; tape a point near x {x_cm}, y {y_cm} cm"
-    return f"{text}; the goal is {lab.goal_m * _MM_PER_M:g} mm: drive longer"
+    return f"{text}; the goal is {lab.goal_m * MM_PER_M:g} mm: drive longer"

@@ -208,7 +208,7 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
     for number, body in enumerate(bodies):
         score = abs(float(residuals[layout.scales][number]))
         if score > _WRONG:
-            side_mm = float(np.linalg.norm(body.points_m[1] - body.points_m[0])) * MM_PER_M
+            side_mm = body.length_m * MM_PER_M
             text = (
                 f"marker {body.name}: its side is {side_mm * scales[number]:.1f} mm, not {side_mm:.1f} mm; "
                 "measure the print, and correct the rig"

@@ -8,7 +8,7 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import say
-from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.cli.stream_options import Key, Mavlink, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
 
 __all__ = ["add_commands"]
@@ -54,6 +54,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 @runs_until_stopped
+@writes_nothing
 def stream(
     logs: Logs,
     udp: Udp = None,

@@ -27,7 +27,8 @@ _CELLS = 8, 5
 class LiveCalibration:
     """A consumer of a recording that fits the lab again every few seconds, in its own thread.
 
-    An error of a fit is text for the user. It cannot end the recording.
+    An error of a fit is text for the user. It cannot end the recording. A bug is raised by a later
+    message, or by ``close``.
 
     Parameters
     ----------
@@ -70,14 +71,19 @@ class LiveCalibration:
             self._add(camera, payload)
         self._next_ns = self._next_ns or message.log_time_ns + self._every_ns
         if message.log_time_ns >= self._next_ns and (self._fitting is None or self._fitting.done()):
-            if self._fitting is not None:
-                self._fitting.result()  # raises a bug of the fit
+            self._raise_bug()
             self._next_ns = message.log_time_ns + self._every_ns
             self._fitting = self._worker.submit(self._report)
 
     def close(self) -> None:
         """Wait for the fit that works, and start no other."""
         self._worker.shutdown(cancel_futures=True)
+        self._raise_bug()
+
+    def _raise_bug(self) -> None:
+        """Raise the exception of the last fit, which is a bug: other errors of a fit are lines."""
+        if self._fitting is not None and not self._fitting.cancelled():
+            self._fitting.result()
 
     def _add(self, camera: str, markers: Markers) -> None:
         kept = self._markers[camera]

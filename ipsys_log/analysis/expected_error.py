@@ -19,9 +19,9 @@ from ipsys_log.analysis.floor_error import GRID_M, WALL_M, WHOLE_PRINT
 from ipsys_log.analysis.plan import mean_length
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.rotations import level_turns
 
 __all__ = [
     "ExpectedErrors",

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.blunders import Blunder, possible_blunders
 from ipsys_log.analysis.consistency import FEWEST_POINTS, score, usual_covariances
-from ipsys_log.analysis.tape import RiggedMeasurement, TapePoint, world_point
+from ipsys_log.analysis.tape import RiggedMeasurement, TapePoint, with_usual_tape, world_point
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.messages import Rig, Suspect
+from ipsys_log.messages import Suspect
 
 __all__ = ["LeaveOneOut", "find_outliers", "is_gross"]
 
@@ -35,7 +35,6 @@ _SHARE_LEFT = 0.2
 _GROSS_M = 0.3
 _GROSS = 3.0
 _MOST_SHARE = 0.2
-_USUAL_TAPE_M = 0.003
 
 
 # An outlier with a larger error, in units of the usual error, is gross. In simulated labs, an exchanged pair
@@ -100,7 +99,7 @@ def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement
     >>> outlier.measurement, outlier.kind, outlier.text, outlier.corrected_m.round(3).tolist()
     ('m12', 'side', 'it lies left of the line from A to B, not right', [1.0, 3.0, 0.0])
     """
-    places = [replace(place, rig=_with_tape(place.rig)) for place in places]
+    places = [replace(place, rig=with_usual_tape(place.rig)) for place in places]
     fixed = {place.measurement.id: world_point(place.measurement, place.rig) for place in places}
     taken, findings = _search(lambda names: _judge(leave_one_out(names), fixed, names))
     by_id = {place.measurement.id: place for place in places}
@@ -111,11 +110,6 @@ def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement
 def is_gross(suspect: Suspect) -> bool:
     """Return whether an outlier is a gross error, which no tape, camera or model explains."""
     return suspect.score >= _GROSS_SCORE
-
-
-def _with_tape(rig: Rig) -> Rig:
-    """Return the rig with a usual tape if it has none: a small crossing angle must still excuse an error."""
-    return replace(rig, tape_sigma_m=_USUAL_TAPE_M) if rig.tape_sigma_m is None else rig
 
 
 def _search(judge: _Judge) -> tuple[list[str], dict[str, _Finding]]:

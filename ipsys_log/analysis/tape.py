@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import (
     ON_REFERENCE_SIGMA_M,
+    USUAL_TAPE_SIGMA_M,
     crossing_angle,
     multilaterate,
     tape_covariance,
@@ -25,6 +26,7 @@ __all__ = [
     "find_weak_points",
     "is_on_reference",
     "reference_points",
+    "with_usual_tape",
     "world_point",
 ]
 
@@ -34,8 +36,6 @@ Array = NDArray[np.float64]
 _RULER_SIGMA_M = 0.001
 # Least sigma of a manual reading. A simulated tape may have no error, but its weight must be finite.
 _FINEST_M = 0.0001
-# Sigma of the tape of a point without its own, only to determine the crossing angle of its circles.
-_USUAL_TAPE_M = 0.003
 _FLAT_RATIO = 3.0
 _FARTHEST_M = 10_000.0
 
@@ -46,6 +46,14 @@ class RiggedMeasurement:
 
     measurement: Measurement
     rig: Rig
+
+
+def with_usual_tape(rig: Rig) -> Rig:
+    """Return the rig; if it has no standard deviation of the tape, with the usual one.
+
+    A small crossing angle of the tapes then excuses an error.
+    """
+    return replace(rig, tape_sigma_m=USUAL_TAPE_SIGMA_M) if rig.tape_sigma_m is None else rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,7 +194,8 @@ def find_weak_points(places: Iterable[RiggedMeasurement]) -> list[WeakPoint]:
         world_m = world_point(measurement, rig).world_m
         references_m = reference_points(measurement, rig)
         known_m = _tape_sigmas(measurement, rig, f"measurement {measurement.id}")
-        sigmas_m = np.full(len(references_m), _USUAL_TAPE_M) if known_m is None else known_m
+        # Without a sigma, the usual one serves only to determine the crossing angle of the circles.
+        sigmas_m = np.full(len(references_m), USUAL_TAPE_SIGMA_M) if known_m is None else known_m
         spread_m2 = np.linalg.eigvalsh(tape_covariance(world_m[:2], references_m, sigmas_m))
         ratio = float(np.sqrt(spread_m2[-1])) / float(sigmas_m.max())
         if ratio > _FLAT_RATIO:

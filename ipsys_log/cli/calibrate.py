@@ -143,7 +143,7 @@ def calibrate(
     with nullcontext(sources or []) if lab is None else _record_now(lab, seconds) as taken:
         image_sources = find_sources(taken, camera or [])
         targets = _targets([pictures.camera for pictures in image_sources], output, names, force)
-        with progress_bar(lambda name: False) as progress:
+        with progress_bar(frame_steps=()) as progress:
             outcomes: list[CalibrationResult | Failure] = []
             for outcome in api.calibrate(
                 *taken,

@@ -7,9 +7,9 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ipsys_log.cli.calibrate_lab import nominal_lenses
 from ipsys_log.cli.console import progress_bar, remarks, say
 from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
+from ipsys_log.cli.nominal_intrinsics import nominal_lenses
 from ipsys_log.cli.open_cameras import check_target, open_cameras, prepare_lab
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ def record_drive(
     """
     from ipsys_log import pipeline
     from ipsys_log.extras import check_installed
-    from ipsys_log.report.live_calibration import LiveCalibration
     from ipsys_log.runs.options import Request
+    from ipsys_log.survey.live_calibration import LiveCalibration
 
     if page is not None:
         check_installed("the measuring page needs", "starlette", "uvicorn")

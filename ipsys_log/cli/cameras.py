@@ -11,6 +11,7 @@ import typer
 
 from ipsys_log.cli.console import console
 from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.signals import writes_nothing
 
 if TYPE_CHECKING:
     from ipsys_log.capture.usb_bus import UsbCamera
@@ -26,6 +27,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(cameras)
 
 
+@writes_nothing
 def cameras(
     rig: Annotated[
         Path | None,

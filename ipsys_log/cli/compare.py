@@ -11,6 +11,7 @@ import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, ReadLogs
+from ipsys_log.cli.signals import writes_nothing
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.differences import Comparison
@@ -26,6 +27,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(latency)
 
 
+@writes_nothing
 def verify(
     logs: ReadLogs,
     run: Annotated[_Run, typer.Option("--run", metavar="NAME", help="Use only this run.")] = None,
@@ -54,6 +56,7 @@ def verify(
     _end(comparisons)
 
 
+@writes_nothing
 def diff(
     first: Annotated[Path, typer.Argument(metavar="FIRST", help="The first log.")],
     second: Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
 from typing import IO, TYPE_CHECKING, Any
@@ -82,18 +82,13 @@ def print_warnings() -> Iterator[None]:
         logger.propagate = propagate
 
 
-def _is_causal(name: str) -> bool:
-    from ipsys_log.runs.graph import stage_named
-
-    stage = stage_named(name)
-    return stage is not None and stage.causal
-
-
 @contextmanager
-def progress_bar(counts_frames: Callable[[str], bool] = _is_causal) -> Iterator[Progress]:
-    """Yield the progress function; it shows a bar for each working stage, only on a terminal.
+def progress_bar(frame_steps: Collection[str] | None = None) -> Iterator[Progress]:
+    """Yield the progress function; it shows a bar for each working step, only on a terminal.
 
-    ``counts_frames`` tells, by name, whether the messages of a stage are those of frames.
+    Parameters
+    ----------
+    frame_steps : names of the steps that count frames: their bars show a rate. Default: the causal stages.
     """
     from rich.progress import (
         BarColumn,
@@ -114,6 +109,7 @@ def progress_bar(counts_frames: Callable[[str], bool] = _is_causal) -> Iterator[
     if not remarks.is_terminal:
         yield lambda stage, done, total: None
         return
+    rated = _causal_stages() if frame_steps is None else frame_steps
     with Progress(*columns, console=remarks, transient=True) as bar:
         bars: dict[str, TaskID] = {}
         drawn_s = 0.0
@@ -128,10 +124,16 @@ def progress_bar(counts_frames: Callable[[str], bool] = _is_causal) -> Iterator[
                 return
             drawn_s = now_s
             speed = bar.tasks[bars[stage]].speed
-            rate = f"{speed:,.0f} frames/s" if speed and counts_frames(stage) else ""
+            rate = f"{speed:,.0f} frames/s" if speed and stage in rated else ""
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show
+
+
+def _causal_stages() -> set[str]:
+    from ipsys_log.runs.graph import STAGES
+
+    return {stage.name for stage in STAGES if stage.causal}
 
 
 def say(text: str) -> None:

@@ -10,6 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, ReadLogs
+from ipsys_log.cli.signals import writes_nothing
 from ipsys_log.cli.stages import MORE, build_command, derive, options_until
 
 __all__ = ["add_commands"]
@@ -44,6 +45,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command("report", help=_HELP)(build_command({**options, "html": _HTML}, _report))
 
 
+@writes_nothing
 def info(logs: ReadLogs, as_json: AsJson = False) -> None:
     """Show cameras, channels, counts, rates, gaps and runs of a log."""
     from ipsys_log.log.dataset import Session
@@ -60,6 +62,7 @@ def info(logs: ReadLogs, as_json: AsJson = False) -> None:
             console.print(table)
 
 
+@writes_nothing
 def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
     """Show the runs of a log: stage, inputs, parameters, version of ipsys, and state.
 

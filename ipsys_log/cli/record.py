@@ -22,7 +22,7 @@ from ipsys_log.cli.options import (
     RigNow,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
-from ipsys_log.cli.stream_options import Key, Mavlink, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
+from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
 
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
@@ -111,6 +111,7 @@ def record(
 
 
 @runs_until_stopped
+@takes_streams
 def live(
     output: NewLog,
     model_from: Annotated[
@@ -130,13 +131,8 @@ def live(
     corners: Corners = None,
     method: Method = "perimeter",
     view: View = False,
-    udp: Udp = None,
-    key: Key = None,
-    vrpn: Vrpn = False,
-    vrpn_port: VrpnPort = None,
-    mavlink: Mavlink = None,
-    host: StreamHost = None,
-    robot: Robots = None,
+    *,
+    streams: StreamOptions,
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
@@ -157,17 +153,7 @@ def live(
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         remarks.print(line, style="yellow", markup=False)
-    streamed = choose_streams(
-        lab.rig,
-        rig.parent,
-        is_vrpn=vrpn,
-        vrpn=vrpn_port,
-        mavlink=mavlink,
-        host=host,
-        udp=udp,
-        key=key,
-        robots=robot,
-    )
+    streamed = choose_streams(lab.rig, rig.parent, **streams)
     for line in check_streams(streamed):
         say(line)
     robots = [marker.robot for marker in lab.rig.markers if marker.robot]
@@ -179,10 +165,10 @@ def live(
         open_cameras(lab, output, seconds) as (cameras, settings, status),
         open_streams(
             streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, robots=robots
-        ) as streams,
+        ) as sinks,
     ):
         viewer = [_viewer(settings, cameras, shown_run)] if view else []
-        pipeline.live(cameras, settings, output, request, None, [status], force, [*viewer, *streams])
+        pipeline.live(cameras, settings, output, request, None, [status], force, [*viewer, *sinks])
 
 
 def _first_run(request: Request) -> str:

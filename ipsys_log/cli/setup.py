@@ -146,7 +146,7 @@ def simulate(output: Path, **settings: Any) -> None:
     from ipsys_log.simulation.settings import LabSettings
 
     text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
-    with say_kept(lambda _: text), progress_bar(lambda name: name == "simulate") as progress:
+    with say_kept(lambda _: text), progress_bar(frame_steps=("simulate",)) as progress:
         counts = write_log(output, simulate(LabSettings(**settings), progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
     console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")

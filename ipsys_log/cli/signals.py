@@ -33,11 +33,13 @@ __all__ = [
     "say_kept",
     "stop_on_signal",
     "suppress_interrupt",
+    "writes_nothing",
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
 _KEPT = "complete results are kept; nothing else is changed"
+_NOTHING_WRITTEN = "no file was changed"
 
 
 class Interrupted(KeyboardInterrupt):
@@ -60,12 +62,14 @@ class InterruptError(Exception):
 class _State:
     """The state of the signals.
 
-    It has the signal that was noted, the text of a normal end (None: an interrupt is a failure), the
-    interrupt that has not arrived yet, and the results that the command has kept so far.
+    It has the signal that was noted, the text of a normal end (None: an interrupt is a failure), the text on
+    the results after a failure, the interrupt that has not arrived yet, and the results that the command has
+    kept so far.
     """
 
     noted: int | None = None
     normal_text: str | None = None
+    kept_text: str = _KEPT
     raised: Interrupted | None = None
     kept: list[str] = field(default_factory=list)
 
@@ -150,11 +154,18 @@ def runs_until_stopped(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def writes_nothing(command: Callable[..., None]) -> Callable[..., None]:
+    """Mark a command that writes no file: after an interrupt, there are no results to keep."""
+    command.writes_nothing = True  # type: ignore[attr-defined]
+    return command
+
+
 def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a command: signals interrupt it, and their exceptions pass the argument parser."""
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> Any:
+        _state.kept_text = _NOTHING_WRITTEN if hasattr(command, "writes_nothing") else _KEPT
         try:
             if not hasattr(command, "runs_until_stopped"):
                 allow_interrupt()
@@ -183,7 +194,7 @@ def _interrupt(number: int, _: FrameType | None = None) -> None:
     if text is not None:
         _state.raised = Interrupted(0, text)
     else:
-        _state.raised = Interrupted(128 + number, f"interrupted; {_KEPT}")
+        _state.raised = Interrupted(128 + number, f"interrupted; {_state.kept_text}")
     signal.signal(signal.SIGALRM, _interrupt_again)
     signal.setitimer(signal.ITIMER_REAL, _AGAIN_S, _AGAIN_S)
     raise _state.raised

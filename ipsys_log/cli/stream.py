@@ -8,8 +8,8 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import say
-from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
-from ipsys_log.cli.stream_options import Key, Mavlink, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
+from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
 
 __all__ = ["add_commands"]
 
@@ -54,15 +54,12 @@ def add_commands(app: typer.Typer) -> None:
 
 
 @runs_until_stopped
+@writes_nothing
+@takes_streams
 def stream(
     logs: Logs,
-    udp: Udp = None,
-    key: Key = None,
-    vrpn: Vrpn = False,
-    vrpn_port: VrpnPort = None,
-    mavlink: Mavlink = None,
-    host: StreamHost = None,
-    robot: Robots = None,
+    *,
+    streams: StreamOptions,
     rig: RigFile = None,
     rate: Rate = 1.0,
     loop: Loop = False,
@@ -89,17 +86,7 @@ def stream(
         raise IpsysError(f"--restamp {restamp}: is not known; use original or now")
     described = None if rig is None else load_rig(rig)
     folder = Path() if rig is None else rig.parent
-    settings = choose_streams(
-        described,
-        folder,
-        is_vrpn=vrpn,
-        vrpn=vrpn_port,
-        mavlink=mavlink,
-        host=host,
-        udp=udp,
-        key=key,
-        robots=robot,
-    )
+    settings = choose_streams(described, folder, **streams)
     if not settings:
         raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870")
     options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -12,7 +15,10 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-__all__ = ["Key", "Mavlink", "Robots", "StreamHost", "Udp", "Vrpn", "VrpnPort", "choose_streams"]
+__all__ = ["StreamOptions", "choose_streams", "takes_streams"]
+
+# The options of the streams, by the names of `choose_streams`.
+StreamOptions = dict[str, Any]
 
 _PANEL = "Streams of positions"
 
@@ -83,6 +89,41 @@ Robots = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+
+
+# Each option with its type, its default, and its name for `choose_streams`.
+_OPTIONS: dict[str, tuple[Any, Any, str]] = {
+    "udp": (Udp, None, "udp"),
+    "key": (Key, None, "key"),
+    "vrpn": (Vrpn, False, "is_vrpn"),
+    "vrpn_port": (VrpnPort, None, "vrpn"),
+    "mavlink": (Mavlink, None, "mavlink"),
+    "host": (StreamHost, None, "host"),
+    "robot": (Robots, None, "robots"),
+}
+
+
+def takes_streams(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of the streams, in place of its keyword ``streams``."""
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [p for own in signature.parameters.values() for p in _expand(own)]
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        streams = {name: given.pop(option) for option, (_, _, name) in _OPTIONS.items()}
+        command(**given, streams=streams)
+
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
+
+
+def _expand(parameter: inspect.Parameter) -> Iterator[inspect.Parameter]:
+    if parameter.name != "streams":
+        yield parameter
+        return
+    for option, (kind, default, _) in _OPTIONS.items():
+        yield inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
 def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSettings:

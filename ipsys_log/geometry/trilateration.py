@@ -13,6 +13,7 @@ from ipsys_log.errors import IpsysError
 __all__ = [
     "ON_REFERENCE_SIGMA_M",
     "SIDES",
+    "USUAL_TAPE_SIGMA_M",
     "TapePosition",
     "are_collinear",
     "crossing_angle",
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 SIDES = ("left", "right")
 # A hand lays a marker onto a reference point with this standard deviation, along each axis.
 ON_REFERENCE_SIGMA_M = 0.001
+# Standard deviation of a tape reading, if neither the reading nor the rig gives one.
+USUAL_TAPE_SIGMA_M = 0.003
 
 
 def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:
@@ -90,7 +93,6 @@ _BESIDE_LINE_M = 0.05
 _NEAREST_M = 1e-9
 # Two positions fit equally well if their sums of squares, in squared sigmas, differ by less than this.
 _ALIKE = 9.0
-_USUAL_SIGMA_M = 0.003
 _STARTS = 6
 _STEPS = 50
 _STEP_M = 1e-10
@@ -256,7 +258,7 @@ def _least_squares(
     references_m: Array, distances_m: Array, sigmas_m: Array | None, side: str | None
 ) -> Array:
     """Return the best solution from starts at circle intersections, on ``side`` if it fits equally well."""
-    weights = 1 / (np.full_like(distances_m, _USUAL_SIGMA_M) if sigmas_m is None else sigmas_m)
+    weights = 1 / (np.full_like(distances_m, USUAL_TAPE_SIGMA_M) if sigmas_m is None else sigmas_m)
     # Several distances from one reference point give no additional start.
     first = np.unique(references_m, axis=0, return_index=True)[1][:_STARTS]
     solutions = []

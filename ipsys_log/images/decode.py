@@ -23,6 +23,7 @@ __all__ = [
     "check_pixel_count",
     "decode_grey",
     "decode_rows",
+    "frame_size",
     "levels_at",
     "read_image_size",
 ]
@@ -193,6 +194,22 @@ def decode_grey(frame: CompressedImage | RawImage) -> Grey:
     if decoded is None:
         raise FrameError(f"{len(frame.data)} bytes that are no picture ({frame.format or 'no format given'})")
     return np.asarray(decoded, dtype=np.uint8)
+
+
+def frame_size(frame: CompressedImage | RawImage) -> tuple[int, int]:
+    """Return width and height of a frame in px; only the header of a whole baseline JPEG is read.
+
+    Raises
+    ------
+    FrameError
+        The data is damaged. A damage after the header of a JPEG is not noticed.
+    """
+    layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
+    if layout is None:
+        height, width = decode_grey(frame).shape
+        return width, height
+    check_pixel_count(layout.width, layout.height, len(frame.data))
+    return layout.width, layout.height
 
 
 def _decode_jpeg(

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.lens_models import project_with_slopes
 from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.rotations import cross
 from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.rotations import cross
 
 __all__ = ["CornerSlopes", "edge_motion", "linearise_corners"]
 

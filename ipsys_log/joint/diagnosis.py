@@ -11,6 +11,7 @@ from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.trajectories import Kind
+from ipsys_log.units import MM_PER_M
 
 __all__ = ["Finding", "Reading", "find_faults", "standardise_readings"]
 
@@ -20,7 +21,6 @@ Array = NDArray[np.float64]
 _WRONG = 4.5
 # A tape reading that fits the place of another point this well was swapped with it.
 _SAME_PLACE_M = 0.03
-_MM_PER_M = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ def _wrong_readings(fit: JointFit) -> list[Finding]:
             continue
         tape = [reading for reading in readings if reading.kind == "distance"]
         if len(tape) > 1:
-            largest_mm = max(abs(reading.residual_m) for reading in tape) * _MM_PER_M
+            largest_mm = max(abs(reading.residual_m) for reading in tape) * MM_PER_M
             text = (
                 f"point {name}: its distances disagree with the cameras by up to {largest_mm:.0f} mm; check "
                 "the side, the id of the marker, and if the marker was moved"
@@ -174,7 +174,7 @@ def _wrong_readings(fit: JointFit) -> list[Finding]:
             findings.append(Finding("distance", name, worst.score, text))
             continue
         text = ", ".join(
-            f"{_reading_name(reading)} is {abs(reading.residual_m) * _MM_PER_M:.0f} mm too "
+            f"{_reading_name(reading)} is {abs(reading.residual_m) * MM_PER_M:.0f} mm too "
             f"{'short' if reading.residual_m > 0 else 'long'}"
             for reading in readings
         )
@@ -208,7 +208,7 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
     for number, body in enumerate(bodies):
         score = abs(float(residuals[layout.scales][number]))
         if score > _WRONG:
-            side_mm = float(np.linalg.norm(body.points_m[1] - body.points_m[0])) * _MM_PER_M
+            side_mm = body.length_m * MM_PER_M
             text = (
                 f"marker {body.name}: its side is {side_mm * scales[number]:.1f} mm, not {side_mm:.1f} mm; "
                 "measure the print, and correct the rig"
@@ -217,8 +217,8 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
         score = abs(float(residuals[layout.heights][number]))
         if score > _WRONG and body.height_m is not None:
             text = (
-                f"marker {body.name}: a robot carries it at {heights[number] * _MM_PER_M:.0f} mm, not at "
-                f"{body.height_m * _MM_PER_M:.0f} mm; correct the rig, or exchange the markers of two robots"
+                f"marker {body.name}: a robot carries it at {heights[number] * MM_PER_M:.0f} mm, not at "
+                f"{body.height_m * MM_PER_M:.0f} mm; correct the rig, or exchange the markers of two robots"
             )
             findings.append(Finding("robot_height", body.name, score, text))
     return findings
@@ -227,7 +227,7 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
 def _moved_cameras(fit: JointFit) -> list[Finding]:
     findings = []
     for motion in find_moved_cameras(fit):
-        shift_mm = float(np.linalg.norm(motion.shift_m)) * _MM_PER_M
+        shift_mm = float(np.linalg.norm(motion.shift_m)) * MM_PER_M
         text = (
             f"camera {motion.camera}: it was moved after about {motion.time_s:.0f} s, by {shift_mm:.0f} mm "
             f"and {np.degrees(motion.turn_rad):.2f} degrees; calibrate with the observations before or after"

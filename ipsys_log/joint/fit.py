@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
 from ipsys_log.joint.floor_unevenness import most_likely_scale
 from ipsys_log.joint.observations import Observations
@@ -16,7 +17,6 @@ from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
 from ipsys_log.joint.problem import Problem
 from ipsys_log.joint.refusals import check_observations, check_spread
-from ipsys_log.joint.rotations import level_turns
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import SHORT, Solution, solve

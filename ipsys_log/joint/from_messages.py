@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.geometry.trilateration import ON_REFERENCE_SIGMA_M, multilaterate
+from ipsys_log.geometry.trilateration import ON_REFERENCE_SIGMA_M, USUAL_TAPE_SIGMA_M, multilaterate
 from ipsys_log.joint.observations import (
     Body,
     CalibrationPoint,
@@ -27,7 +27,6 @@ __all__ = ["gather_observations"]
 
 Array = NDArray[np.float64]
 
-_USUAL_TAPE_M = 0.003
 _USUAL_RULER_M = 0.001
 # A marker that lies on the floor needs no ruler. This is the thickness of its paper.
 _ON_FLOOR_M = 0.0003
@@ -162,7 +161,7 @@ def _body(rig: Rig, marker_id: int, settings: JointSettings) -> Body:
 
 def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
     known = {point.name: (point.x_m, point.y_m) for point in rig.reference_points}
-    usual_m = rig.tape_sigma_m or _USUAL_TAPE_M
+    usual_m = rig.tape_sigma_m or USUAL_TAPE_SIGMA_M
     entered = measurement.point
     distances = measurement.distances
     unknown = [d.reference for d in distances if d.reference not in known]

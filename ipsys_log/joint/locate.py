@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import undistort
+from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.rotations import level_turns
 
 __all__ = ["Positions", "locate_markers"]
 

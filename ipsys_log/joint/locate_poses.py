@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import pixel_slopes
+from ipsys_log.geometry.rotations import rotate
 from ipsys_log.geometry.square_pose import fit_squares
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.rotations import rotate
 
 __all__ = ["Poses", "locate_poses"]
 

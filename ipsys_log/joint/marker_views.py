@@ -46,7 +46,7 @@ def view_markers(sightings: Sightings, bodies: tuple[Body, ...], lens: CameraCal
     count = len(sightings)
     uv = undistort(sightings.pixels.reshape(-1, 2), lens).reshape(count, 4, 2)
     valid = np.isfinite(uv).all(axis=(1, 2))
-    sides_m = np.array([np.linalg.norm(body.points_m[1] - body.points_m[0]) for body in bodies])
+    sides_m = np.array([body.length_m for body in bodies])
     rotations = np.full((count, 2, 3, 3), np.nan)
     centres_m = np.full((count, 2, 3), np.nan)
     rotations[valid], centres_m[valid] = solve_squares(uv[valid], sides_m[sightings.body[valid]])

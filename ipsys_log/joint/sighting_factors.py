@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.lens_models import project_points, project_with_slopes
+from ipsys_log.geometry.rotations import cross
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.observations import Body, Sightings
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.robust import limit_of, robust_loss
-from ipsys_log.joint.rotations import cross
 from ipsys_log.joint.trajectories import Kind, Placement, Trajectories
 
 __all__ = ["SightingFactors", "Slopes", "WeightedRows", "make_sighting_factors"]

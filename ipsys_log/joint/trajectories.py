@@ -8,10 +8,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.geometry.rotations import left_jacobians, level_turns, rotate
 from ipsys_log.joint.floor_field import spline_weights
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.parameters import Layout, State
-from ipsys_log.joint.rotations import left_jacobians, level_turns, rotate
 
 __all__ = ["Kind", "Paths", "Placement", "Trajectories"]
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import intersect_height
+from ipsys_log.geometry.rotations import skew_matrices
 
 __all__ = ["CalibrationPoints", "CameraRays", "directions", "fit_rays", "group_cameras"]
 
@@ -169,27 +170,23 @@ def _slopes(places: CalibrationPoints, camera_rays: CameraRays, turn: Array) -> 
     on_plane[:, 0, 0] = on_plane[:, 1, 1] = 1.0
     on_plane[:, :, 2] = -rays[:, :2] / rays[:, 2:]
     by_ray = along[:, None, None] * on_plane
-    by_turn = -by_ray @ _cross(rays) @ _left_jacobian(turn)
+    by_turn = -by_ray @ skew_matrices(rays) @ _left_jacobian(turn)
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
     by_lens = by_ray @ camera_rays.rotation[:, :2] @ _lens_terms(u, v)
     return np.concatenate([by_turn, on_plane, by_lens], axis=2)
 
 
-def _cross(vectors: Array) -> Array:
-    """Return matrices (n, 3, 3) of the cross product with each vector (n, 3)."""
-    x, y, z = vectors.T
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
-
-
 def _left_jacobian(turn: Array) -> Array:
-    """Return the left Jacobian of a rotation by its rotation vector (3,) (Barfoot 2017, eq. 7.77)."""
+    """Return the left Jacobian of a rotation by its rotation vector (3,) (Barfoot 2017, eq. 7.77).
+
+    ``left_jacobians`` differs in the last bits, so rayplane would have another output with it.
+    """
     angle = float(np.linalg.norm(turn))
     if angle < 1e-8:
         return np.eye(3)
-    cross = _cross(turn[None])[0]
+    skew = skew_matrices(turn[None])[0]
     first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    jacobian: Array = np.eye(3) + first * cross + second * cross @ cross
+    jacobian: Array = np.eye(3) + first * skew + second * skew @ skew
     return jacobian
 
 

@@ -15,8 +15,9 @@ from matplotlib.ticker import MaxNLocator
 
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
-from ipsys_log.report.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.report.styles import NOTE, REST, shorten
+from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
+from ipsys_log.units import MM_PER_M
 
 __all__ = ["draw_lab"]
 
@@ -24,7 +25,6 @@ __all__ = ["draw_lab"]
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])
 _PANEL_IN, _LEFT_IN, _GAP_IN, _BOTTOM_IN, _ROW_IN = 4.0, 0.7, 0.45, 0.95, 4.75
 _MOST_COLUMNS = 3
-_MM_PER_M = 1000.0
 # Distance from the map to the walls.
 _WALL_M = 0.25
 
@@ -37,7 +37,7 @@ def draw_lab(lab: LabCalibration, path: Path) -> None:
     width_in = _LEFT_IN + columns * (_PANEL_IN + _GAP_IN) + 1.1
     height_in = _BOTTOM_IN + rows * _ROW_IN + 0.1
     figure = Figure(figsize=(width_in, height_in), dpi=100)
-    errors_mm = np.concatenate([camera.expected.errors_m for camera in shown]) * _MM_PER_M
+    errors_mm = np.concatenate([camera.expected.errors_m for camera in shown]) * MM_PER_M
     # A few nodes with large errors must not use most of the colour range.
     top_mm = float(np.quantile(errors_mm, 0.98))
     for number, camera in enumerate(shown):
@@ -53,7 +53,7 @@ def draw_lab(lab: LabCalibration, path: Path) -> None:
         (right_in / width_in, _BOTTOM_IN / height_in, 0.18 / width_in, _PANEL_IN / height_in)
     )
     figure.colorbar(shades, cax=box, extend="max", label="expected 2D error in mm")
-    title = f"Expected error over the floor: mean {lab.mean_m * _MM_PER_M:.1f} mm, "
+    title = f"Expected error over the floor: mean {lab.mean_m * MM_PER_M:.1f} mm, "
     title += f"for markers {lab.height_m * 100:.0f} cm above it"
     figure.text(_LEFT_IN / width_in, 1 - 0.28 / height_in, title, fontsize=12)
     handles, labels = axes.get_legend_handles_labels()
@@ -71,7 +71,7 @@ def draw_lab(lab: LabCalibration, path: Path) -> None:
 def _draw_camera(axes: Axes, lab: LabCalibration, camera: CameraResult, top_mm: float) -> AxesImage:
     grid, half_m = lab.grid, lab.grid.step_m / 2
     map_mm = np.full(len(camera.expected.seen), np.nan)
-    map_mm[camera.expected.seen] = camera.expected.errors_m * _MM_PER_M
+    map_mm[camera.expected.seen] = camera.expected.errors_m * MM_PER_M
     (left, right), (low, high) = ((m[0] - half_m, m[-1] + half_m) for m in (grid.xs_m, grid.ys_m))
     shades = axes.imshow(
         map_mm.reshape(len(grid.ys_m), len(grid.xs_m)), cmap=_HEAT, vmin=0, vmax=top_mm, origin="lower",
@@ -94,7 +94,7 @@ def _draw_camera(axes: Axes, lab: LabCalibration, camera: CameraResult, top_mm: 
         axes.annotate(
             point.name, (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold", zorder=6
         )
-    mean, covered = f"{camera.mean_m * _MM_PER_M:.1f}", f"{camera.covered:.0%}"
+    mean, covered = f"{camera.mean_m * MM_PER_M:.1f}", f"{camera.covered:.0%}"
     axes.set_title(f"{shorten(camera.camera)}: {mean} mm, {covered} covered", loc="left", fontsize=11)
     axes.set(xlim=(x0 - half_m, x1 + half_m), ylim=(y0 - half_m, y1 + half_m), xlabel="x in m")
     for axis in (axes.xaxis, axes.yaxis):

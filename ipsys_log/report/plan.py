@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, plan_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
-from ipsys_log.geometry.trilateration import are_collinear, tape_covariance
+from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, are_collinear, tape_covariance
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
@@ -33,9 +33,9 @@ _RADIUS = 8 / 6 / np.sqrt(2)
 _STEP_M, _SPAN_M = 0.1, 5.0
 _AROUND_M = 0.5
 _MOST_HEIGHTS = 5
-# Usual standard deviation of a tape in m. Usual noise and fit error of a camera with too few points for an
-# estimate; both are relative, as in uncertainty.py.
-_USUAL_TAPE_M, _USUAL_NOISE, _USUAL_FIT = 0.003, 3e-4, 2.5e-3
+# Usual noise and fit error of a camera with too few points for an estimate; both are relative, as in
+# uncertainty.py.
+_USUAL_NOISE, _USUAL_FIT = 3e-4, 2.5e-3
 _LITTLE = 0.05
 # The leverage has this many terms. With fewer points, it has no upper bound.
 _LEAST_PLACES = 6
@@ -197,7 +197,7 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
     known_m = _references(rig)
     payloads = session.payloads(session.topics(MEASUREMENTS)) if rig.tape_sigma_m is None else []
     named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
-    sigma_m = rig.tape_sigma_m or float(np.median(named_m or _USUAL_TAPE_M))
+    sigma_m = rig.tape_sigma_m or float(np.median(named_m or USUAL_TAPE_SIGMA_M))
 
     def variances(world_m: Array) -> Array:
         if len(known_m) < 2:

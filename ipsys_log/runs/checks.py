@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.geometry.lenses import check_calibration, check_size
-from ipsys_log.images.decode import decode_grey
+from ipsys_log.images.decode import frame_size
 from ipsys_log.images.video import Video
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
@@ -240,7 +240,7 @@ def image_sizes(session: Session) -> dict[str, tuple[int, int]]:
 
 
 def _first_size_px(session: Session, topic: str) -> tuple[int, int] | None:
-    """Return width and height of the first frame that can be decoded; None if the first frames cannot be."""
+    """Return width and height of the first valid frame; None if the first frames are damaged."""
     video: Video | None = None
     for message in islice(session.messages([topic]), _CHECKED_MESSAGES):
         frame = message.payload
@@ -249,6 +249,5 @@ def _first_size_px(session: Session, topic: str) -> tuple[int, int] | None:
                 video = video or Video(frame.format)
                 frame = video(frame)
             if frame is not None:
-                height, width = decode_grey(frame).shape
-                return width, height
+                return frame_size(frame)
     return None

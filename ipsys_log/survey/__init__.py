@@ -1,1 +1,1 @@
-"""Calibration points: entry and checks of tape measurements, in finished logs and with live cameras."""
+"""Calibration points from logs and live cameras: entry, checks, and the result of a joint calibration."""

@@ -14,10 +14,11 @@ from ipsys_log.analysis.tape import (
     TapePoint,
     find_weak_points,
     reference_points,
+    with_usual_tape,
     world_point,
 )
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import SIDES, are_collinear
+from ipsys_log.geometry.trilateration import SIDES, USUAL_TAPE_SIGMA_M, are_collinear
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.survey.scene import Prediction
 from ipsys_log.units import CM_PER_M
@@ -29,15 +30,12 @@ __all__ = [
     "warn_floor",
     "warn_model",
     "warn_tapes",
-    "with_tape",
 ]
 
 Array = NDArray[np.float64]
 
 # The name of a model from a log, in a warning.
 MODEL_NAME = "the model"
-# Standard deviation of a tape if the rig gives none. It only serves to estimate the precision of a point.
-_USUAL_TAPE_M = 0.003
 # A residual of a distance above this value, and above three sigmas, is a reading error.
 _MISFIT_M = 0.01
 _OUTSIDE_M = 0.02
@@ -47,11 +45,6 @@ _ASTRAY_M, _ASTRAY_OUTSIDE_M = 0.05, 0.15
 _SIGMAS = 4.0
 # A smaller correction is given in mm.
 _FINE_M = 0.02
-
-
-def with_tape(rig: Rig) -> Rig:
-    """Return the rig; if it gives no standard deviation of the tape, with the usual value."""
-    return replace(rig, tape_sigma_m=_USUAL_TAPE_M) if rig.tape_sigma_m is None else rig
 
 
 def _outside_m(point_m: Array, rig: Rig) -> float:
@@ -81,7 +74,7 @@ def warn_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | No
 
 def warn_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
     """Return a warning if the distances of a measurement contradict one another."""
-    sigma_m = with_tape(rig).tape_sigma_m or _USUAL_TAPE_M
+    sigma_m = rig.tape_sigma_m or USUAL_TAPE_SIGMA_M
     worst = int(np.abs(fixed.residuals_m).argmax())
     off_m = float(abs(fixed.residuals_m[worst]))
     if len(read.distances) > 2 and off_m > max(_MISFIT_M, 3 * sigma_m):
@@ -95,7 +88,7 @@ def warn_crossing(read: Measurement, rig: Rig) -> list[str]:
         f"{_tapes(read)}: the tapes cross at only {flat.angle_deg:.0f} degrees, so the standard deviation of "
         f"the point is {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; use another point or a third "
         "reference point"
-        for flat in find_weak_points([RiggedMeasurement(read, with_tape(rig))])
+        for flat in find_weak_points([RiggedMeasurement(read, with_usual_tape(rig))])
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.pairs import active_measurements
-from ipsys_log.analysis.tape import TapePoint, is_on_reference, reference_points, world_point
+from ipsys_log.analysis.tape import TapePoint, is_on_reference, reference_points, with_usual_tape, world_point
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
 from ipsys_log.messages import Measurement, Model, Rig
@@ -21,7 +21,6 @@ from ipsys_log.survey.blunders import (
     warn_floor,
     warn_model,
     warn_tapes,
-    with_tape,
 )
 from ipsys_log.survey.entry import Entry, Fault
 from ipsys_log.survey.scene import MarkerObservations, Prediction, predict
@@ -128,7 +127,7 @@ def check_entry(
     try:
         # With the usual tape sigma, the covariance shows a flat crossing of the circles. The written
         # measurement has no sigma of its own.
-        fixed = world_point(read, with_tape(rig))
+        fixed = world_point(read, with_usual_tape(rig))
     except IpsysError as error:
         reason = "; ".join([_without_id(error, name), *entry.doubts])
         return EntryCheck(name, (*all_faults, Fault("", reason)))

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.cli.signals import InterruptError, interruptible
+from ipsys_log.cli.signals import InterruptError, interruptible, writes_nothing
 from ipsys_log.log.reader import LogReader
+from ipsys_log.player import Player
 from tests.conftest import ROOT, SIGNALS, Ipsys
 from tests.test_record import wait_for
 
@@ -240,3 +241,37 @@ def test_closed_terminal_ends_a_recording_whole(tmp_path: Path) -> None:
     os.waitpid(child, 0)
     with LogReader(log) as reader:
         assert reader.channels["/cameras/red/image"].message_count > 0
+
+
+@pytest.mark.usefixtures("handlers")
+def test_interrupt_of_a_reading_command_promises_no_results() -> None:
+    def command() -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    def reading() -> None:
+        command()
+
+    texts = []
+    for marked in (writes_nothing(reading), command):
+        with pytest.raises(InterruptError) as caught:
+            interruptible(marked)()
+        texts.append(caught.value.text)
+    assert texts == [
+        "interrupted; no file was changed",
+        "interrupted; complete results are kept; nothing else is changed",
+    ]
+
+
+def test_player_stopped_twice_says_that_no_file_changed(
+    ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first signal ends the playback in order; the second one interrupts the closing of the streams."""
+
+    def signals(player: Player) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Player, "wait", signals)
+    done = ipsys("stream", SAMPLE, "--topics", "/truth/tracks", "--udp", "127.0.0.1:9", "--start-paused")
+    assert done.code == 128 + signal.SIGTERM
+    assert done.err.splitlines()[-1] == "ipsys: interrupted; no file was changed"

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import FrameError, SizeError
-from ipsys_log.images.decode import decode_grey, decode_rows
+from ipsys_log.images.decode import decode_grey, decode_rows, frame_size
 from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
-from ipsys_log.messages import CompressedImage
+from ipsys_log.messages import CompressedImage, RawImage
 from ipsys_log.stages.detect.follow import MarkerTracker
 from tests.stages.drawing import VGA, Array, Look, Picture, at_px, corners_px, draw, jpeg
 
@@ -53,6 +53,38 @@ def jpegs(draw: st.DrawFn) -> bytes:
     interval = draw(st.one_of(st.just(0), st.integers(1, 40)))
     picture = colourful(width, height, draw(st.integers(0, 9)))
     return packed(picture, sampling, interval, draw(st.integers(1, 100)))
+
+
+@ENOUGH
+@given(jpegs())
+def test_frame_size_is_that_of_the_decoded_image(data: bytes) -> None:
+    height, width = decode_grey(CompressedImage(0, "a", data, "jpeg")).shape
+    assert frame_size(CompressedImage(0, "a", data, "jpeg")) == (width, height)
+
+
+def test_frame_size_of_other_images_is_that_of_the_pixels() -> None:
+    picture = colourful(90, 70, 0)
+    progressive = bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1])
+    png = bytes(cv2.imencode(".png", picture)[1])
+    raw = RawImage(0, "a", 90, 70, "bgr8", 270, picture.tobytes())
+    frames = CompressedImage(0, "a", progressive, "jpeg"), CompressedImage(0, "a", png, "png"), raw
+    assert [frame_size(frame) for frame in frames] == [(90, 70)] * 3
+
+
+def test_frame_size_needs_no_pixels_of_a_jpeg(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(simplejpeg, "decode_jpeg")
+    data = packed(colourful(150, 90, 1), "4:2:0", 0)
+    assert frame_size(CompressedImage(0, "a", data, "jpeg")) == (150, 90)
+    with pytest.raises(FrameError, match="too few for a JPEG of 10000 x 10000 px"):
+        frame_size(CompressedImage(0, "a", resized(data, 10_000), "jpeg"))
+
+
+def resized(data: bytes, size_px: int) -> bytes:
+    """Return a JPEG whose header states another size."""
+    layout = read_layout(data)
+    assert layout is not None
+    at, size = layout.height_at, size_px.to_bytes(2, "big")
+    return data[:at] + size + size + data[at + 4 :]
 
 
 ROWS = st.lists(st.tuples(st.integers(0, 200), st.integers(0, 200)), max_size=4)

@@ -13,10 +13,15 @@ import pytest
 from ipsys_log.api import load_model
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import TRUTH_TOPIC, Markers, Message, Run, Tracks
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.survey.checks import check_entry
+from ipsys_log.survey.entry import TypedEntry, parse_entry
+from ipsys_log.survey.from_log import open_finished_log
+from ipsys_log.survey.scene import observe_marker
 from tests.conftest import Ipsys
 
 HOUR_NS = 3_600_000_000_000
@@ -129,3 +134,20 @@ def test_joint_results_with_another_rig_are_verified(ipsys: Ipsys, log: Path, tm
     assert ipsys("replay", log, "--model", "joint", "--rig", rig).code == 0
     verified = ipsys("verify", log)
     assert verified.code == 0, verified.out + verified.err
+
+
+def test_points_are_measured_beside_a_joint_model(ipsys: Ipsys, log: Path) -> None:
+    """The joint model cannot predict from camera points: a point is checked without it, and saved."""
+    assert ipsys("fit", log, "--model", "joint").code == 0
+    with open_finished_log(log, Request()) as scene:
+        assert scene.model is not None
+        assert scene.model.name == "joint"
+        interval = scene.intervals[0]
+        sight = observe_marker(scene.views(0), interval.marker_id)
+        assert sight.points_m
+        typed = TypedEntry(str(interval.marker_id), {"A": "250", "B": "250"}, "left", "10")
+        checked = check_entry(*parse_entry(typed, scene.rig), scene.rig, sight, (), scene.model)
+        assert checked.measurement is not None, checked.faults
+        before = len(scene.history())
+        scene.add([checked.measurement])
+        assert len(scene.history()) == before + 1

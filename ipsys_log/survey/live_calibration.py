@@ -13,8 +13,8 @@ from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.report.lab_calibration import LabCalibration, describe_fit
-from ipsys_log.units import NS_PER_S
+from ipsys_log.survey.lab_calibration import LabCalibration, describe_fit
+from ipsys_log.units import MM_PER_M, NS_PER_S
 
 __all__ = ["LiveCalibration"]
 
@@ -22,13 +22,13 @@ __all__ = ["LiveCalibration"]
 _STEP_NS = NS_PER_S // 5
 # Cells of an image, along its width and height, for the coverage before the first fit.
 _CELLS = 8, 5
-_MM_PER_M = 1000.0
 
 
 class LiveCalibration:
     """A consumer of a recording that fits the lab again every few seconds, in its own thread.
 
-    An error of a fit is text for the user. It cannot end the recording.
+    An error of a fit is text for the user. It cannot end the recording. A bug is raised by a later
+    message, or by ``close``.
 
     Parameters
     ----------
@@ -71,14 +71,19 @@ class LiveCalibration:
             self._add(camera, payload)
         self._next_ns = self._next_ns or message.log_time_ns + self._every_ns
         if message.log_time_ns >= self._next_ns and (self._fitting is None or self._fitting.done()):
-            if self._fitting is not None:
-                self._fitting.result()  # raises a bug of the fit
+            self._raise_bug()
             self._next_ns = message.log_time_ns + self._every_ns
             self._fitting = self._worker.submit(self._report)
 
     def close(self) -> None:
         """Wait for the fit that works, and start no other."""
         self._worker.shutdown(cancel_futures=True)
+        self._raise_bug()
+
+    def _raise_bug(self) -> None:
+        """Raise the exception of the last fit, which is a bug: other errors of a fit are lines."""
+        if self._fitting is not None and not self._fitting.cancelled():
+            self._fitting.result()
 
     def _add(self, camera: str, markers: Markers) -> None:
         kept = self._markers[camera]
@@ -112,7 +117,7 @@ class LiveCalibration:
 
 def _line(lab: LabCalibration) -> str:
     """Return the expected error of each camera, and the next step, on one line."""
-    errors = ", ".join(f"{one.camera} {one.mean_m * _MM_PER_M:.1f}" for one in lab.cameras)
+    errors = ", ".join(f"{one.camera} {one.mean_m * MM_PER_M:.1f}" for one in lab.cameras)
     text = f"expected mean error in mm: {errors}"
     if lab.causes:
         return f"{text}; {lab.causes[0].text}"
@@ -126,4 +131,4 @@ def _line(lab: LabCalibration) -> str:
     if lab.points:
         x_cm, y_cm = (100 * lab.points[0].point_m).round().astype(int).tolist()
         return f"{text}; tape a point near x {x_cm}, y {y_cm} cm"
-    return f"{text}; the goal is {lab.goal_m * _MM_PER_M:g} mm: drive longer"
+    return f"{text}; the goal is {lab.goal_m * MM_PER_M:g} mm: drive longer"

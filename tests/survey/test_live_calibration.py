@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 from dataclasses import replace
 
+import pytest
+
 from ipsys_log.messages import Markers, Measurement, Message, Rig
-from ipsys_log.report.live_calibration import LiveCalibration
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.survey.live_calibration import LiveCalibration
 
 LAB = build_lab(GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=12.0, seed=3), points=6))
 
@@ -65,3 +68,22 @@ def test_an_impossible_fit_is_a_line() -> None:
     lines, live = lines_of([apart(message) for message in simulate_session(LAB)], rig)
     assert live.lab is None
     assert lines[-1].startswith("no fit yet: camera black")
+
+
+@pytest.mark.parametrize("at", ["message", "close"])
+def test_bug_of_a_live_fit_is_raised(monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+    """A bug in the thread of the fit is no line of text, and is not lost, also if it is in the last fit."""
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("ipsys_log.survey.live_calibration.fit_without", fail)
+    lines: list[str] = []
+    live = LiveCalibration(geometric_rig(LAB), LAB.calibrations, 0.05, lines.append, every_s=4.0)
+    messages = iter(list(simulate_session(LAB)))
+    while live._fitting is None or live._fitting.exception() is None:
+        live(next(messages))
+    finish = live.close if at == "close" else lambda: deque(map(live, messages))
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        finish()
+    assert not any("no fit yet" in line for line in lines)

@@ -21,7 +21,7 @@ from ipsys_log.analysis.expected_error import (
 )
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import tape_covariance
+from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, tape_covariance
 from ipsys_log.joint.diagnosis import Finding, find_faults
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.locate import locate_markers
@@ -41,7 +41,6 @@ Array = NDArray[np.float64]
 _AROUND_M = 0.5
 # Distance between possible points, in m; larger on a large floor.
 _STEP_M, _SPAN_M = 0.4, 10.0
-_USUAL_TAPE_M = 0.003
 _MOST_POINTS = 4
 # A gap is worth a drive if its mean expected error exceeds the goal, and this multiple of the camera's mean.
 _WORSE = 1.1
@@ -352,11 +351,11 @@ def _candidates(rig: Rig, low_m: Array, high_m: Array, step_m: float) -> Array:
 
 def _tape(rig: Rig) -> TapeCovariances:
     known_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points]).reshape(-1, 2)
-    sigmas_m = np.full(len(known_m), rig.tape_sigma_m or _USUAL_TAPE_M)
+    sigmas_m = np.full(len(known_m), rig.tape_sigma_m or USUAL_TAPE_SIGMA_M)
 
     def covariances(points_m: Array) -> Array:
         if len(known_m) < 2:
-            return np.broadcast_to(_USUAL_TAPE_M**2 * np.eye(2), (len(points_m), 2, 2))
+            return np.broadcast_to(USUAL_TAPE_SIGMA_M**2 * np.eye(2), (len(points_m), 2, 2))
         return np.array([tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m])
 
     return covariances

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-__all__ = ["cross", "left_jacobians", "level_turns", "rotate"]
+__all__ = ["cross", "left_jacobians", "level_turns", "rotate", "skew_matrices"]
 
 Array = NDArray[np.float64]
 
 
 def rotate(vectors_rad: Array) -> Array:
     """Return rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    # Late: most commands rotate nothing, and scipy takes long to load.
+    from scipy.spatial.transform import Rotation
+
     if not len(vectors_rad):
         return np.zeros((0, 3, 3))
     return np.asarray(Rotation.from_rotvec(vectors_rad).as_matrix(), dtype=np.float64)
@@ -41,6 +43,15 @@ def cross(first: Array, second: Array) -> Array:
     return product
 
 
+def skew_matrices(vectors: Array) -> Array:
+    """Return the matrices (n, 3, 3) of the cross product with each vector (n, 3)."""
+    skew = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -z, y, -x
+    skew[:, 1, 0], skew[:, 2, 0], skew[:, 2, 1] = z, -y, x
+    return skew
+
+
 def left_jacobians(vectors_rad: Array) -> Array:
     """Return matrices (n, 3, 3) from a change of rotation vectors (n, 3) to the turn in fixed axes.
 
@@ -53,8 +64,5 @@ def left_jacobians(vectors_rad: Array) -> Array:
     safe = np.where(small, 1.0, angles)
     first = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
     second = np.where(small, 1 / 6, (safe - np.sin(safe)) / safe**3)
-    skew = np.zeros((len(vectors_rad), 3, 3))
-    x, y, z = vectors_rad.T
-    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -z, y, -x
-    skew[:, 1, 0], skew[:, 2, 0], skew[:, 2, 1] = z, -y, x
+    skew = skew_matrices(vectors_rad)
     return np.asarray(np.eye(3) + first[:, None, None] * skew + second[:, None, None] * skew @ skew)

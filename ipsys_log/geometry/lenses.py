@@ -227,6 +227,8 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
     (n, 2), in px of the raw image.
     """
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 3)
+    if not len(points):  # OpenCV refuses an empty array
+        return np.empty((0, 2))
     if lens.distortion_model == "kannala_brandt":
         depths = points[:, 2:]
         if not depths.all():

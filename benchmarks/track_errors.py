@@ -11,7 +11,6 @@ from track_contenders import RobotTrack
 from track_drives import SeenDrive
 
 from ipsys_log.analysis.floor_error import region_shares
-from ipsys_log.units import NS_PER_S
 
 __all__ = ["Figures", "LabErrors", "compute_lab_errors", "summarize_labs"]
 

@@ -17,6 +17,7 @@ The script prints tables, and writes JSON with -o.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 
 from results import Report, command
@@ -151,7 +152,7 @@ def _second_line(name: str, figures: Figures) -> str:
 
 
 def _cell(value: float | None, width: int, digits: int) -> str:
-    known = value is not None and value == value
+    known = value is not None and math.isfinite(value)
     return f"{value:>{width}.{digits}f}" if known else f"{'-':>{width}}"
 
 
@@ -160,7 +161,7 @@ def _add_limits(report: Report, condition: Condition, model: str, figures: Figur
         return
     fast = condition.speed_m_s >= _FAST_M_S
     for key, of_model, slow_limit, fast_limit in _WANTED:
-        if of_model == model and figures[key] == figures[key]:
+        if of_model == model and math.isfinite(figures[key]):
             title = f"{condition.name} {model}: {key}"
             limit = fast_limit if fast else slow_limit
             report.rows.append(Row(title, (figures[key],), key.rpartition("_")[2], ("<=", limit)))

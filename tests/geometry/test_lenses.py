@@ -85,6 +85,6 @@ def test_lens_equality_compares_the_distortion() -> None:
     assert not same_intrinsics(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", (0.0, *FISHEYE[1:])))
 
 
-@pytest.mark.parametrize("model, d", [("kannala_brandt", FISHEYE), ("plumb_bob", PINHOLE)])
+@pytest.mark.parametrize(("model", "d"), [("kannala_brandt", FISHEYE), ("plumb_bob", PINHOLE)])
 def test_no_point_has_no_pixel(model: str, d: tuple[float, ...]) -> None:
     assert project(np.empty((0, 3)), lens(model, d)).shape == (0, 2)

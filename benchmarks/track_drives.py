@@ -159,12 +159,12 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
     lab = replace(lab, settings=noise, drive=replace(lab.drive, mirrored=not lab.drive.mirrored))
     messages = list(simulate_session(lab))
     # The time of the joint model is that of its first camera.
-    first = next(iter(lab.clock_offsets_ns.values()))
+    late_ns = lab.clock_offsets_ns[model.cameras[0].camera] if model.name == JOINT else 0
     return SeenDrive(
         model,
         next(message.payload for message in messages if isinstance(message.payload, Rig)),
         tuple(_located(messages, model)),
-        Truth(lab, first if model.name == JOINT else 0),
+        Truth(lab, late_ns),
         {camera.name: camera.origin_m[:2] for camera in lab.cameras},
     )
 

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
     ("errors", "interrupts"), ("units", "plain_text", "extras"), ("messages",), ("geometry", "rig"),
-    ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("stages",), ("runs",),
+    ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("tracking",), ("stages",), ("runs",),
     ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",),
     ("tracker",), ("player",), ("opened_log",), ("api",), ("report",), ("web",), ("cli",), ("__main__", "__init__"),
 )  # fmt: skip

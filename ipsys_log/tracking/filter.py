@@ -65,8 +65,9 @@ def start(sightings: Sightings, noise: MotionNoise) -> States:
     means[:, POSE] = sightings.poses
     modes = sightings.sensitivities
     covariances[:, POSE, POSE] = sightings.noise + modes @ modes.swapaxes(1, 2)
-    covariances[:, POSE, MOTION:] = modes
-    covariances[:, MOTION:, POSE] = modes.swapaxes(1, 2)
+    # A sighting is the pose plus the errors, so that the pose is the sighting minus the errors.
+    covariances[:, POSE, MOTION:] = -modes
+    covariances[:, MOTION:, POSE] = -modes.swapaxes(1, 2)
     unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
     covariances[unknown, 3, 3] = _START_HEADING_RAD2
     rates = [noise.start_m_s**2, noise.start_m_s**2, noise.climb_m_s2**2, noise.start_rad_s**2]

@@ -13,7 +13,7 @@ from ipsys_log.analysis.floor_error import KnownSightings, Locator, grid_nodes, 
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.poses import transform
-from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import build_models
@@ -44,6 +44,7 @@ __all__ = [
     "Scene",
     "Session",
     "driving_robots",
+    "fit_session",
     "held_out_points",
     "make_session",
     "nodes_of",
@@ -268,7 +269,8 @@ def _by_table(name: str) -> Callable[[Session], Locator]:
     return calibrate
 
 
-def _joint(session: Session) -> Locator:
+def fit_session(session: Session) -> JointFit:
+    """Return the joint fit of a session: of its points for training, and its drive."""
     lab, lenses = session.lab, session.lab.calibrations
     payloads = [message.payload for message in session.messages]
     markers = {
@@ -277,7 +279,11 @@ def _joint(session: Session) -> Locator:
     }
     measured = [one for one in payloads if isinstance(one, Measurement) and "train" in one.splits]
     nominal = list(lenses) if lab.settings.intrinsics == "nominal" else []
-    models = build_models(fit_jointly(gather_observations(session.rig, lenses, markers, measured, nominal)))
+    return fit_jointly(gather_observations(session.rig, lenses, markers, measured, nominal))
+
+
+def _joint(session: Session) -> Locator:
+    lab, models = session.lab, build_models(fit_session(session))
 
     def locator(
         camera: str, corners_px: Array, heights_m: Array, covariances_px2: Array | None = None

@@ -27,6 +27,7 @@ BENCHMARKS = {
     "table": "a channel as a table, beside decoding its messages",
     "startup": "ipsys --help and ipsys info",
     "joint": "error over the floor of calibrations, in simulated labs",
+    "tracks": "error of the tracks of driving robots, in simulated labs",
 }
 
 

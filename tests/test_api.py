@@ -85,7 +85,7 @@ def test_log_lists_cameras_runs_and_channels(replayed: Path) -> None:
 
 
 def test_text_in_html_is_escaped() -> None:
-    from ipsys_log.api import Listing, _RunRow
+    from ipsys_log.opened_log import Listing, _RunRow
 
     listing = Listing([_RunRow("<script>", "detect", "current", ())])
     assert "<script>" not in listing._repr_html_()

@@ -13,9 +13,9 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 LAYERS = (
     ("errors", "interrupts"), ("units", "plain_text", "extras", "atomic_files"), ("messages",),
     ("geometry", "rig"), ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",),
-    ("stages",), ("runs",), ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",),
-    ("survey",), ("tracker",), ("player",), ("api",), ("report",), ("web",), ("cli",),
-    ("__main__", "__init__"),
+    ("tracking",), ("stages",), ("runs",), ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",),
+    ("restore",), ("survey",), ("tracker",), ("player",), ("opened_log",), ("api",), ("report",), ("web",),
+    ("cli",), ("__main__", "__init__"),
 )  # fmt: skip
 LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
 

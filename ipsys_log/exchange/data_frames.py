@@ -23,6 +23,7 @@ from ipsys_log.messages.channels import (
     MARKERS,
     MEASUREMENTS,
     POSITIONS,
+    SMOOTHED_TRACKS,
     TRACKS,
     TRUTH,
     Channel,
@@ -39,6 +40,7 @@ _CORNERS = [f"{axis}{corner}_px" for corner in range(4) for axis in "xy"]
 _BATCH = 1 << 16  # number of messages that are read at once: a larger batch takes memory, and is no faster
 
 _POINT = ("id", "x_m", "y_m", "z_m", "heading_rad", "covariance_m2")
+_TRACK = ("robot", *_POINT, "cameras", "inside")
 
 
 class _Table(NamedTuple):
@@ -53,7 +55,8 @@ _ITEMS = {
     "markers": _Table(MARKERS, Markers, ("id", "corners_px", "time_offset_ns", "edge_offset_px")),
     "camera_points": _Table(CAMERA_POINTS, CameraPoints, (*_POINT, "time_offset_ns")),
     "positions": _Table(POSITIONS, Positions, (*_POINT, "inside", "time_offset_ns")),
-    "tracks": _Table(TRACKS, Tracks, ("robot", *_POINT, "cameras", "inside")),
+    "tracks": _Table(TRACKS, Tracks, _TRACK),
+    "smoothed_tracks": _Table(SMOOTHED_TRACKS, Tracks, _TRACK),
     "truth": _Table(TRUTH, Tracks, ("robot", *_POINT)),
 }
 TABLES = (*_ITEMS, "measurements", "events", "latency")

@@ -31,6 +31,8 @@ class Positions:
     chi2 : (n,), squared residuals in units of the noise, with five degrees of freedom.
     modes_m : (n, 3, m), errors of the points by the modes of the calibration. The covariance of two points
         by their calibration is the product of their modes.
+    noise_m2 : (n, 3, 3), the part of the covariances by the noise of the corners and the tilt.
+    heading_noise_rad : (n,), standard deviation of the headings by the same noise.
     """
 
     points_m: Array
@@ -38,6 +40,8 @@ class Positions:
     covariances_m2: Array
     chi2: Array
     modes_m: Array
+    noise_m2: Array
+    heading_noise_rad: Array
 
 
 def locate_markers(
@@ -96,12 +100,13 @@ def locate_markers(
     flat = model.modes.shape[0] - floor_modes.shape[1]
     modes_m = -(gains @ now.by_camera) @ model.modes[:flat]
     modes_m += by_height * (floor_modes @ model.modes[flat:])[:, None]
-    covariances = lift @ spread[:, :2, :2] @ lift.swapaxes(1, 2) + modes_m @ modes_m.swapaxes(1, 2)
+    noise_m2 = lift @ spread[:, :2, :2] @ lift.swapaxes(1, 2)
+    covariances = noise_m2 + modes_m @ modes_m.swapaxes(1, 2)
     by_height = by_height * np.reshape(height_sigmas_m, (-1, 1, 1))
     covariances += by_height @ by_height.swapaxes(1, 2)
     headings_rad = (headings_rad - change[:, 2] + np.pi) % (2 * np.pi) - np.pi
     chi2 = (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0]
-    return Positions(points_m, headings_rad, covariances, chi2, modes_m)
+    return Positions(points_m, headings_rad, covariances, chi2, modes_m, noise_m2, np.sqrt(spread[:, 2, 2]))
 
 
 def _start(

@@ -41,6 +41,7 @@ __all__ = [
     "RIG",
     "RIG_TOPIC",
     "RUN_EVENTS",
+    "SMOOTHED_TRACKS",
     "TRACKS",
     "TRUTH",
     "TRUTH_TOPIC",
@@ -113,13 +114,15 @@ MODEL = Channel(name="model", topic="/runs/{run}/model", payloads=(Model,))
 EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads=(Evaluation,))
 POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positions", payloads=(Positions,))
 TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
+SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
 POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransforms,))
 # The only channel that several stages of a run write.
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
 
 CHANNELS: tuple[Channel, ...] = (
     *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH),
-    *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES, RUN_EVENTS),
+    *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
+    *(SMOOTHED_TRACKS, RUN_EVENTS),
 )
 
 RIG_TOPIC = RIG.topic

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from ipsys_log.messages.channels import MODEL, Channel
 from ipsys_log.messages.message import Message
 from ipsys_log.messages.rig import CameraCalibration, Rig
 
-__all__ = ["Plan", "Progress", "Stage", "StageView", "Step", "model_read"]
+__all__ = ["Plan", "Progress", "Stage", "StageView", "Step", "Timed", "model_read"]
 
 # A step turns a message into payloads; it is called with the messages in log order.
 Step = Callable[[Message], Iterable[Any]]
@@ -55,6 +55,13 @@ class StageView(Protocol):
         """Yield the complete runs with a channel, newest first, each with its last payload."""
 
 
+class Timed(NamedTuple):
+    """A payload of a stage that needs the whole log, with the log time of the message that it belongs to."""
+
+    log_time_ns: int
+    payload: Any
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """The plan of one run of a stage: everything on which its result depends.
@@ -65,7 +72,7 @@ class Plan:
     parameters : the parameters on which the result depends, as in the record of the run.
     reads : the channels of the row that a run with these parameters reads.
     step : makes the step of a causal stage for a run of a given name; or
-    compute : returns the one payload of a stage that needs the whole log.
+    compute : returns the payload of a stage that needs the whole log, or a list of :class:`Timed` payloads.
     notes : remarks for the user; ``compute`` may add some.
     """
 

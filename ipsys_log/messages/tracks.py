@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ipsys_log.messages.message import Mat33, TimeNs
+from ipsys_log.messages.message import Mat33, TimeNs, Vec3
 
 __all__ = [
     "FrameTransform",
@@ -23,6 +23,8 @@ class Position:
     """The world position of a marker by one camera.
 
     ``inside`` tells whether it lies in the volume of the calibration points; None if this is unknown.
+    ``noise_m2`` is the part of ``covariance_m2`` that is new in each frame, without the errors of the
+    calibration. ``heading_noise_rad`` is the same part of the heading, as a standard deviation.
     """
 
     id: int
@@ -33,6 +35,8 @@ class Position:
     covariance_m2: Mat33 | None = None
     inside: bool | None = None
     time_offset_ns: int | None = None
+    noise_m2: Mat33 | None = None
+    heading_noise_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +47,11 @@ class Positions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """The world position of a robot from all cameras that saw it."""
+    """The pose of a robot at one instant, from all sightings up to then, and its motion.
+
+    ``cameras`` are those of the recent sightings. ``coasting_ns`` is the time since the last sighting, in a
+    pose that is predicted because no camera sees the robot; otherwise None.
+    """
 
     robot: str
     id: int
@@ -54,6 +62,12 @@ class Track:
     covariance_m2: Mat33 | None = None
     cameras: tuple[str, ...] = ()
     inside: bool | None = None
+    velocity_m_s: Vec3 | None = None
+    velocity_covariance_m2_s2: Mat33 | None = None
+    heading_sigma_rad: float | None = None
+    turn_rate_rad_s: float | None = None
+    turn_rate_sigma_rad_s: float | None = None
+    coasting_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -300,6 +300,24 @@ class AppliedModel:
             return np.broadcast_to(self._covariance_m2, (len(points_m), 3, 3))
         return None
 
+    def error_modes(
+        self, points_m: Array, heights_m: Array, height_sigmas_m: Array | None = None
+    ) -> tuple[Array, Array] | None:
+        """Return the errors of the model as modes (n, 3, k), and the other part (n, 3, 3) of the covariances.
+
+        The last mode is the error of the height; see :meth:`Uncertainty.error_modes`. A model with a constant
+        covariance has the same error everywhere. Return None if the covariances are unknown.
+        """
+        if self._uncertainty is not None:
+            return self._uncertainty.error_modes(self.predict, points_m, heights_m, height_sigmas_m)
+        if self._covariance_m2 is not None:
+            count = len(points_m)
+            root = np.linalg.cholesky(self._covariance_m2)
+            modes_m = np.zeros((count, 3, 4))
+            modes_m[:, :, :3] = root
+            return modes_m, np.zeros((count, 3, 3))
+        return None
+
     def inside(self, points_m: Array, world_m: Array, sigmas_m: Array) -> NDArray[np.bool_] | None:
         """Return a mask (n,) of the positions in the volume of the calibration points, see :class:`Volume`.
 

@@ -87,6 +87,32 @@ class Uncertainty:
         covariances: Array = slopes @ inside @ slopes.transpose(0, 2, 1) + from_height
         return covariances
 
+    def error_modes(
+        self, predict: Predict, points_m: Array, heights_m: Array, height_sigmas_m: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Return the parts of the covariances that are errors of the fit and of the height.
+
+        Parameters
+        ----------
+        predict, points_m, heights_m, height_sigmas_m : as in :meth:`covariances`.
+
+        Returns
+        -------
+        modes_m : (n, 3, 19), errors of the world points by independent standard normal numbers: 18 of the
+            fit, and that of the height. Two camera points have the same numbers, so that the product of their
+            modes is their covariance.
+        rest_m2 : (n, 3, 3), the other part of the covariances, from the noise of a camera point.
+        """
+        slopes, by_height = _slopes(predict, points_m, heights_m)
+        root = np.linalg.cholesky(self.fit + 1e-12 * np.trace(self.fit) * np.eye(3))
+        terms = leverage_terms(points_m) @ np.linalg.cholesky(self._inverse)
+        of_fit = ((slopes @ root)[:, :, :, None] * terms[:, None, None, :]).reshape(len(points_m), 3, 18)
+        sigmas_m = HEIGHT_SIGMA_M if height_sigmas_m is None else height_sigmas_m[:, None]
+        modes_m = np.concatenate([of_fit, (by_height * sigmas_m)[:, :, None]], axis=2)
+        wide = _wide(points_m) ** (2 * self.growth)
+        rest_m2 = slopes @ (wide[:, None, None] * self._noise) @ slopes.transpose(0, 2, 1) + _FLOOR_M2
+        return modes_m, rest_m2
+
     @cached_property
     def _noise(self) -> Array:
         return np.diag([self.across**2, self.across**2, self.along**2])

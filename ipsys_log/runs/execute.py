@@ -26,7 +26,7 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.messages.channels import EVENTS, MODEL, RIG, Channel, channel_of
-from ipsys_log.messages.stage import Stage
+from ipsys_log.messages.stage import Stage, Timed
 from ipsys_log.rig.file import hide_passwords
 from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.options import Progress, Request
@@ -313,13 +313,15 @@ def _settings(
 
 
 def compute_messages(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
-    """Yield the messages of a task's run: of its causal stage, or one message computed from the whole log."""
+    """Yield the messages of a task's run: of its causal stage, or those computed from the whole log."""
     if task.step is None:
         assert task.compute is not None
-        payload = task.compute(partial(progress, task.stage.name))
-        log_time_ns, _ = session.last(task.topics)
-        topic = task.stage.channel_for(type(payload)).topic_of(name)
-        yield Message(topic, log_time_ns, payload.timestamp, payload)
+        computed = task.compute(partial(progress, task.stage.name))
+        # One payload, such as a model, speaks of the whole log: it belongs to the last message.
+        rows = computed if isinstance(computed, list) else [Timed(session.last(task.topics)[0], computed)]
+        for log_time_ns, payload in rows:
+            topic = task.stage.channel_for(type(payload)).topic_of(name)
+            yield Message(topic, log_time_ns, payload.timestamp, payload)
         return
     wired = wire(task.stage, name, task.inputs, task.step(name))
     written = {(channel, name) for channel in task.stage.writes}

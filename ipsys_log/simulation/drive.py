@@ -62,15 +62,31 @@ class Drive:
         (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.maximum(times_s, 0.0))
         return np.stack([x_m, y_m, np.arctan2(dy, dx)], axis=1)
 
+    def velocities_over(self, marker_id: int, times_s: Array) -> Array:
+        """Return the exact velocities of one marker at times (n,) after the start: (n, 2), in m/s."""
+        way_s = self._way_s(self.ahead_s[marker_id], np.maximum(times_s, 0.0))
+        interval = np.clip(np.searchsorted(self.times_s, way_s, side="right"), 1, len(self.times_s) - 1) - 1
+        by_way = (np.diff(self.phases_rad) / np.diff(self.times_s))[interval]
+        # The robot accelerates: its way on the path grows by this share of the time.
+        share = np.where(times_s > 0, 1 - np.exp(-np.maximum(times_s, 0.0) / _START_S), 0.0)
+        _, (dx, dy) = _figure(self._phase(way_s), self.mirrored)
+        return np.stack([dx, dy], axis=1) * (by_way * share)[:, None]
+
     def track(self, ahead_s: float, times_s: Array) -> Array:
         """Return the centres of a marker at times (n,): (n, 3) in m."""
         (x_m, y_m), _ = self._follow(ahead_s, times_s)
         return np.stack([x_m, y_m, np.full_like(x_m, self.height_m)], axis=1)
 
     def _follow(self, ahead_s: float, times_s: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        return _figure(self._phase(self._way_s(ahead_s, times_s)), self.mirrored)
+
+    def _way_s(self, ahead_s: float, times_s: Array) -> Array:
+        """Return the place on the path (n,), as the time from its start to there at full speed."""
         driven_s = times_s - _START_S * (1 - np.exp(-times_s / _START_S))
-        phase = np.interp((ahead_s + driven_s) % self.times_s[-1], self.times_s, self.phases_rad)
-        return _figure(phase, self.mirrored)
+        return np.asarray((ahead_s + driven_s) % self.times_s[-1])
+
+    def _phase(self, way_s: Array) -> Array:
+        return np.interp(way_s, self.times_s, self.phases_rad)
 
 
 def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:

@@ -35,6 +35,8 @@ Array = NDArray[np.float64]
 
 # This step is long enough for the precision of the numbers, and short enough for a curved model.
 _STEP_M = 0.01
+# A ray that falls by less than this share of its length says nothing about a height.
+_LEAST_FALL = 0.1
 
 
 class Locate:
@@ -78,12 +80,9 @@ def _positions(
     A marker whose depth contradicts its height is not inside: its position is valid at that height only.
     """
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
-    # The model maps a second point, a little along the heading: the two points give the world heading.
     angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
-    ahead = points_m + _STEP_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(len(points))], axis=1)
-    both = applied.predict(np.vstack([points_m, ahead]), np.concatenate([heights_m, heights_m]))
-    world, along = both[: len(points)], both[len(points) :] - both[: len(points)]
-    headings = np.arctan2(along[:, 1], along[:, 0]).tolist()
+    world, headings_rad = _world_poses(applied, points_m, angles, heights_m)
+    headings = headings_rad.tolist()
     covariances = applied.covariances(points_m, heights_m, height_sigmas_m)
     sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
     inside = applied.inside(points_m, world, sigmas_m)
@@ -104,6 +103,27 @@ def _positions(
         for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))
         if np.isfinite(world[n]).all()
     )
+
+
+def _world_poses(
+    applied: AppliedModel, points_m: Array, angles_rad: Array, heights_m: Array
+) -> tuple[Array, Array]:
+    """Return world points (n, 3) and headings (n,) of camera points (n, 3) with angles (n,).
+
+    The model also maps a point a little ahead, at the same depth, and the point itself a little deeper. Under
+    a tilted camera, the point ahead has another height. The vertical part of the step is removed along the
+    ray, because markers are level.
+    """
+    units = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(len(points_m))], axis=1)
+    deeper = points_m * (1 + _STEP_M / points_m[:, 2:])
+    moved = np.vstack([points_m, points_m + _STEP_M * units, deeper])
+    world, ahead, below = applied.predict(moved, np.tile(heights_m, 3)).reshape(3, -1, 3)
+    along, ray = ahead - world, below - world
+    # A model with known heights has no vertical part, and its ray has no length.
+    falls = np.abs(ray[:, 2]) > _LEAST_FALL * _STEP_M
+    share = np.where(falls, along[:, 2] / np.where(falls, ray[:, 2], 1.0), 0.0)
+    along = along - share[:, None] * ray
+    return world, np.arctan2(along[:, 1], along[:, 0])
 
 
 # Corners without a covariance have about this error.
@@ -148,6 +168,7 @@ class LocateCorners:
             np.array([self._rig.length_of(marker.id) if self._rig else 0.0 for marker in markers]),
         )
         headings_rad = located.headings_rad.tolist()
+        heading_noise_rad = located.heading_noise_rad.tolist()
         return tuple(
             Position(
                 marker.id,
@@ -158,6 +179,8 @@ class LocateCorners:
                 located.covariances_m2[n],
                 bool(located.chi2[n] < _MOST_CHI2),
                 _time_offset_ns(camera, marker),
+                located.noise_m2[n],
+                heading_noise_rad[n],
             )
             for n, (marker, (x_m, y_m, z_m)) in enumerate(
                 zip(markers, located.points_m.tolist(), strict=True)
@@ -214,7 +237,7 @@ def _rig_part(rig: Rig, model: str) -> object:
 
 STAGE = Stage(
     name="locate",
-    versions={"locate": 2},
+    versions={"locate": 3},
     reads=(RIG, MARKERS, CAMERA_POINTS, MODEL),
     writes=(POSITIONS,),
     plan=_plan,

@@ -20,16 +20,16 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages import ENTRIES
 from tests.conftest import ROOT, Ipsys, data_section
-from tests.runs import smoothing
-from tests.runs.smoothing import SMOOTHED_TRACKS
+from tests.runs import damping
+from tests.runs.damping import DAMPED_TRACKS
 
 
 @pytest.fixture
-def with_smoothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Add the stage smooth to the graph: one more row and channel."""
-    monkeypatch.setattr(channels, "CHANNELS", (*CHANNELS, SMOOTHED_TRACKS))
-    monkeypatch.setattr(graph, "STAGES", (*STAGES, smoothing.STAGE))
-    monkeypatch.setitem(graph.VERSIONS, "smooth", 1)
+def with_damping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the stage damp to the graph: one more row and channel."""
+    monkeypatch.setattr(channels, "CHANNELS", (*CHANNELS, DAMPED_TRACKS))
+    monkeypatch.setattr(graph, "STAGES", (*STAGES, damping.STAGE))
+    monkeypatch.setitem(graph.VERSIONS, "damp", 1)
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_stage_writes_a_payload_type_to_one_channel() -> None:
     ("topic", "payload", "channel"),
     [
         ("/runs/poly/tracks", Tracks, TRACKS),
-        ("/runs/poly/smoothed_tracks", Tracks, None),
+        ("/runs/poly/damped_tracks", Tracks, None),
         ("/truth/tracks", Tracks, TRUTH),
         ("/robot/truth", Tracks, TRUTH),
         ("/front/image_raw", RawImage, IMAGES),
@@ -88,35 +88,35 @@ def test_stages_until_gives_the_needed_stages() -> None:
     assert names("fuse") == names(None) == [stage.name for stage in STAGES]
 
 
-def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, log: Path, with_smoothing: None) -> None:
+def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, log: Path, with_damping: None) -> None:
     outcomes = replay([log], Request())
-    assert [(one.stage, one.run) for one in outcomes[-2:]] == [("fuse", "poly"), ("smooth", "poly")]
+    assert [(one.stage, one.run) for one in outcomes[-2:]] == [("fuse", "poly"), ("damp", "poly")]
     with Session([log]) as session:
         tracks = session.payloads(session.topics(TRACKS, "poly"))
-        smoothed = session.payloads(session.topics(SMOOTHED_TRACKS, "poly"))
+        damped = session.payloads(session.topics(DAMPED_TRACKS, "poly"))
         assert session.topics(TRACKS, "poly") == ["/runs/poly/tracks"]
-    assert len(tracks) == len(smoothed) > 0
-    assert tracks[-1].tracks[0].x_m != smoothed[-1].tracks[0].x_m
+    assert len(tracks) == len(damped) > 0
+    assert tracks[-1].tracks[0].x_m != damped[-1].tracks[0].x_m
     assert all(one.equal for one in verify([log], None, lambda stage, done, total: None))
     rows = json.loads(ipsys("runs", log, "--json").out)
-    assert {row["stage"]: row["state"] for row in rows}["smooth"] == "current"
+    assert {row["stage"]: row["state"] for row in rows}["damp"] == "current"
 
 
-def test_stage_of_one_payload_type_is_done_once(log: Path, with_smoothing: None) -> None:
+def test_stage_of_one_payload_type_is_done_once(log: Path, with_damping: None) -> None:
     replay([log], Request())
     before = data_section(log)
     assert not any(one.fresh for one in replay([log], Request()))
     assert data_section(log) == before
 
 
-def test_parameter_of_an_added_stage_makes_another_run(log: Path, with_smoothing: None) -> None:
+def test_parameter_of_an_added_stage_makes_another_run(log: Path, with_damping: None) -> None:
     replay([log], Request())
     again = replay([log], Request(parameters={"weight": "0.25"}))
-    assert [(one.stage, one.run) for one in again if one.fresh] == [("smooth", "poly_2")]
+    assert [(one.stage, one.run) for one in again if one.fresh] == [("damp", "poly_2")]
 
 
 def test_row_of_an_added_stage_does_not_change_the_others(
-    log: Path, detected_log: Path, tmp_path: Path, with_smoothing: None, monkeypatch: pytest.MonkeyPatch
+    log: Path, detected_log: Path, tmp_path: Path, with_damping: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     replay([log], Request())
     monkeypatch.undo()
@@ -127,9 +127,9 @@ def test_row_of_an_added_stage_does_not_change_the_others(
         assert [ours.hash(topic) for topic in topics] == [theirs.hash(topic) for topic in topics]
 
 
-def ipsys_with_smoothing(*arguments: object) -> str:
-    """Run ``ipsys`` with the stage smooth in its table; return its output."""
-    command = [sys.executable, "-m", "tests.runs.smoothing", *map(str, arguments)]
+def ipsys_with_damping(*arguments: object) -> str:
+    """Run ``ipsys`` with the stage damp in its table; return its output."""
+    command = [sys.executable, "-m", "tests.runs.damping", *map(str, arguments)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300)
     return done.stdout
 
@@ -139,24 +139,24 @@ def test_rows_have_the_names_of_their_entries() -> None:
 
 
 def test_added_stage_is_a_command_in_the_help() -> None:
-    *_, stage_panel, _ = ipsys_with_smoothing("--help").split("\n╭─ ")
+    *_, stage_panel, _ = ipsys_with_damping("--help").split("\n╭─ ")
     assert stage_panel.startswith("Single stages of replay")
-    assert "Smooth the tracks." in stage_panel.splitlines()[-2]
-    text = ipsys_with_smoothing("smooth", "--help")
+    assert "Damp the tracks." in stage_panel.splitlines()[-2]
+    text = ipsys_with_damping("damp", "--help")
     assert all(option in text for option in ("--weight", "--model", "--method", "--corners", "--json"))
 
 
 def test_command_of_an_added_stage_gets_its_parameters(log: Path) -> None:
     results = [
-        json.loads(ipsys_with_smoothing("smooth", log, "--json", *options))["stages"]
+        json.loads(ipsys_with_damping("damp", log, "--json", *options))["stages"]
         for options in ((), ("--weight", "0.25"), ("--weight", "0.25"))
     ]
-    assert [stages[-1]["stage"] for stages in results] == ["smooth"] * 3
+    assert [stages[-1]["stage"] for stages in results] == ["damp"] * 3
     assert [(stages[-1]["run"], stages[-1]["new"]) for stages in results] == [
         ("poly", True), ("poly_2", True), ("poly_2", False)
     ]  # fmt: skip
 
 
 def test_replay_command_runs_an_added_stage(log: Path) -> None:
-    stages = json.loads(ipsys_with_smoothing("replay", log, "--json"))["stages"]
-    assert [stage["stage"] for stage in stages] == [*(stage.name for stage in STAGES), "smooth"]
+    stages = json.loads(ipsys_with_damping("replay", log, "--json"))["stages"]
+    assert [stage["stage"] for stage in stages] == [*(stage.name for stage in STAGES), "damp"]

@@ -122,10 +122,10 @@ def test_stages_that_are_not_known_here_are_left_alone(ipsys: Ipsys, log: Path) 
 
     with Session([log]) as session:
         time_ns = session.end_ns + 1
-    run = Run(time_ns, "poly", "smooth", input_runs=("poly",), number=99)
+    run = Run(time_ns, "poly", "damp", input_runs=("poly",), number=99)
     append_messages(log, [Message("/runs/poly/record", time_ns, time_ns, run)])
-    state = "made by smooth 1, which is not known here: update ipsys"
-    assert states(ipsys, log)["poly", "smooth"]["state"] == state
+    state = "made by damp 1, which is not known here: update ipsys"
+    assert states(ipsys, log)["poly", "damp"]["state"] == state
     done = ipsys("verify", log)
     assert (done.code, state in done.err) == (0, True)
 

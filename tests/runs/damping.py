@@ -1,6 +1,6 @@
 """A stage for tests, in the form of a new stage: one file, one entry, and one channel.
 
-Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.smoothing smooth LOG``.
+Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.damping damp LOG``.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from ipsys_log.messages.channels import TRACKS, Channel
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.stages import StageEntry, StageParameter
 
-__all__ = ["ENTRY", "SMOOTHED_TRACKS", "STAGE"]
+__all__ = ["DAMPED_TRACKS", "ENTRY", "STAGE"]
 
-SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
+DAMPED_TRACKS = Channel(name="damped_tracks", topic="/runs/{run}/damped_tracks", payloads=(Tracks,))
 ENTRY = StageEntry(
-    name="smooth",
-    help="Smooth the tracks.",
+    name="damp",
+    help="Damp the tracks.",
     parameters=(StageParameter(name="weight", help="The weight of the newest pose.", metavar="W"),),
 )
 
 
-class Smooth:
+class Damp:
     """Halve the distance between a pose and the pose before it."""
 
     def __init__(self, weight: float) -> None:
@@ -35,12 +35,12 @@ class Smooth:
 
     def __call__(self, message: Message) -> Iterator[Any]:
         tracks: Tracks = message.payload
-        smoothed = []
+        damped = []
         for track in tracks.tracks:
             x_m = self._weight * track.x_m + (1 - self._weight) * self._last.get(track.robot, track.x_m)
             self._last[track.robot] = x_m
-            smoothed.append(replace(track, x_m=x_m))
-        yield replace(tracks, tracks=tuple(smoothed))
+            damped.append(replace(track, x_m=x_m))
+        yield replace(tracks, tracks=tuple(damped))
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan:
@@ -49,15 +49,15 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan:
         run=view.run(TRACKS),
         parameters={"weight": weight},
         reads=(TRACKS,),
-        step=lambda run: Smooth(float(weight)),
+        step=lambda run: Damp(float(weight)),
     )
 
 
 STAGE = Stage(
-    name="smooth",
-    versions={"smooth": 1},
+    name="damp",
+    versions={"damp": 1},
     reads=(TRACKS,),
-    writes=(SMOOTHED_TRACKS,),
+    writes=(DAMPED_TRACKS,),
     plan=_plan,
     rig_part=lambda rig, method: None,
     per_camera=False,
@@ -68,7 +68,7 @@ def _add_stage() -> None:
     """Add the stage to the tables of the program before it reads them, as its file would."""
     sys.modules[f"ipsys_log.stages.{ENTRY.module}"] = sys.modules[__name__]
     stages.ENTRIES = (*stages.ENTRIES, ENTRY)
-    channels.CHANNELS = (*channels.CHANNELS, SMOOTHED_TRACKS)
+    channels.CHANNELS = (*channels.CHANNELS, DAMPED_TRACKS)
 
 
 if __name__ == "__main__":

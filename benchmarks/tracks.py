@@ -1,0 +1,179 @@
+"""Accuracy of tracks in simulated labs whose cameras are not synchronized, against the ground truth.
+
+    python benchmarks/tracks.py --labs 20                      # every condition and calibration
+    python benchmarks/tracks.py --condition 1_m_s --models best
+    python benchmarks/tracks.py --labs 200 --models joint --contenders fuse
+
+Three robots drive through each lab, on a path that no calibration has seen. The cameras are 0, 11 and 22 ms
+out of step, and take 30 frames per second. The first 0.5 s of a track are left out.
+
+Errors are medians over labs, of the mean and the 95th percentile. ``ratio`` compares the mean with that of
+all single positions in the same drive. ``1 ms`` is the error on a grid of instants, by the rows at or before
+each instant. A step is the change of the error between two rows up to 60 ms apart. At a hand-over, the set of
+the cameras of the last 100 ms changes. Steps and velocities have 95th percentiles over all labs and robots.
+The script prints tables, and writes JSON with -o.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+
+from results import Report, command
+from rounds import Row
+from threadpoolctl import threadpool_limits
+from track_contenders import CONTENDERS
+from track_drives import CALIBRATIONS, Condition, calibrate, drive_through
+from track_errors import Figures, LabErrors, compute_lab_errors, summarize_labs
+
+from ipsys_log.errors import FitError
+
+__all__ = ["measure"]
+
+# No other part of the project uses these seeds.
+_FIRST_SEED = 3000
+_CONDITIONS = (
+    Condition("0.26_m_s", 0.26),
+    Condition("1_m_s", 1.0),
+    Condition("0.26_m_s, rolling", 0.26, rolling=True),
+    Condition("1_m_s, rolling", 1.0, rolling=True),
+    Condition("0.26_m_s, clocks", 0.26, unknown_clocks=True),
+    Condition("1_m_s, clocks", 1.0, unknown_clocks=True),
+    Condition("0.26_m_s, uneven", 0.26, floor_rms_m=0.0015),
+    Condition("1_m_s, uneven", 1.0, floor_rms_m=0.0015),
+)
+# Only a joint calibration with a drive estimates clock offsets.
+_ESTIMATES_CLOCKS = "joint, drive"
+_SMOKE_S = 3.0
+# Limits of the figures, for the stage of the program: by key, calibration, and limits at 0.26 and at 1 m/s.
+_WANTED = (
+    ("mean_mm", "joint", 0.8, 0.8),
+    ("p95_mm", "joint", 1.5, 1.5),
+    ("ratio", "joint", 1.05, 1.05),
+    ("mean_mm", "joint, drive", 0.6, 0.7),
+    ("median_3d_mm", "best", 1.5, 1.9),
+    ("p95_3d_mm", "best", 2.6, 3.5),
+    ("heading_mean_deg", "joint", 0.05, 0.05),
+    ("heading_p95_deg", "joint", 0.1, 0.1),
+    ("heading_mean_deg", "best", 0.1, 0.1),
+    ("heading_p95_deg", "best", 0.25, 0.25),
+    ("heading_mean_deg", "poly", 0.2, 0.2),
+    ("heading_p95_deg", "poly", 0.5, 0.5),
+    ("hand_over_mm", "joint", 0.75, 1.7),
+    ("velocity_m_s", "joint", 0.02, 0.10),
+)
+_MEASURED = "fuse"
+_FAST_M_S = 1.0
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """Track the robots of every condition, with every calibration and contender."""
+    report = Report("tracks")
+    conditions = [one for one in _CONDITIONS if options.condition in one.name]
+    models = options.calibrations.split(";") if options.calibrations else list(CALIBRATIONS)
+    contenders = options.contenders.split(",") if options.contenders else list(CONTENDERS)
+    for names, known, kind in ((models, CALIBRATIONS, "calibration"), (contenders, CONTENDERS, "contender")):
+        if unknown := sorted(set(names) - set(known)):
+            raise SystemExit(f"no {kind} {unknown[0]!r}; there are {', '.join(known)}")
+    if options.smoke:
+        conditions, models = conditions[:1], models[:1] if options.calibrations else ["rayplane"]
+    with threadpool_limits(1):
+        for condition in conditions:
+            for model in models:
+                if not condition.unknown_clocks or model == _ESTIMATES_CLOCKS:
+                    _add(report, condition, model, _measure_labs(condition, model, contenders, options))
+    return report
+
+
+def _measure_labs(
+    condition: Condition, model: str, contenders: Sequence[str], options: argparse.Namespace
+) -> dict[str, list[LabErrors]]:
+    errors: dict[str, list[LabErrors]] = {name: [] for name in contenders}
+    for number in range(1 if options.smoke else options.drive_labs):
+        seed = _FIRST_SEED + number
+        try:
+            calibration = calibrate(condition, model, seed)
+        except FitError:
+            continue
+        drive = drive_through(condition, calibration, seed, _SMOKE_S if options.smoke else options.drive_s)
+        for name in contenders:
+            errors[name].append(compute_lab_errors(drive, CONTENDERS[name](drive)))
+    return errors
+
+
+def _add(report: Report, condition: Condition, model: str, errors: dict[str, list[LabErrors]]) -> None:
+    """Add the figures of a condition and a calibration: two tables, details, and rows with limits."""
+    figures = {name: summarize_labs(labs) for name, labs in errors.items() if labs}
+    report.details.setdefault(condition.name, {})[model] = figures
+    if not figures:
+        return
+    labs = len(next(iter(errors.values())))
+    single_mm = next(iter(figures.values()))["single_mm"]
+    report.tables.append(
+        "\n".join(
+            [
+                f"{condition.name}: {model}, {labs} labs; single cameras {single_mm:.2f} mm",
+                f"  {'in mm':<16}{'mean':>6}{'p95':>7}{'ratio':>7}{'1 ms':>7}{'p95':>7}"
+                f"{'step':>7}{'other':>7}{'m/s':>7}",
+                *(_line(name, one) for name, one in figures.items()),
+                f"  {'degrees; %':<16}{'head':>6}{'p95':>7}{'at rows':>15}{'between':>16}{'3D':>8}{'p95':>7}",
+                *(_second_line(name, one) for name, one in figures.items()),
+            ]
+        )
+    )
+    _add_limits(report, condition, model, figures.get(_MEASURED))
+
+
+_KEYS = (
+    ("mean_mm", 6, 2),
+    ("p95_mm", 7, 2),
+    ("ratio", 7, 2),
+    ("grid_mm", 7, 2),
+    ("grid_p95_mm", 7, 2),
+    ("hand_over_mm", 7, 2),
+    ("other_camera_mm", 7, 2),
+    ("velocity_m_s", 7, 3),
+)
+
+
+def _line(name: str, figures: Figures) -> str:
+    return f"  {name:<16}" + "".join(_cell(figures.get(key), width, digits) for key, width, digits in _KEYS)
+
+
+def _second_line(name: str, figures: Figures) -> str:
+    line = (
+        f"  {name:<16}" + _cell(figures["heading_mean_deg"], 6, 2) + _cell(figures["heading_p95_deg"], 7, 2)
+    )
+    for kind in ("at_rows", "between"):
+        shares = [figures.get(f"{kind}_{key}") for key in ("68", "95")]
+        line += f"{_cell(shares[0], 5, 0)}{_cell(shares[1], 4, 0)}{_cell(figures.get(f'{kind}_nees'), 6, 2)}"
+    return line + _cell(figures["median_3d_mm"], 9, 2) + _cell(figures["p95_3d_mm"], 7, 2)
+
+
+def _cell(value: float | None, width: int, digits: int) -> str:
+    known = value is not None and math.isfinite(value)
+    return f"{value:>{width}.{digits}f}" if known else f"{'-':>{width}}"
+
+
+def _add_limits(report: Report, condition: Condition, model: str, figures: Figures | None) -> None:
+    if figures is None or condition.floor_rms_m:
+        return
+    fast = condition.speed_m_s >= _FAST_M_S
+    for key, of_model, slow_limit, fast_limit in _WANTED:
+        if of_model == model and math.isfinite(figures[key]):
+            title = f"{condition.name} {model}: {key}"
+            limit = fast_limit if fast else slow_limit
+            report.rows.append(Row(title, (figures[key],), key.rpartition("_")[2], ("<=", limit)))
+
+
+def add_options(parser: argparse._ArgumentGroup) -> None:
+    parser.add_argument("--drive-labs", type=int, default=5, help="labs of each condition")
+    parser.add_argument("--drive-s", type=float, default=20.0, help="duration of a drive in s")
+    parser.add_argument("--condition", default="", help="only conditions with this in their name")
+    parser.add_argument("--calibrations", default="", help=f"of {'; '.join(CALIBRATIONS)}")
+    parser.add_argument("--contenders", default="", help=f"of {', '.join(CONTENDERS)}")
+
+
+if __name__ == "__main__":
+    command("tracks")

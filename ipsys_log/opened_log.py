@@ -1,0 +1,263 @@
+"""Opened logs: several files read as one, with their tables and the tracks of robots at any times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from html import escape
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, NamedTuple
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Message
+from ipsys_log.messages.channels import CHANNELS, Channel
+from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.states import recorded_stages
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Export", "Listing", "Log", "StrPath", "Time"]
+
+StrPath = str | PathLike[str]
+Time = int | datetime
+
+
+class Listing(tuple[NamedTuple, ...]):
+    """Rows of one kind, such as the runs of a log. It prints as a table, in notebooks too."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        if not self:
+            return "(none)"
+        rows = [self[0]._fields, *(tuple(map(_cell, row)) for row in self)]
+        widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
+        return "\n".join(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        )
+
+    def _repr_html_(self) -> str:
+        if not self:
+            return "<p>none</p>"
+        head = "".join(f"<th>{escape(name)}</th>" for name in self[0]._fields)
+        body = "".join(f"<tr>{''.join(f'<td>{escape(_cell(v))}</td>' for v in row)}</tr>" for row in self)
+        return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _cell(value: object) -> str:
+    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+class _CameraRow(NamedTuple):
+    camera: str
+    images: int
+    calibrated: bool
+
+
+class _RunRow(NamedTuple):
+    run: str
+    stage: str
+    state: str
+    inputs: tuple[str, ...]
+
+
+class _ChannelRow(NamedTuple):
+    channel: str
+    run: str | None
+    topic: str
+    messages: int
+
+
+class Export(NamedTuple):
+    """An exported file: its path, the number of its rows, and their runs."""
+
+    path: Path
+    rows: int
+    runs: tuple[str, ...]
+
+
+class Log:
+    """One or several logs, read as one: a snapshot of the time when they were opened. A context manager.
+
+    Attributes
+    ----------
+    cameras, runs, channels : the content of the logs, as small tables.
+    """
+
+    def __init__(self, *paths: StrPath) -> None:
+        if not paths:
+            raise IpsysError("no log is given; name at least one")
+        self._session = Session([Path(path) for path in paths])
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; a second call does nothing."""
+        self._session.__exit__(None, None, None)
+
+    def __repr__(self) -> str:
+        runs = len(self._session.run_names())
+        return f"<Log {self._session}: {len(self._session.images)} cameras, {runs} runs>"
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The paths of the logs."""
+        return tuple(self._session.paths)
+
+    @property
+    def cameras(self) -> Listing:
+        """The cameras: name, number of images, and whether the log has their intrinsics."""
+        session = self._session
+        names = sorted({*session.images, *session.calibrations})
+        return Listing(
+            _CameraRow(name, session.count(session.images.get(name, "")), name in session.calibrations)
+            for name in names
+        )
+
+    @property
+    def runs(self) -> Listing:
+        """The recorded stages, oldest first: run, stage, state, and the runs that they read."""
+        return Listing(
+            _RunRow(recorded.run.run, recorded.run.stage, recorded.state, recorded.run.input_runs)
+            for recorded in recorded_stages(self._session)
+        )
+
+    @property
+    def channels(self) -> Listing:
+        """The channels that have messages: name, run, topic, number of messages."""
+        session = self._session
+        rows = [
+            _ChannelRow(channel.name, run, topic, session.count(topic))
+            for channel in CHANNELS
+            for run in (sorted(session.run_names()) if channel.is_derived else [None])
+            for topic in session.topics(channel, run)
+        ]
+        return Listing(rows)
+
+    def messages(
+        self, channel: str, run: str | None = None, start: Time | None = None, end: Time | None = None
+    ) -> Iterator[Message]:
+        """Yield the decoded messages of a channel in log order.
+
+        Parameters
+        ----------
+        channel : its name, such as ``images``, ``markers`` or ``tracks``.
+        run : the run of a derived channel; None: the newest complete one.
+        start, end : log times, as an integer in ns or a datetime with a time zone; the end is not included.
+
+        Raises
+        ------
+        IpsysError
+            There is no such channel or run.
+        """
+        selected = _channel_named(channel)
+        topics = self._session.topics(selected, self._run_of(selected, run))
+        return self._session.messages(topics, _ns(start), _ns(end))
+
+    def table(
+        self,
+        name: str,
+        run: str | Sequence[str] | None = None,
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> pd.DataFrame:
+        """Read a channel as a table: one row for each marker, point, position or track.
+
+        Times are in UTC; ``time`` is the instant of the row. Missing values are NaN or NA.
+
+        Parameters
+        ----------
+        name : ``markers``, ``camera_points``, ``positions``, ``tracks``, ``truth``, ``measurements``,
+            ``events`` or ``latency``.
+        run : the run of a derived channel; None: the newest complete one; several: a column ``run`` names it.
+        start, end : as for :meth:`messages`.
+
+        Raises
+        ------
+        IpsysError
+            There is no such table or run, or pandas is not installed.
+        """
+        from ipsys_log.exchange.data_frames import TABLES, read_table
+
+        if name not in TABLES:
+            raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
+        runs = self._runs_of(_channel_named(name), run)
+        return read_table(self._session, name, runs, _ns(start), _ns(end))
+
+    def export(
+        self,
+        path: StrPath,
+        table: str = "tracks",
+        run: str | Sequence[str] | None = None,
+        robot: str | None = None,
+    ) -> Export:
+        """Write a channel to a file for other programs; the suffix of the file is its format.
+
+        Parameters
+        ----------
+        path : ``.csv`` or ``.parquet`` for the table; ``.tum`` or ``.kitti`` for the trajectory of a robot.
+        table, run : as for :meth:`table`; a trajectory has one run.
+        robot : only this robot, in a table of tracks.
+
+        Raises
+        ------
+        IpsysError
+            There is no such format, table, run or robot; a library is missing; the file is one of the
+            logs.
+        """
+        from ipsys_log.exchange.data_frames import TABLES
+        from ipsys_log.exchange.export import export_file
+
+        file = Path(path)
+        if any(file.exists() and file.samefile(log) for log in self.paths):
+            raise IpsysError(f"{file}: this is the log itself; name another file")
+        if table not in TABLES:
+            raise IpsysError(f"table {table!r} is not known; use one of {', '.join(TABLES)}")
+        runs = self._runs_of(_channel_named(table), run)
+        rows = export_file(self._session, table, runs, file, robot)
+        return Export(file, rows, tuple(name for name in runs if name is not None))
+
+    def _runs_of(self, channel: Channel, run: str | Sequence[str] | None) -> list[str | None]:
+        wanted = [run] if run is None or isinstance(run, str) else list(run)
+        return [self._run_of(channel, name) for name in wanted]
+
+    def _run_of(self, channel: Channel, run: str | None) -> str | None:
+        if not channel.is_derived:
+            if run is not None:
+                raise IpsysError(f"channel {channel.name} is recorded and belongs to no run; leave run out")
+            return None
+        name = run or newest_run(self._session, channel)
+        if name is None or not self._session.topics(channel, name):
+            known = [
+                name for name in sorted(self._session.run_names()) if self._session.topics(channel, name)
+            ]
+            which = f"run {run} has no {channel.name}" if run else f"no run has {channel.name}"
+            raise IpsysError(f"{self._session}: {which} (it is in: {', '.join(known) or 'none'})")
+        return name
+
+
+def _channel_named(name: str) -> Channel:
+    channel = next((channel for channel in CHANNELS if channel.name == name), None)
+    if channel is None:
+        raise IpsysError(f"channel {name!r} is not known; use one of {', '.join(c.name for c in CHANNELS)}")
+    return channel
+
+
+def _ns(time: Time | None) -> int | None:
+    if time is None or isinstance(time, int):
+        return time
+    if time.tzinfo is None:
+        raise IpsysError(f"{time}: has no time zone; give one, for example datetime.now(timezone.utc)")
+    whole = int(time.replace(microsecond=0).timestamp())
+    return whole * 1_000_000_000 + time.microsecond * 1_000

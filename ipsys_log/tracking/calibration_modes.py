@@ -1,0 +1,128 @@
+"""Modes of the calibration errors from a fitted model of a log."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.messages import CameraModel, Model, Rig
+from ipsys_log.models.table import AppliedModel, reads_corners
+from ipsys_log.tracking.bias_modes import BiasModes, Grid, NodeModes, reduce_modes
+
+__all__ = ["MODES", "calibration_modes"]
+
+Array = NDArray[np.float64]
+
+# The number of modes, the distance of the nodes, and their reach beyond the calibration points.
+MODES = 12
+_SPACING_M, _MARGIN_M = 0.2, 1.0
+_ROBOT_HEIGHT_M, _ROBOT_LENGTH_M = 0.1, 0.2
+# Standard deviation of a corner of detect: a weight of corners without noise.
+_USUAL_PX = 0.012
+_HEIGHT_SIGMA_M = 0.001
+# Rays that are flatter than this (cosine with the vertical) do not belong to positions.
+_FLATTEST = 0.2
+
+
+def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> BiasModes:
+    """Return the errors of a calibration as modes over the floor.
+
+    Parameters
+    ----------
+    model : a fitted model of all cameras.
+    rig : the heights and sides of the markers on robots.
+    count : the number of modes.
+
+    Returns
+    -------
+    BiasModes : without modes if the model has no covariance.
+    """
+    grid = _grid(model)
+    if grid is None:
+        return BiasModes.none()
+    heights_m = [rig.height_of(marker.id) for marker in rig.markers] if rig else []
+    known_m = [height_m for height_m in heights_m if height_m is not None]
+    usual_m = rig.marker_height_m if rig and rig.marker_height_m is not None else _ROBOT_HEIGHT_M
+    height_m = float(np.median(known_m)) if known_m else usual_m
+    if reads_corners(model.name):
+        length_m = rig.marker_length_m if rig else _ROBOT_LENGTH_M
+        nodes = {camera.camera: _joint_nodes(camera, grid, height_m, length_m) for camera in model.cameras}
+    else:
+        separate = {
+            camera.camera: _table_nodes(model.name, camera, grid, height_m) for camera in model.cameras
+        }
+        nodes = _side_by_side({name: node for name, node in separate.items() if node is not None})
+    return reduce_modes(grid, nodes, count)
+
+
+def _grid(model: Model) -> Grid | None:
+    points_m = [pair.world_m[:2] for camera in model.cameras for pair in camera.pairs]
+    if not points_m:
+        return None
+    low_m = np.min(points_m, axis=0) - _MARGIN_M
+    sizes = np.ceil((np.max(points_m, axis=0) + _MARGIN_M - low_m) / _SPACING_M).astype(int) + 1
+    return Grid(low_m, _SPACING_M, (int(sizes[0]), int(sizes[1])))
+
+
+def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, length_m: float) -> NodeModes:
+    """Return the modes of a joint model: those of level markers at the nodes, and the error of the height."""
+    # Late: scipy takes 1 s.
+    from ipsys_log.geometry.lenses import project
+    from ipsys_log.geometry.markers import marker_corners
+    from ipsys_log.joint.locate import locate_markers
+    from ipsys_log.joint.payload import restore_joint
+    from ipsys_log.joint.rotations import level_turns
+
+    model, flat_m = restore_joint(camera), grid.points_m
+    count = len(flat_m)
+    floor_m, _ = model.floor.heights(flat_m, model.amplitudes)
+    centres_m = np.column_stack([flat_m, floor_m + height_m])
+    arms_m = marker_corners(1.0) * length_m @ level_turns(np.zeros(count)).swapaxes(1, 2)
+    corners_c = (arms_m + (centres_m - model.origin_m)[:, None]) @ model.camera_from_world.T
+    steep = (corners_c[..., 2] > _FLATTEST * np.linalg.norm(corners_c, axis=2)).all(axis=1)
+    corners_px = project(corners_c.reshape(-1, 3), model.calibration).reshape(count, 4, 2)
+    variances = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (count, 8, 8))
+    lengths_m, heights_m = np.full(count, length_m), np.full(count, height_m)
+    modes_m = np.full((count, 3, model.modes.shape[1] + 1), np.nan)
+    corners_px[~steep] = corners_px[steep][:1]
+    located = locate_markers(model, corners_px, variances, heights_m, lengths_m)
+    higher = locate_markers(model, corners_px, variances, heights_m + _HEIGHT_SIGMA_M, lengths_m)
+    modes_m[steep, :, :-1] = located.modes_m[steep]
+    modes_m[steep, :, -1] = (higher.points_m - located.points_m)[steep]
+    clock = len(model.lens) + 7
+    return NodeModes(modes_m, np.zeros((count, 3, 3)), np.append(model.modes[clock], 0.0))
+
+
+def _table_nodes(name: str, camera: CameraModel, grid: Grid, height_m: float) -> NodeModes | None:
+    """Return the modes of a model of the table, at the camera points of the nodes; None if it has none."""
+    from ipsys_log.models.rigid import rigid_transform
+
+    applied = AppliedModel(name, camera)
+    fitted_m = np.array([pair.camera_m for pair in camera.pairs])
+    world_m = np.array([pair.world_m for pair in camera.pairs])
+    # The rigid transform is a few cm wrong: the sensitivities hardly change over that distance.
+    rotation, origin_m = rigid_transform(world_m, fitted_m)
+    flat_m = grid.points_m
+    points_m = np.column_stack([flat_m, np.full(len(flat_m), height_m)]) @ rotation.T + origin_m
+    steep = points_m[:, 2] > _FLATTEST * np.linalg.norm(points_m, axis=1)
+    points_m[~steep] = fitted_m[0]
+    parts = applied.error_modes(points_m, np.full(len(flat_m), height_m))
+    if parts is None:
+        return None
+    modes_m, rest_m2 = parts
+    modes_m[~steep] = np.nan
+    rest_m2[~steep] = np.nan
+    return NodeModes(modes_m, rest_m2, np.zeros(modes_m.shape[2]))
+
+
+def _side_by_side(cameras: dict[str, NodeModes]) -> dict[str, NodeModes]:
+    """Return the nodes with the amplitudes of all cameras, each camera with its own; the last one is common."""
+    counts = [node.modes_m.shape[2] - 1 for node in cameras.values()]
+    ends = np.cumsum([0, *counts])
+    joined = {}
+    for number, (name, node) in enumerate(cameras.items()):
+        modes_m = np.zeros((*node.modes_m.shape[:2], ends[-1] + 1))
+        modes_m[:, :, ends[number] : ends[number + 1]] = node.modes_m[:, :, :-1]
+        modes_m[:, :, -1] = node.modes_m[:, :, -1]
+        joined[name] = NodeModes(modes_m, node.rest_m2, np.zeros(ends[-1] + 1))
+    return joined

@@ -1,0 +1,97 @@
+"""Motion of a robot between two instants: the transition of its state, and the noise of its accelerations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ACCELERATION", "MOTION", "POSE", "RATES", "MotionNoise", "transition"]
+
+Array = NDArray[np.float64]
+
+# Columns of the state: x, y, z in m and heading in rad; their rates; the acceleration in x and y.
+POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)
+MOTION = 10
+# Gauss-Legendre nodes on 0 to 1: the integrals of the noise are exact to 1e-9 for up to 1 s.
+_NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(5))
+_NODES = _NODES + 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """The usual motion of a robot.
+
+    Attributes
+    ----------
+    acceleration_m_s2, hold_s : standard deviation of the acceleration on the floor along each axis, and its
+        correlation time.
+    turn_rad_s2, climb_m_s2 : changes of the turn rate and of the vertical speed: square root of the density
+        of white noise, as their standard deviation after one second.
+    start_m_s, start_rad_s : standard deviations of the velocity and of the turn rate of a new track.
+    """
+
+    acceleration_m_s2: float = 3.0
+    hold_s: float = 0.4
+    turn_rad_s2: float = 2.0
+    climb_m_s2: float = 0.05
+    start_m_s: float = 1.0
+    start_rad_s: float = 2.0
+
+
+def transition(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array]:
+    """Return the transitions of the state and the covariances of its noise.
+
+    The acceleration is an Ornstein-Uhlenbeck process (Singer's model), so it fades while a track coasts.
+
+    Parameters
+    ----------
+    durations_s : (k,), at least 0.
+    noise : the usual motion.
+
+    Returns
+    -------
+    transitions : (k, 10, 10).
+    covariances : (k, 10, 10).
+
+    References
+    ----------
+    Singer, IEEE Trans. AES 1970.
+    """
+    count = len(durations_s)
+    forward, spread = np.zeros((count, MOTION, MOTION)), np.zeros((count, MOTION, MOTION))
+    diagonal = np.arange(8)
+    forward[:, diagonal, diagonal] = 1.0
+    forward[:, diagonal[:4], diagonal[4:]] = durations_s[:, None]
+    by_position, by_velocity, rest = _of_acceleration(durations_s, noise.hold_s)
+    for axis in (0, 1):
+        own = 8 + axis
+        forward[:, axis, own], forward[:, 4 + axis, own], forward[:, own, own] = (
+            by_position,
+            by_velocity,
+            rest,
+        )
+        rows = np.array([axis, 4 + axis, own])
+        spread[:, rows[:, None], rows] = _acceleration_noise(durations_s, noise)
+    for axis, density in ((2, noise.climb_m_s2**2), (3, noise.turn_rad_s2**2)):
+        spread[:, axis, axis] = density * durations_s**3 / 3
+        spread[:, axis, 4 + axis] = spread[:, 4 + axis, axis] = density * durations_s**2 / 2
+        spread[:, 4 + axis, 4 + axis] = density * durations_s
+    return forward, spread
+
+
+def _of_acceleration(durations_s: Array, hold_s: float) -> tuple[Array, Array, Array]:
+    """Return the effects of a unit acceleration on position, velocity and acceleration after a duration."""
+    share = durations_s / hold_s
+    lost = -np.expm1(-share)
+    return hold_s**2 * (share - lost), hold_s * lost, 1.0 - lost
+
+
+def _acceleration_noise(durations_s: Array, noise: MotionNoise) -> Array:
+    """Return the covariance (k, 3, 3) of position, velocity and acceleration by the noise of the latter."""
+    effects = np.stack(_of_acceleration(durations_s[:, None] * _NODES, noise.hold_s), axis=1)
+    density = 2 * noise.acceleration_m_s2**2 / noise.hold_s
+    weights = (density * durations_s)[:, None] * _WEIGHTS
+    covariance: Array = (effects * weights[:, None]) @ effects.swapaxes(1, 2)
+    return covariance

@@ -36,6 +36,7 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 from tests.capture.streams import encode
+from tests.live_recordings import record_every_frame
 from tests.shared_files import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -209,6 +210,16 @@ def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         replay([lab_log], Request(), output=folder / "calibration.mcap")
 
     return make_once(tmp_path_factory, "calibration", write) / "calibration.mcap"
+
+
+@pytest.fixture(scope="session")
+def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A live recording of the small simulated session with all its results, to be copied before a change."""
+
+    def write(folder: Path) -> None:
+        record_every_frame(lab_log, calibration, folder / "live.mcap")
+
+    return make_once(tmp_path_factory, "live", write) / "live.mcap"
 
 
 def data_section(path: Path) -> bytes:

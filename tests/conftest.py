@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import gc
 import os
 import shutil
 import signal
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+import typer.main
 from hypothesis import HealthCheck, settings
 
 # As in the pipeline, and before the import of numpy: small matrices, and one process per core.
@@ -33,6 +36,7 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 from tests.capture.streams import encode
+from tests.live_recordings import record_every_frame
 from tests.shared_files import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,6 +51,16 @@ settings.register_profile("any_machine", deadline=None, suppress_health_check=[H
 settings.load_profile("any_machine")
 # a program for Debian's own Python
 collect_ignore = ["capture/rtsp_server.py"]
+
+
+# The table of commands is the same for all tests; building it takes longer than the parsing of a command.
+_build_commands = functools.cache(typer.main.get_command)
+
+
+def pytest_collection_finish() -> None:
+    """Exempt the modules and tests from the garbage collection: it took 15 % of the time of commands."""
+    gc.collect()
+    gc.freeze()
 
 
 class Done(NamedTuple):
@@ -86,6 +100,7 @@ def ipsys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
     def run(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["ipsys", *map(str, arguments)])
+        monkeypatch.setattr(typer.main, "get_command", _build_commands)
         code = 0
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
         try:
@@ -195,6 +210,16 @@ def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         replay([lab_log], Request(), output=folder / "calibration.mcap")
 
     return make_once(tmp_path_factory, "calibration", write) / "calibration.mcap"
+
+
+@pytest.fixture(scope="session")
+def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A live recording of the small simulated session with all its results, to be copied before a change."""
+
+    def write(folder: Path) -> None:
+        record_every_frame(lab_log, calibration, folder / "live.mcap")
+
+    return make_once(tmp_path_factory, "live", write) / "live.mcap"
 
 
 def data_section(path: Path) -> bytes:

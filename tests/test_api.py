@@ -24,7 +24,7 @@ from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS, TRACK
 from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.output import write_log
 from tests.conftest import ROOT
-from tests.test_live import lenses
+from tests.live_recordings import lenses
 
 RUNS = ("poly", "rigid")
 

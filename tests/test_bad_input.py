@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,25 +16,10 @@ import pytest
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Distance, Measurement, Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
-from ipsys_log.runs.output import write_log
 from ipsys_log.units import format_time
+from tests.changed_logs import rewrite
 from tests.conftest import Ipsys
 from tests.tiers import first_fast
-
-
-def rewrite(lab: Path, change: Callable[[Message], Message | None], extra: tuple[Message, ...] = ()) -> Path:
-    """Write the lab with each message changed, or removed if ``change`` returns None."""
-    path = lab.with_name("changed.mcap")
-
-    def messages() -> Iterator[Message]:
-        with Session([lab]) as session:
-            topics = [topic for reader in session.readers for topic in reader.channels]
-            changed = (change(message) for message in session.messages(topics))
-            yield from (message for message in changed if message is not None)
-        yield from extra
-
-    write_log(path, messages())
-    return path
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:

@@ -73,10 +73,10 @@ def run_without(
 
 
 @pytest.fixture
-def folder(tmp_path: Path, lab_log: Path, calibration: Path) -> Path:
-    """A folder with a rig of simulated cameras, a recording, and the model of another log."""
+def folder(tmp_path: Path, detected_log: Path, calibration: Path) -> Path:
+    """A folder with a rig of simulated cameras, a recording with markers, and the model of another log."""
     (tmp_path / "lab.toml").write_text(RIG + "".join(CAMERA.format(name) for name in ("red", "white")))
-    shutil.copy(lab_log, tmp_path / "lab.mcap")
+    shutil.copy(detected_log, tmp_path / "lab.mcap")
     shutil.copy(calibration, tmp_path / "model.mcap")
     return tmp_path
 

@@ -42,10 +42,10 @@ from ipsys_log.messages import (
     RigMarker,
 )
 from ipsys_log.rig.file import check_rig, load_rig
-from ipsys_log.runs.output import write_log
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.checks import next_id
 from ipsys_log.survey.sheet import read_sheet
+from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.log.bombs import jpeg_head
 
@@ -240,13 +240,6 @@ def test_raw_image_without_pixels_is_no_picture(size: tuple[int, int]) -> None:
             decode_grey(frame)
 
 
-def changed(lab: Path, change: Callable[[Message], Message]) -> Path:
-    with Session([lab]) as session:
-        topics = [topic for reader in session.readers for topic in reader.channels]
-        write_log(lab.with_name("changed.mcap"), map(change, list(session.messages(topics))))
-    return lab.with_name("changed.mcap")
-
-
 @pytest.mark.parametrize("length_m", [1e308, float("inf"), float("nan"), -1e308])
 def test_tape_of_any_length_is_one_line(ipsys: Ipsys, lab: Path, length_m: float) -> None:
     def longer(message: Message) -> Message:
@@ -256,7 +249,7 @@ def test_tape_of_any_length_is_one_line(ipsys: Ipsys, lab: Path, length_m: float
             return replace(message, payload=replace(payload, distances=distances))
         return message
 
-    log = changed(lab, longer)
+    log = rewrite(lab, longer)
     before = log.read_bytes()
     for command in (["fit", log], ["view", log, "--save", lab.with_name("a.rrd")]):
         done = ipsys(*command)

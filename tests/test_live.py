@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
-from itertools import zip_longest
-from math import inf
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +14,6 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
-from ipsys_log.analysis.differences import Comparison
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages
@@ -27,11 +23,8 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     FRAME_SKIPPED,
-    STAMP_UNRELIABLE,
-    CameraCalibration,
     CompressedImage,
     Evaluation,
-    Event,
     Latency,
     Markers,
     Measurement,
@@ -39,7 +32,7 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.messages.channels import CAMERA_POINTS, POSITIONS, RECORD
+from ipsys_log.messages.channels import CAMERA_POINTS, RECORD
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.verify import diff, verify
@@ -51,54 +44,8 @@ from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.live import LiveScene
 from ipsys_log.survey.scene import observe_marker
 from tests.conftest import Ipsys
-from tests.playing import SteppedClock, cameras, playing
-
-# slow enough for a busy machine
-RATE_HZ = 6.0
-
-
-def sent(lab: Path) -> dict[str, list[bytes]]:
-    """Return the frames of a log by camera."""
-    with Session([lab]) as session:
-        return {name: [p.data for p in session.payloads([t])] for name, t in session.images.items()}
-
-
-def lenses(lab: Path) -> dict[str, CameraCalibration]:
-    with Session([lab]) as session:
-        return {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
-
-
-def attached_to(lab: Path, rate_hz: float) -> tuple[LiveCameras, list[Message]]:
-    frames = sent(lab)
-    with Session([lab]) as session:
-        (rig,) = session.payloads(["/rig"])
-    attached = LiveCameras(cameras(*frames), playing(frames, rate_hz), Clock())
-    return attached, first_messages(rig, lenses(lab), attached.now_ns)
-
-
-def go_live(lab: Path, calibration: Path, target: Path, rate_hz: float) -> None:
-    """Record in real time: a busy machine skips frames."""
-    attached, settings = attached_to(lab, rate_hz)
-    with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration))
-
-
-def again(log: Path, run: str | None = None) -> list[Comparison]:
-    return verify([log], run, lambda stage, done, total: None)
-
-
-@pytest.fixture(scope="session")
-def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record on a fast machine: no frame is skipped."""
-    target, frames = tmp_path_factory.mktemp("live") / "live.mcap", sent(lab_log)
-    clock = SteppedClock(list(frames), RATE_HZ)
-    with Session([lab_log]) as session:
-        (rig,) = session.payloads(["/rig"])
-    attached = LiveCameras(cameras(*frames), playing(frames, inf, before=clock.before), clock)
-    settings = first_messages(rig, lenses(lab_log), attached.now_ns)
-    with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
-    return target
+from tests.live_recordings import again, attached_to, go_live, lenses, sent
+from tests.playing import cameras, playing
 
 
 def test_live_equals_replay_byte_for_byte(recorded: Path) -> None:
@@ -345,132 +292,6 @@ def test_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> No
     )
     with pytest.raises(IpsysError, match=r"run edges is out of date: it has read"):
         again(log)
-
-
-class Jumping(Clock):
-    """A clock that jumps, as of a recorder that was suspended."""
-
-    ahead_ns = 0
-
-    def now_ns(self) -> int:
-        return super().now_ns() + self.ahead_ns
-
-
-@pytest.fixture(scope="session")
-def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record cameras without stamps, with a program that pauses for 2 s after their tenth frame."""
-    target, clock = tmp_path_factory.mktemp("stalled") / "live.mcap", Jumping()
-    frames = {name: [*found[:10], *found[9:0:-1], *found[:10]] for name, found in sent(lab_log).items()}
-
-    def stand_still(camera: str, number: int) -> None:
-        if (camera, number) == (min(frames), 10):
-            clock.ahead_ns = 2_000_000_000
-
-    with Session([lab_log]) as session:
-        (rig,) = session.payloads(["/rig"])
-    attached = LiveCameras(cameras(*frames), playing(frames, RATE_HZ, False, stand_still), clock)
-    settings = first_messages(rig, lenses(lab_log), attached.now_ns)
-    with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration))
-    return target
-
-
-def test_live_with_late_frames_equals_replay(stalled: Path, calibration: Path) -> None:
-    found = again(stalled)
-    assert "/runs/poly/tracks" in {one.topic for one in found}
-    assert all(one.equal and one.left > 0 for one in found)
-    before = stalled.read_bytes()
-    outcomes = pipeline.replay([stalled], Request(model_from=calibration, as_live=True))
-    assert not any(one.fresh for one in outcomes)
-    assert stalled.read_bytes() == before
-
-
-def late_ranges(events: list[Event]) -> dict[str, list[tuple[float, float]]]:
-    """Return the times of late frames by camera, from the two events of each stall."""
-    ranges: dict[str, list[tuple[float, float]]] = {}
-    for camera in {str(event.camera) for event in events}:
-        mine = [event for event in events if event.camera == camera]
-        for begins, ends in zip_longest(mine[::2], mine[1::2]):
-            assert (begins.start is None, begins.end) == (False, None)
-            end_ns = inf if ends is None else ends.end
-            ranges.setdefault(camera, []).append((begins.start or 0, end_ns or 0))
-    return ranges
-
-
-def test_late_frames_are_named_and_in_no_track(stalled: Path) -> None:
-    with Session([stalled]) as session:
-        events = [e for e in session.payloads(["/events"]) if e.kind == STAMP_UNRELIABLE]
-        tracks = session.payloads(["/runs/poly/tracks"])
-        positions = list(session.messages(session.topics(POSITIONS, "poly")))
-        (fused,) = (run for run in session.runs() if run.stage == "fuse")
-    ranges = late_ranges(events)
-    for camera in ("black", "red", "white"):
-        assert any(end_ns - start_ns > 1.9e9 for start_ns, end_ns in ranges[camera])
-    late = {
-        m.publish_time_ns
-        for m in positions
-        if any(start_ns <= m.publish_time_ns <= end_ns for start_ns, end_ns in ranges[str(m.camera)])
-    }
-    assert len(late) >= 3
-    assert {one.timestamp for one in tracks} == {m.publish_time_ns for m in positions} - late != set()
-    assert "/events" in {read.topic for read in fused.inputs}
-
-
-def test_runs_of_logs_without_late_frames_read_no_events(overloaded: Path) -> None:
-    """The runs are the same as without such an event."""
-    with Session([overloaded]) as session:
-        assert session.count("/events") > 0
-        read = {read.topic for run in session.runs() for read in run.inputs if run.stage == "fuse"}
-    assert read == {"/rig"} | {topic for topic in read if topic.endswith("/positions")}
-
-
-@cache
-def slow(step: Callable[..., Any]) -> Callable[..., Any]:
-    def slower(self: Detect, message: Message) -> Any:
-        if isinstance(message.payload, CompressedImage):
-            time.sleep(0.15)
-        return step(self, message)
-
-    return slower
-
-
-@pytest.fixture
-def overloaded(lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Record on a machine that is too slow for its cameras."""
-    target = tmp_path / "overloaded.mcap"
-    with monkeypatch.context() as patch:
-        patch.setattr(Detect, "__call__", slow(Detect.__call__))
-        go_live(lab_log, calibration, target, 30.0)
-    return target
-
-
-def test_slow_machine_records_and_names_skipped_frames(
-    overloaded: Path, lab_log: Path, calibration: Path
-) -> None:
-    with Session([overloaded]) as session, Session([lab_log]) as sent:
-        events: list[Event] = session.payloads(["/events"])
-        skipped = {e.timestamp for e in events if e.kind == FRAME_SKIPPED}
-        frames = {m.log_time_ns for m in session.messages(session.images.values())}
-        markers = {
-            m.log_time_ns
-            for m in session.messages([f"/runs/edges/cameras/{camera}/markers" for camera in session.images])
-        }
-        assert all(
-            session.count(topic) == sent.count(sent.images[name]) for name, topic in session.images.items()
-        )
-    assert len(skipped) > 5
-    assert markers == frames - skipped
-    assert all(one.equal for one in again(overloaded))
-    # Replay as live, or all frames: the user chooses.
-    request = Request(model_from=calibration, as_live=True)
-    assert not any(one.fresh for one in pipeline.replay([overloaded], request))
-    assert all(
-        one.fresh
-        for one in pipeline.replay([overloaded], Request(model_from=calibration))
-        if one.stage != "fit"
-    )
-    with Session([overloaded]) as session:
-        assert sum(session.count(f"/runs/edges_2/cameras/{c}/markers") for c in session.images) == len(frames)
 
 
 def test_diff_of_a_log_with_itself_and_of_two_runs(recorded: Path, calibration: Path, tmp_path: Path) -> None:

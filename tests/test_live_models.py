@@ -17,8 +17,8 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.verify import verify
 from tests.conftest import Ipsys
+from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
-from tests.test_live import RATE_HZ, lenses, sent
 
 MODELS = ("poly", "joint")
 

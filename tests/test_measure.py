@@ -33,8 +33,9 @@ from ipsys_log.survey.checks import check_entry, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.survey.scene import observe_marker
+from tests.changed_logs import rewrite
 from tests.conftest import Ipsys, Unmeasured, data_section
-from tests.test_bad_input import refused, rewrite
+from tests.test_bad_input import refused
 
 
 def as_typed(measurement: Measurement) -> TypedEntry:

@@ -27,7 +27,7 @@ from ipsys_log.runs.output import write_message
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from tests.conftest import Ipsys, small_disk
-from tests.test_live import go_live, recorded, slow  # noqa: F401
+from tests.live_recordings import go_live, slow
 from tests.tiers import first_fast
 
 # a limit far above any duration on a busy machine
@@ -148,7 +148,7 @@ def test_killed_live_run_is_completed_by_repair(
 
 @pytest.mark.parametrize("share", first_fast(1, [0.3, 0.6, 0.95]))
 def test_skipped_frames_are_processed_by_a_replay(
-    recorded: Path,  # noqa: F811
+    recorded: Path,
     tmp_path: Path,
     share: float,
 ) -> None:
@@ -184,7 +184,7 @@ def _chunks(log: Path) -> Iterator[ChunkRef]:
 
 @pytest.mark.slow
 def test_run_with_other_content_is_left_unchanged(
-    recorded: Path,  # noqa: F811
+    recorded: Path,
     ipsys: Ipsys,
     tmp_path: Path,
 ) -> None:

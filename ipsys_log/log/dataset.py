@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import heapq
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
+from ipsys_log.log.combined_logs import check_overlaps, find_new_ids, rename_ids
 from ipsys_log.log.contents import (
     RawMessage,
     StoredChannel,
@@ -39,42 +39,7 @@ from ipsys_log.messages.channels import (
     channel_of,
 )
 
-__all__ = ["Session", "find_new_ids", "rename_ids"]
-
-
-def find_new_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
-    """Return new ids for ids that an earlier log has too: for each log, the new id by the old id.
-
-    Parameters
-    ----------
-    logs : the measurements of each log; the earliest log first.
-
-    Examples
-    --------
-    >>> find_new_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
-    [{}, {'p001': 'p001_2'}]
-    """
-    taken: set[str] = set()
-    renamings = []
-    for number, measurements in enumerate(logs, 1):
-        ids = list(dict.fromkeys(measurement.id for measurement in measurements))
-        new: dict[str, str] = {}
-        for name in ids:
-            if name in taken:
-                new[name] = f"{name}_{number}"
-        taken.update(new.get(name, name) for name in ids)
-        renamings.append(new)
-    return renamings
-
-
-def rename_ids(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
-    """Return a measurement, or a withdrawal, with the new ids of its log."""
-    withdrawn = measurement.withdraws
-    return replace(
-        measurement,
-        id=ids.get(measurement.id, measurement.id),
-        withdraws=None if withdrawn is None else ids.get(withdrawn, withdrawn),
-    )
+__all__ = ["Session"]
 
 
 _ITEMS_OF_IMAGE = 16
@@ -102,7 +67,7 @@ class Session:
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
             self._check_numbers()
-            self._check_overlaps()
+            check_overlaps(self.readers, set(self.topics(IMAGES)))
             self.images = self._cameras(IMAGES)
             self.calibrations = self._pair_calibrations(self._cameras(CALIBRATIONS))
             self._camera_of = {
@@ -331,26 +296,6 @@ class Session:
                 ]
                 reader.check_number(sum(counts), kind)
 
-    def _check_overlaps(self) -> None:
-        """Refuse logs that have the same run, or images of the same camera at the same time."""
-        images = set(self.topics(IMAGES))
-        first: dict[str, LogReader] = {}
-        for reader in self.readers:
-            for topic in reader.channels:
-                other = first.setdefault(topic, reader)
-                if other is reader or topic.endswith("/record"):
-                    continue
-                if topic in images and _overlap(reader, other, topic):
-                    raise LogError(
-                        f"two cameras have the same name: {topic} is in {other.path} and, at the same time, "
-                        f"in {reader.path}; leave one of them out"
-                    )
-                if run_of_topic(topic) is not None:
-                    raise LogError(
-                        f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or compute "
-                        "the run again with --run and another name"
-                    )
-
     def _cameras(self, channel: Channel) -> dict[str, str]:
         """Return the topic by camera; if a camera has topics of several types, that of the first type."""
         cameras: dict[str, str] = {}
@@ -429,8 +374,3 @@ def _too_large(data: bytes | memoryview) -> str:
 
 def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:
     return reader.times(topic) if topic in reader.channels else np.empty(0, np.int64)
-
-
-def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
-    first, second = one.times(topic), other.times(topic)
-    return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])

@@ -50,8 +50,8 @@ from ipsys_log.units import NS_PER_S
 from tests import labs
 from tests.capture.test_recorder import Noted
 from tests.conftest import Ipsys
+from tests.live_recordings import lenses
 from tests.playing import SteppedClock, cameras, playing
-from tests.test_live import lenses
 from tests.test_measure import as_typed
 
 RATE_HZ = 10.0

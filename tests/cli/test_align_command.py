@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.marker_cells import PlacedMarker
 from ipsys_log.geometry.poses import look_down, pose_facing_up
-from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
     CompressedImage,
@@ -34,6 +33,7 @@ from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
+from tests.changed_logs import rewrite
 from tests.conftest import Ipsys, data_section
 from tests.ladder import follow
 
@@ -159,19 +159,6 @@ def test_align_reads_a_session_with_calibration_points(
     assert (np.abs(picture.astype(int) - [232, 214, 195]).max(axis=2) < 3).mean() > 0.02
 
 
-def changed(log: Path, change: Callable[[Message], Message | None]) -> Path:
-    path = log.with_name("changed.mcap")
-
-    def messages() -> Iterator[Message]:
-        with Session([log]) as session:
-            topics = [topic for reader in session.readers for topic in reader.channels]
-            kept = (change(message) for message in session.messages(topics))
-            yield from (message for message in kept if message is not None)
-
-    write_log(path, messages())
-    return path
-
-
 @pytest.mark.slow
 def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
     """The plumb lines and common markers of two cameras give nearly the result of the tape."""
@@ -182,7 +169,7 @@ def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
             return replace(message, payload=replace(message.payload, distances=()))
         return message
 
-    found = aligned(ipsys, changed(lab, heights_only))
+    found = aligned(ipsys, rewrite(lab, heights_only))
     assert found["coverage"] is None
     for row in found["overlaps"]:
         assert row["width_m"] == pytest.approx(by_tape[tuple(row["cameras"])], abs=0.04)
@@ -198,7 +185,7 @@ def test_gross_tape_error_does_not_change_the_alignment(ipsys: Ipsys, lab: Path)
             return replace(message, payload=replace(message.payload, distances=distances))
         return message
 
-    found = aligned(ipsys, changed(lab, too_short))
+    found = aligned(ipsys, rewrite(lab, too_short))
     assert found["coverage"] is None
     assert "the calibration points were not used: measurement s000" in " ".join(found["notes"])
     assert len(found["cameras"]) == 3
@@ -245,7 +232,7 @@ def test_missing_data_of_a_log_give_notes(ipsys: Ipsys, lab: Path, tmp_path: Pat
         payload = message.payload
         return replace(message, payload=replace(payload, floor=None)) if isinstance(payload, Rig) else message
 
-    found = aligned(ipsys, changed(lab, no_floor))
+    found = aligned(ipsys, rewrite(lab, no_floor))
     assert found["coverage"] is None
     assert any("coverage needs the size of the floor: write [floor]" in note for note in found["notes"])
 

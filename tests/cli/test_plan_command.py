@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from ipsys_log.messages import CameraCalibration, Measurement, Message, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
+from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys, data_section
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
@@ -49,19 +48,6 @@ def authors(ipsys: Ipsys, data: Path, tmp_path: Path) -> Path:
     log = tmp_path / "imsel.mcap"
     assert ipsys("import", "imsel", data / "imsel", "-o", log).code == 0
     return log
-
-
-def rewrite(log: Path, change: Callable[[Message], Message | None]) -> Path:
-    path = log.with_name("changed.mcap")
-
-    def messages() -> Iterator[Message]:
-        with Session([log]) as session:
-            topics = [topic for reader in session.readers for topic in reader.channels]
-            changed = (change(message) for message in session.messages(topics))
-            yield from (message for message in changed if message is not None)
-
-    write_log(path, messages())
-    return path
 
 
 def drop_measured(message: Message) -> Message | None:

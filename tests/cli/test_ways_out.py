@@ -25,8 +25,9 @@ from ipsys_log.messages.channels import RIG
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
+from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
-from tests.test_bad_input import refused, rewrite
+from tests.test_bad_input import refused
 
 LIMIT_S = 240.0
 PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"

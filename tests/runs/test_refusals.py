@@ -30,8 +30,9 @@ from ipsys_log.messages import (
 )
 from ipsys_log.runs import checks
 from ipsys_log.units import NS_PER_S
+from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
-from tests.test_bad_input import refused, rewrite
+from tests.test_bad_input import refused
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 PACKAGE = ROOT / "ipsys_log"

@@ -28,6 +28,7 @@ from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, RIG, RUN_
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log, write_messages
+from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.shared_files import make_once
 
@@ -64,20 +65,11 @@ def runs_of(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
 
 
 def without(log: Path, drop: Callable[[Message], bool]) -> Path:
-    path = log.with_name("less.mcap")
-    with Session([log]) as session:
-        topics = [topic for reader in session.readers for topic in reader.channels]
-        write_log(path, (message for message in session.messages(topics) if not drop(message)))
-    return path
+    return rewrite(log, lambda message: None if drop(message) else message, name="less.mcap")
 
 
 def change(log: Path, edit: Callable[[Any], Any]) -> Path:
-    path = log.with_name("other.mcap")
-    with Session([log]) as session:
-        topics = [topic for reader in session.readers for topic in reader.channels]
-        messages = (replace(m, payload=edit(m.payload)) for m in session.messages(topics))
-        write_log(path, messages)
-    return path
+    return rewrite(log, lambda m: replace(m, payload=edit(m.payload)), name="other.mcap")
 
 
 def robots(folder: Path, log: Path, prefix: str) -> Path:

@@ -1,0 +1,79 @@
+"""Conditions for logs that are read together: separate runs, separate images, unique ids of measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.contents import run_of_topic
+from ipsys_log.log.reader import LogReader
+from ipsys_log.messages import Measurement
+
+__all__ = ["check_overlaps", "find_new_ids", "rename_ids"]
+
+
+def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) -> None:
+    """Refuse logs that have the same run, or images of the same camera at the same time.
+
+    Raises
+    ------
+    LogError
+        The text names the topic and both logs.
+    """
+    first: dict[str, LogReader] = {}
+    for reader in readers:
+        for topic in reader.channels:
+            other = first.setdefault(topic, reader)
+            if other is reader or topic.endswith("/record"):
+                continue
+            if topic in image_topics and _overlap(reader, other, topic):
+                raise LogError(
+                    f"two cameras have the same name: {topic} is in {other.path} and, at the same time, "
+                    f"in {reader.path}; leave one of them out"
+                )
+            if run_of_topic(topic) is not None:
+                raise LogError(
+                    f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or compute "
+                    "the run again with --run and another name"
+                )
+
+
+def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
+    first, second = one.times(topic), other.times(topic)
+    return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])
+
+
+def find_new_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
+    """Return new ids for ids that an earlier log has too: for each log, the new id by the old id.
+
+    Parameters
+    ----------
+    logs : the measurements of each log; the earliest log first.
+
+    Examples
+    --------
+    >>> find_new_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
+    [{}, {'p001': 'p001_2'}]
+    """
+    taken: set[str] = set()
+    renamings = []
+    for number, measurements in enumerate(logs, 1):
+        ids = list(dict.fromkeys(measurement.id for measurement in measurements))
+        new: dict[str, str] = {}
+        for name in ids:
+            if name in taken:
+                new[name] = f"{name}_{number}"
+        taken.update(new.get(name, name) for name in ids)
+        renamings.append(new)
+    return renamings
+
+
+def rename_ids(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
+    """Return a measurement, or a withdrawal, with the new ids of its log."""
+    withdrawn = measurement.withdraws
+    return replace(
+        measurement,
+        id=ids.get(measurement.id, measurement.id),
+        withdraws=None if withdrawn is None else ids.get(withdrawn, withdrawn),
+    )

@@ -8,11 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ipsys_log.api import load_model
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, Markers, Message, Run, Tracks
+from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
@@ -118,6 +121,29 @@ def test_joint_model_for_camera_points_is_refused_in_one_line(ipsys: Ipsys, log:
     assert "cannot be used with camera points" in done.err
     with pytest.raises(IpsysError, match="cannot be used with camera points"):
         load_model(log, "joint")
+
+
+def test_marker_without_a_height_gets_its_full_pose(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+    rig, located = tmp_path / "lab.toml", tmp_path / "located.mcap"
+    assert ipsys("fit", log, "--model", "joint").code == 0
+    assert ipsys("init", rig, "--from", log).code == 0
+    rig.write_text(rig.read_text().replace("marker_height_m = 0.1\n", ""))
+    drive = tmp_path / "drive.mcap"
+    write_log(drive, simulate_session(lab(4, 10.0)))
+    before = drive.read_bytes()
+    options = ("--model", "joint", "--model-from", log, "--rig", rig, "-o", located)
+    tracks = replay(ipsys, drive, *options)["joint"]["tracks"]["truth"]
+    assert drive.read_bytes() == before
+    assert tracks["2d"]["mean_cm"] < 0.4
+    assert tracks["3d"]["mean_cm"] < 1.5
+    with Session([drive, located]) as session:
+        positions = [p for one in session.payloads(session.topics(POSITIONS, "joint")) for p in one.positions]
+    heights_m = np.array([p.z_m for p in positions])
+    sigmas_m = np.sqrt([p.covariance_m2[2, 2] for p in positions if p.covariance_m2 is not None])
+    assert abs(float(np.median(heights_m)) - 0.1) < 0.005
+    # The covariance of a full pose is true: heights differ from 0.1 m by as much as it says.
+    assert 0.5 < float(np.median(np.abs(heights_m - 0.1) / sigmas_m)) / 0.6745 < 2
+    assert np.mean([bool(p.inside) for p in positions]) > 0.99
 
 
 def test_joint_results_with_another_rig_are_verified(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:

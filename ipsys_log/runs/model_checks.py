@@ -16,7 +16,6 @@ from ipsys_log.messages import CameraModel
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
-    MARKERS,
     POSITIONS,
     RIG,
     Channel,
@@ -24,7 +23,7 @@ from ipsys_log.messages.channels import (
 from ipsys_log.models.table import AppliedModel, min_pairs, needs_height, reads_corners
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
-from ipsys_log.runs.select import copied_run, fitted_in
+from ipsys_log.runs.select import copied_run, fitted_in, has_corners
 from ipsys_log.runs.view import LogView
 from ipsys_log.stages.evaluate import can_evaluate
 from ipsys_log.stages.fit import BESIDE_LINE_M, check_different, check_pairs
@@ -77,7 +76,7 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
 
 def _check_corners(session: Session, model: str) -> None:
     """Check that the log has corners of markers, or images to detect them in."""
-    if not session.images and newest_run(session, MARKERS) is None:
+    if not has_corners(session):
         raise FitError(
             f"{session}: {model} is fitted to the corners of markers, but the log has only camera points; "
             "use --model best"

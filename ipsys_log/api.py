@@ -27,7 +27,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CHANNELS, EVALUATION, Channel
-from ipsys_log.models.table import AppliedModel
+from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.player import Player
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome, newest_run
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipsys_log.capture.frames import Clock
+    from ipsys_log.joint.fitted_corners import FittedCornerModel
     from ipsys_log.sinks.sink import Sink
 
 __all__ = [
@@ -449,12 +450,16 @@ class FittedModel:
         return self._applied[camera].predict(points, heights)
 
 
-def load_model(path: StrPath, name: str | None = None) -> FittedModel:
+def load_model(path: StrPath, name: str | None = None) -> FittedModel | FittedCornerModel:
     """Load the newest fitted model of a log.
 
     Parameters
     ----------
     name : the name in the table of models, such as ``best``; None: the newest of all.
+
+    Returns
+    -------
+    A model that reads camera points; or, for ``joint``, one that reads the corners of markers.
 
     Raises
     ------
@@ -464,7 +469,12 @@ def load_model(path: StrPath, name: str | None = None) -> FittedModel:
     from ipsys_log.runs.select import fitted_in
 
     with Session([Path(path)]) as session:
-        return FittedModel(fitted_in(session, name)[0])
+        model = fitted_in(session, name)[0]
+    if not reads_corners(model.name):
+        return FittedModel(model)
+    from ipsys_log.joint.fitted_corners import FittedCornerModel  # late: scipy takes 1 s
+
+    return FittedCornerModel(model)
 
 
 def calibrate(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +28,16 @@ __all__ = [
     "ExpectedErrors",
     "FloorGap",
     "FloorGrid",
+    "MarkerView",
     "TapeCovariances",
     "TapedPoint",
     "choose_points",
     "expect_errors",
     "find_gaps",
+    "mean_error",
+    "posterior_root",
+    "see_markers",
+    "some_modes",
 ]
 
 Array = NDArray[np.float64]
@@ -108,11 +114,22 @@ class FloorGap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TapedPoint:
-    """A point to measure: ``point_m`` (2,), the cameras that see it, and the expected mean error after it."""
+    """A point to measure.
+
+    Attributes
+    ----------
+    point_m : (2,); ``height_m`` is its height above the floor.
+    cameras : those that see it.
+    mean_after_m : the expected mean error after it.
+    update : (m, m). The modes of the calibration after this point, and all before it, are the present modes
+        times this matrix.
+    """
 
     point_m: Array
+    height_m: float
     cameras: tuple[str, ...]
     mean_after_m: float
+    update: Array
 
 
 def expect_errors(
@@ -140,29 +157,62 @@ def expect_errors(
 
 
 def _modes(
-    model: JointModel, size_px: tuple[int, int], points_m: Array, height_m: float, length_m: float
+    model: JointModel, size_px: tuple[int, int], points_m: Array, heights_m: Array | float, length_m: float
 ) -> tuple[Mask, Array]:
-    """Return a mask (p,) of the points (p, 2) at which a camera sees a whole marker, and their modes."""
+    """Return a mask (p,) of the points (p, 2) at which a camera sees a whole marker, and their modes.
+
+    ``heights_m`` is a number or (p,).
+    """
+    view = see_markers(model, size_px, points_m, heights_m, length_m)
+    count = len(view.corners_px)
+    exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
+    lengths_m = np.full(count, length_m)
+    located = locate_markers(
+        model, view.corners_px, exact, view.heights_m, lengths_m, 0.0, tilt_sigma_rad=0.0
+    )
+    return view.seen, located.modes_m[:, :2]
+
+
+class MarkerView(NamedTuple):
+    """Markers on the floor as a camera sees them: a mask (p,), and the n seen ones.
+
+    ``corners_px`` (n, 4, 2) are exact, ``centres_m`` (n, 3) and ``turns`` (n, 3, 3) are the poses in the
+    world, ``heights_m`` (n,) the heights above the floor.
+    """
+
+    seen: Mask
+    corners_px: Array
+    centres_m: Array
+    turns: Array
+    heights_m: Array
+
+
+def see_markers(
+    model: JointModel,
+    size_px: tuple[int, int],
+    points_m: Array,
+    heights_m: Array | float,
+    length_m: float,
+    headings_rad: Array | float = 0.0,
+) -> MarkerView:
+    """Return the markers at points (p, 2) that are whole in the image of a camera, with their margins."""
     lens = replace(model.calibration, width=size_px[0], height=size_px[1])
     floor_m = model.floor.heights(points_m, model.amplitudes)[0]
-    centres_m = np.column_stack([points_m, height_m + floor_m])
-
-    turn = level_turns(np.zeros(1))[0]
+    heights_m = np.broadcast_to(heights_m, floor_m.shape)
+    centres_m = np.column_stack([points_m, heights_m + floor_m])
+    turns = level_turns(np.broadcast_to(headings_rad, floor_m.shape))
 
     def corners_c(side_m: float, rows: Mask) -> Array:
-        corners_m = centres_m[rows, None] + marker_corners(side_m) @ turn.T
+        corners_m = centres_m[rows, None] + marker_corners(side_m) @ turns[rows].swapaxes(1, 2)
         return np.asarray((corners_m.reshape(-1, 3) - model.origin_m) @ model.camera_from_world.T)
 
     everywhere = np.ones(len(points_m), dtype=np.bool_)
     around = corners_c(WHOLE_PRINT * length_m, everywhere)
     seen: Mask = np.asarray(in_image(around, lens).reshape(-1, 4).all(axis=1), dtype=np.bool_)
-    corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
-    count = len(corners_px)
-    exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
-    located = locate_markers(
-        model, corners_px, exact, np.full(count, height_m), np.full(count, length_m), 0.0, tilt_sigma_rad=0.0
-    )
-    return seen, located.modes_m[:, :2]
+    corners_px = np.zeros((0, 4, 2))
+    if seen.any():
+        corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
+    return MarkerView(seen, corners_px, centres_m[seen], turns[seen], heights_m[seen])
 
 
 def _lengths(covariances_m2: Array) -> Array:
@@ -211,11 +261,12 @@ def choose_points(
     length_m: float,
     goal_m: float,
     count: int,
+    heights_m: Array | float = 0.0,
 ) -> list[TapedPoint]:
     """Choose the points on the floor whose tape readings reduce the mean expected error most, one by one.
 
     The choice ends when the error is at most ``goal_m``, after ``count`` points, or without a candidate that
-    a camera sees.
+    a camera sees. No point is chosen twice.
 
     Parameters
     ----------
@@ -226,55 +277,106 @@ def choose_points(
     length_m : side of the marker.
     goal_m : wanted mean error.
     count : the largest number of points.
+    heights_m : heights of the candidates above the floor, a number or (c,).
 
     References
     ----------
     V-optimality, also called I-: Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, ch. 10.
     """
-    modes_m = np.concatenate([one.modes_m for one in expected])
+    modes_m = some_modes(expected)
     if not len(modes_m) or not len(candidates_m):
         return []
-    modes_m = modes_m[:: max(1, len(modes_m) // _ENOUGH_NODES)]
-    views = {
-        camera: _modes(model, sizes_px[camera], candidates_m, 0.0, length_m)
-        for camera, model in models.items()
-    }
-    rows = {camera: np.cumsum(seen) - 1 for camera, (seen, _) in views.items()}
-    tapes_m2 = tape_m2(candidates_m)
+    heights_m = np.broadcast_to(heights_m, (len(candidates_m),))
+    candidates = _Candidates(models, sizes_px, candidates_m, heights_m, tape_m2(candidates_m), length_m)
     chosen: list[TapedPoint] = []
-    slopes, noise_m2 = np.zeros((0, modes_m.shape[2])), np.zeros((0, 0))
-    mean_m = float(_lengths(modes_m @ modes_m.swapaxes(1, 2)).mean())
+    update = np.eye(modes_m.shape[2])
+    mean_m = mean_error(modes_m)
     while len(chosen) < count and mean_m > goal_m:
-        best: tuple[float, int, tuple[str, ...], Array, Array] | None = None
-        for number in range(len(candidates_m)):
-            cameras = tuple(camera for camera, (seen, _) in views.items() if seen[number])
-            if not cameras:
-                continue
-            own = np.concatenate([views[camera][1][rows[camera][number]] for camera in cameras])
-            own_m2 = np.tile(tapes_m2[number], (len(cameras), len(cameras)))
-            own_m2 += _CORNER_SIGMA_M**2 * np.eye(len(own))
-            together, together_m2 = np.concatenate([slopes, own]), _block_diagonal(noise_m2, own_m2)
-            after_m = _mean_after(modes_m, together, together_m2)
-            if best is None or after_m < best[0]:
-                best = after_m, number, cameras, together, together_m2
+        best = candidates.choose(modes_m @ update, update)
         if best is None:
             break
-        mean_m, number, cameras, slopes, noise_m2 = best
-        chosen.append(TapedPoint(candidates_m[number], cameras, mean_m))
+        number, step = best
+        update = update @ step
+        mean_m = mean_error(modes_m @ update)
+        cameras = candidates.take(number)
+        chosen.append(TapedPoint(candidates_m[number], float(heights_m[number]), cameras, mean_m, update))
     return chosen
 
 
-def _block_diagonal(first: Array, second: Array) -> Array:
-    both = np.zeros((len(first) + len(second),) * 2)
-    both[: len(first), : len(first)] = first
-    both[len(first) :, len(first) :] = second
-    return both
+def some_modes(expected: Sequence[ExpectedErrors]) -> Array:
+    """Return the modes (n, 2, m) of enough camera-nodes for a mean over the floor."""
+    modes_m = np.concatenate([one.modes_m for one in expected])
+    return np.asarray(modes_m[:: max(1, len(modes_m) // _ENOUGH_NODES)])
 
 
-def _mean_after(modes_m: Array, slopes: Array, noise_m2: Array) -> float:
-    """Return the mean expected error (n, 2, m) after observations with slopes (k, m) and noise (k, k)."""
+def mean_error(modes_m: Array) -> float:
+    """Return the mean expected error of camera-nodes with modes (n, 2, m)."""
+    return float(_lengths(modes_m @ modes_m.swapaxes(1, 2)).mean())
+
+
+def posterior_root(slopes: Array, noise_m2: Array) -> Array:
+    """Return a root (m, m) of the covariance of m independent normal numbers after an observation.
+
+    Parameters
+    ----------
+    slopes, noise_m2 : (k, m) and (k, k), of the observation.
+    """
+    gain = np.linalg.solve(slopes @ slopes.T + noise_m2, slopes)
+    covariance = np.eye(slopes.shape[1]) - slopes.T @ gain
+    return np.asarray(np.linalg.cholesky((covariance + covariance.T) / 2))
+
+
+class _Candidates:
+    """Possible points for a taped marker, and the observations that they would give."""
+
+    def __init__(
+        self,
+        models: Mapping[str, JointModel],
+        sizes_px: Mapping[str, tuple[int, int]],
+        points_m: Array,
+        heights_m: Array,
+        tapes_m2: Array,
+        length_m: float,
+    ) -> None:
+        self._seen, self._slopes = {}, {}
+        for camera, model in models.items():
+            seen, modes_m = _modes(model, sizes_px[camera], points_m, heights_m, length_m)
+            slopes = np.zeros((len(points_m), *modes_m.shape[1:]))
+            slopes[seen] = modes_m
+            self._seen[camera], self._slopes[camera] = seen, slopes
+        self._tapes_m2 = tapes_m2
+        self._free = np.any([*self._seen.values()], axis=0)
+
+    def choose(self, modes_m: Array, update: Array) -> tuple[int, Array] | None:
+        """Return the free point that gives the least mean error, and the update of the modes by it.
+
+        ``modes_m`` (n, 2, m) are those after ``update`` (m, m), which has the points that are taken.
+        """
+        base_m2 = modes_m @ modes_m.swapaxes(1, 2)
+        best: tuple[float, int, tuple[Array, Array]] | None = None
+        for number in np.flatnonzero(self._free).tolist():
+            observed = self._observe(number, update)
+            after_m = _mean_after(base_m2, modes_m, *observed)
+            if best is None or after_m < best[0]:
+                best = after_m, number, observed
+        return None if best is None else (best[1], posterior_root(*best[2]))
+
+    def take(self, number: int) -> tuple[str, ...]:
+        """Take a point out of the choice; return the cameras that see it."""
+        self._free[number] = False
+        return tuple(camera for camera, seen in self._seen.items() if seen[number])
+
+    def _observe(self, number: int, update: Array) -> tuple[Array, Array]:
+        """Return slopes (k, m) and noise (k, k) of a tape reading: all cameras see the same tape error."""
+        own = [self._slopes[camera][number] for camera, seen in self._seen.items() if seen[number]]
+        noise_m2 = np.tile(self._tapes_m2[number], (len(own), len(own)))
+        noise_m2 += _CORNER_SIGMA_M**2 * np.eye(len(noise_m2))
+        return np.concatenate(own) @ update, noise_m2
+
+
+def _mean_after(base_m2: Array, modes_m: Array, slopes: Array, noise_m2: Array) -> float:
+    """Return the mean expected error after an observation; ``base_m2`` (n, 2, 2) is the product of modes."""
     root = np.linalg.cholesky(slopes @ slopes.T + noise_m2)
     gain = np.linalg.solve(root, slopes @ modes_m.reshape(-1, modes_m.shape[2]).T)
     gain = gain.T.reshape(len(modes_m), 2, -1)
-    covariances_m2 = modes_m @ modes_m.swapaxes(1, 2) - gain @ gain.swapaxes(1, 2)
-    return float(_lengths(covariances_m2).mean())
+    return float(_lengths(base_m2 - gain @ gain.swapaxes(1, 2)).mean())

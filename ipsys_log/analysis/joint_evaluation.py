@@ -186,9 +186,7 @@ def _suspects(observations: Observations, study: Study, notes: list[str]) -> tup
 _Predicted = dict[str, tuple[list[Pair], Array, Array]]
 
 
-def _predict(
-    cameras: Models, observations: Observations, study: Study, names: Collection[str]
-) -> _Predicted:
+def _predict(cameras: Models, observations: Observations, study: Study, names: Collection[str]) -> _Predicted:
     """Locate the markers at some calibration points by their mean corners and measured heights."""
     predicted: _Predicted = {}
     for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):

@@ -332,7 +332,10 @@ class Session:
                 reader.check_number(sum(counts), kind)
 
     def _check_overlaps(self) -> None:
-        """Refuse logs that have the same run, or images of the same camera at the same time."""
+        """Refuse logs that have images of the same camera, or results of the same run, at the same time.
+
+        Sessions one after the other may have runs of the same name: such a run is read as one.
+        """
         images = set(self.topics(IMAGES))
         first: dict[str, LogReader] = {}
         for reader in self.readers:
@@ -345,10 +348,10 @@ class Session:
                         f"two cameras have the same name: {topic} is in {other.path} and, at the same time, "
                         f"in {reader.path}; leave one of them out"
                     )
-                if run_of_topic(topic) is not None:
+                if run_of_topic(topic) is not None and _overlap(reader, other, topic):
                     raise LogError(
-                        f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or compute "
-                        "the run again with --run and another name"
+                        f"{topic} is in {other.path} and, at the same time, in {reader.path}; leave one of "
+                        "them out"
                     )
 
     def _cameras(self, channel: Channel) -> dict[str, str]:

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import undistort
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.locate_step import MOST_CHI2
+from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.observations import Observations, Sightings
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.messages import Model
 
@@ -29,14 +27,16 @@ _LEAST_CORNERS = 3
 _OUTLINE = 16
 # Tangent of the largest angle of a drawn ray: beyond it, a ray meets the floor far away or never.
 _GRAZED = 3.0
+# A clock that the fit keeps constant has a smaller standard deviation, by rounding.
+_NO_SIGMA_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageResiduals:
     """Mean corner residuals in the cells of an image.
 
-    A residual is estimated minus measured, for a marker at its known height. Its place, its heading and the
-    calibration explain the rest.
+    A residual is estimated minus measured. The estimate is that of the fit: it uses one place of a marker for
+    all cameras, and one path of a robot.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class CalibratedCamera:
     outline_m : (k, 2), outline of its field of view on the floor; empty without a size.
     clock_s, clock_sigma_s : time to add to its stamps. The sigma is 0 for the reference clock and without a
         drive.
-    residuals : None if the log has no sighting at a known height.
+    residuals : None for a model of another log.
     """
 
     camera: str
@@ -82,7 +82,7 @@ class CalibratedCamera:
 
 
 def describe_cameras(
-    model: Model, sizes_px: Mapping[str, Size], observations: Observations | None
+    model: Model, sizes_px: Mapping[str, Size], fit: JointFit | None
 ) -> tuple[CalibratedCamera, ...]:
     """Return the cameras of a joint model.
 
@@ -90,20 +90,16 @@ def describe_cameras(
     ----------
     model : the fitted model.
     sizes_px : width and height of the images by camera.
-    observations : the sightings of a log, for the residuals; None if it has none.
+    fit : the fit of the model, for the residuals; None for a model of another log.
     """
-    sightings = {}
-    if observations is not None:
-        names = [camera.name for camera in observations.cameras]
-        sightings = dict(zip(names, observations.sightings, strict=True))
+    names = [] if fit is None else [camera.name for camera in fit.observations.cameras]
     cameras = []
     for payload in model.cameras:
-        name, camera = payload.camera, restore_joint(payload)
-        own, size_px = sightings.get(name), sizes_px.get(name)
+        name, size_px = payload.camera, sizes_px.get(payload.camera)
         residuals = None
-        if own is not None and observations is not None and size_px is not None:
-            residuals = _residuals(camera, observations, own, size_px)
-        cameras.append(_describe(name, camera, size_px, residuals))
+        if fit is not None and size_px is not None and name in names:
+            residuals = _residuals(fit, names.index(name), size_px)
+        cameras.append(_describe(name, restore_joint(payload), size_px, residuals))
     return tuple(cameras)
 
 
@@ -111,7 +107,7 @@ def _describe(
     name: str, model: JointModel, size_px: Size | None, residuals: ImageResiduals | None
 ) -> CalibratedCamera:
     variances = (model.modes**2).sum(axis=1)
-    clock = 6 + len(model.lens) + 1
+    clock_sigma_s = float(np.sqrt(variances[6 + len(model.lens) + 1]))
     outline_m = np.zeros((0, 2)) if size_px is None else _outline(model, size_px)
     return CalibratedCamera(
         name,
@@ -121,7 +117,7 @@ def _describe(
         model.camera_from_world[2],
         outline_m,
         model.clock_s,
-        float(np.sqrt(variances[clock])),
+        clock_sigma_s if clock_sigma_s > _NO_SIGMA_S else 0.0,
         residuals,
     )
 
@@ -143,31 +139,24 @@ def _outline(model: JointModel, size_px: Size) -> Array:
     return np.asarray(model.origin_m[:2] + rays[:, :2] * (model.origin_m[2] / depths)[:, None])
 
 
-def _residuals(
-    model: JointModel, observations: Observations, sightings: Sightings, size_px: Size
-) -> ImageResiduals | None:
-    """Return the residuals of all sightings at known heights, in cells of the image."""
-    heights_m = np.array(
-        [
-            observations.points[point].height_m if point >= 0 else observations.bodies[body].height_m
-            for body, point in zip(sightings.body.tolist(), sightings.point.tolist(), strict=True)
-        ],
-        dtype=np.float64,
-    )
-    known = np.isfinite(heights_m)
-    if not known.any():
+def _residuals(fit: JointFit, number: int, size_px: Size) -> ImageResiduals | None:
+    """Return the residuals of a camera by its number in a fit; None if nothing fits."""
+    misses_px, corners_px, outliers = [np.zeros((0, 2))], [np.zeros((0, 2))], 0
+    for factors in fit.problem.sightings:
+        if factors.camera != number:
+            continue
+        whitened = factors.residuals(fit.state, fit.problem.layout, fit.problem.trajectories)
+        residuals_px = np.linalg.solve(factors.whitening, whitened[:, :, None])[:, :, 0]
+        good = (whitened**2).sum(axis=1) <= factors.limit
+        misses_px.append(residuals_px[good].reshape(-1, 2))
+        corners_px.append(factors.sightings.pixels[good].reshape(-1, 2))
+        outliers += int((~good).sum())
+    misses, corners = np.concatenate(misses_px), np.concatenate(corners_px)
+    if not len(misses):
         return None
-    own = sightings.select(known)
-    lengths_m = np.array([observations.bodies[body].length_m for body in own.body.tolist()])
-    located = locate_markers(model, own.pixels, own.covariances_px2, heights_m[known], lengths_m)
-    good = located.chi2 < MOST_CHI2
-    if not good.any():
-        return None
-    misses_px = located.residuals_px[good].reshape(-1, 2)
-    corners_px = own.pixels[good].reshape(-1, 2)
-    cells_px, means_px, rms_px = _average(corners_px, misses_px, size_px[0] / _CELLS)
-    total_px = float(np.sqrt((misses_px**2).mean()))
-    return ImageResiduals(cells_px, means_px, rms_px, total_px, len(misses_px), int((~good).sum()))
+    total_px = float(np.sqrt((misses**2).mean()))
+    cells = _average(corners, misses, size_px[0] / _CELLS)
+    return ImageResiduals(*cells, total_px, len(misses), outliers)
 
 
 def _average(corners_px: Array, misses_px: Array, cell_px: float) -> tuple[Array, Array, Array]:

@@ -30,6 +30,8 @@ _STEP_M, _SQUARE = 0.3, 4
 _CORNER_SIGMA_PX = 0.02
 # Two successive places have headings that differ by the golden angle, so that all headings occur.
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
+# A smaller reduction is not worth a drive.
+_LITTLE = 0.05
 _FLAT = np.array([0, 1, 5])
 
 
@@ -46,6 +48,11 @@ class PlannedDrive:
     cameras: tuple[str, ...]
     mean_before_m: float
     mean_after_m: float
+
+    @property
+    def is_useful(self) -> bool:
+        """True if the drive reduces the error noticeably: no drive reduces the error of the tape."""
+        return self.mean_after_m < (1 - _LITTLE) * self.mean_before_m
 
 
 def choose_drive(

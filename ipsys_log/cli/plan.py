@@ -159,6 +159,8 @@ def _drive_line(drive: PlannedDrive) -> str:
     from ipsys_log.report.plan import means_cm
     from ipsys_log.units import CM_PER_M
 
+    if not drive.is_useful:
+        return "another drive changes little: most of the predicted error is that of the tape"
     (x0, y0), (x1, y1) = (
         (corner_m * CM_PER_M).round().astype(int) for corner_m in (drive.low_m, drive.high_m)
     )

@@ -31,7 +31,6 @@ class Positions:
     chi2 : (n,), squared residuals in units of the noise, with five degrees of freedom.
     modes_m : (n, 3, m), errors of the points by the modes of the calibration. The covariance of two points
         by their calibration is the product of their modes.
-    residuals_px : (n, 8), estimated minus measured corners.
     """
 
     points_m: Array
@@ -39,7 +38,6 @@ class Positions:
     covariances_m2: Array
     chi2: Array
     modes_m: Array
-    residuals_px: Array
 
 
 def locate_markers(
@@ -103,7 +101,7 @@ def locate_markers(
     covariances += by_height @ by_height.swapaxes(1, 2)
     headings_rad = (headings_rad - change[:, 2] + np.pi) % (2 * np.pi) - np.pi
     chi2 = (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0]
-    return Positions(points_m, headings_rad, covariances, chi2, modes_m, left[:, :, 0])
+    return Positions(points_m, headings_rad, covariances, chi2, modes_m)
 
 
 def _start(

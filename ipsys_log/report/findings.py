@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.analysis.calibration_points import measured, split_ids
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
-from ipsys_log.messages.channels import EVALUATION, MODEL
+from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
 from ipsys_log.models.table import reads_corners
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, uses_height
@@ -204,19 +206,19 @@ def _calibrated(session: Session, models: Sequence[Model]) -> tuple[CalibratedCa
         return ()
     # Late: scipy takes 1 s, and most reports have no joint model.
     from ipsys_log.analysis.calibrated_cameras import describe_cameras
-    from ipsys_log.analysis.joint_calibration import observe
+    from ipsys_log.analysis.joint_calibration import fit_without, observe
 
     records = [run for run in complete_runs(session) if writes(run, MODEL)]
     record = next((r for r in reversed(records) if method_of(session, r) == model.name), None)
-    view = LogView(session)
-    if record is not None:
+    view, fit = LogView(session), None
+    if record is not None and {read.topic for read in record.inputs} & {*session.topics(MEASUREMENTS)}:
         view = LogView(session, input_runs(record), record.rig, replaced_lenses(record))
-    try:
-        observations = observe(view)
-    except FitError:  # a log with the model of another log may have no markers
-        observations = None
+        measurements = [point.measurement for point in measured(view)]
+        used, _ = split_ids(measurements, record.parameters)
+        with suppress(FitError):
+            fit = fit_without(observe(view), {one.id for one in measurements} - used)
     sizes_px = {camera: (lens.width, lens.height) for camera, lens in view.calibrations().items()}
-    return describe_cameras(model, sizes_px, observations)
+    return describe_cameras(model, sizes_px, fit)
 
 
 def _model(session: Session, run: str) -> Model | None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 from ipsys_log.messages import Rig
 from ipsys_log.report.figures import style_axes
+from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
 
 __all__ = ["clocks_figure", "has_clocks", "poses_figure", "residual_limit_px", "residuals_figure"]
@@ -33,9 +34,10 @@ _ARROW = 0.04
 def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure:
     """Draw the cameras from above and from the side, each with its field of view on the floor."""
     figure = Figure(figsize=(_WIDTH_IN, 7.0), layout="constrained")
-    above, beside = figure.subplots(2, 1, height_ratios=[3.2, 1.4], sharex=True)
+    above, beside = figure.subplots(2, 1, height_ratios=[3.2, 1.4])
     styles = camera_styles(camera.camera for camera in cameras)
-    _draw_floor(above, rig)
+    around_m = [part for camera in cameras for part in (camera.outline_m, camera.origin_m[None, :2])]
+    draw_ground(above, rig, [part for part in around_m if len(part)])
     for camera in cameras:
         colour, shape = styles[camera.camera]
         x_m, y_m, z_m = camera.origin_m.tolist()
@@ -46,15 +48,14 @@ def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure
         beside.plot(x_m, z_m, shape, color=colour, ms=8, zorder=4)
         for end_m in _ends_m(camera):
             beside.plot([x_m, end_m], [z_m, 0.0], color=colour, lw=1.0)
-    above.autoscale_view()
-    above.set(aspect="equal", ylabel="y in m")
     above.set_title("From above", loc="left", fontsize=10)
     beside.axhline(0.0, color=NOTE, lw=1.2)
     beside.set(xlabel="x in m", ylabel="height in m")
     beside.set_ylim(bottom=0.0, top=1.15 * max(float(camera.origin_m[2]) for camera in cameras))
     beside.set_title("From the side, along y", loc="left", fontsize=10)
+    beside.set_xlim(above.get_xlim())
+    style_axes(beside)
     for axes in (above, beside):
-        style_axes(axes)
         axes.tick_params(labelsize=8)
     figure.legend(loc="outside lower center", frameon=False, fontsize=8)
     return figure
@@ -66,17 +67,6 @@ def _pose_label(camera: CalibratedCamera) -> str:
         f"{shorten(camera.camera)}: height {camera.origin_m[2]:.3f} m ± {camera.sigmas_m[2] * _MM_PER_M:.1f} "
         f"mm, place ± {flat_mm:.1f} mm"
     )
-
-
-def _draw_floor(axes: Axes, rig: Rig | None) -> None:
-    if rig is None:
-        return
-    if rig.floor is not None:
-        size_m = rig.floor.width_m, rig.floor.depth_m
-        axes.add_patch(Rectangle((0.0, 0.0), *size_m, fill=False, ec="black", lw=1.2))
-    for point in rig.reference_points:
-        axes.plot(point.x_m, point.y_m, "+", color="black", ms=9, mew=1.4)
-        axes.annotate(point.name, (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold")
 
 
 def _draw_axis(axes: Axes, camera: CalibratedCamera, colour: str) -> None:

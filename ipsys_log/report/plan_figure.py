@@ -76,7 +76,7 @@ def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float)
     shown_m = np.vstack([seen_m - half_m, seen_m + half_m, found.measured_m[:, :2]])
     middle_m, span_m = (shown_m.max(axis=0) + shown_m.min(axis=0)) / 2, float(np.ptp(shown_m, axis=0).max())
     _draw_rings(axes, found, _RING * span_m)
-    if found.drive is not None:
+    if found.drive is not None and found.drive.is_useful:
         axes.add_patch(_drive_area(found.drive))
     (x0, y0), (x1, y1) = middle_m - 0.52 * span_m, middle_m + 0.52 * span_m
     axes.set(xlim=(x0, x1), ylim=(y0, y1), xlabel="x in m", ylabel="y in m")

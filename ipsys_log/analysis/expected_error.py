@@ -209,9 +209,7 @@ def see_markers(
     everywhere = np.ones(len(points_m), dtype=np.bool_)
     around = corners_c(WHOLE_PRINT * length_m, everywhere)
     seen: Mask = np.asarray(in_image(around, lens).reshape(-1, 4).all(axis=1), dtype=np.bool_)
-    corners_px = np.zeros((0, 4, 2))
-    if seen.any():
-        corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
+    corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
     return MarkerView(seen, corners_px, centres_m[seen], turns[seen], heights_m[seen])
 
 

@@ -139,11 +139,15 @@ def test_loaded_joint_model_gives_the_positions_of_locate(ipsys: Ipsys, fitted: 
     assert isinstance(model, FittedCornerModel)
     with Session([fitted]) as session:
         rig = session.payloads(session.topics(RIG))[-1]
-        seen = next(m for m in session.messages(session.topics(MARKERS, "geometric")) if m.payload.markers)
-        (positions,) = (
-            m.payload.positions
+        located = {
+            (m.camera, m.log_time_ns): m.payload.positions
             for m in session.messages(session.topics(POSITIONS, "joint"))
-            if (m.camera, m.log_time_ns) == (seen.camera, seen.log_time_ns)
+        }
+        # A marker on a robot is at the height of the rig, other than one at a calibration point.
+        seen, positions = next(
+            (m, positions)
+            for m in session.messages(session.topics(MARKERS, "geometric"))
+            if (positions := located[m.camera, m.log_time_ns]) and all(p.inside for p in positions)
         )
     markers = seen.payload.markers
     corners_px = np.array([marker.corners_px for marker in markers])
@@ -157,7 +161,7 @@ def test_loaded_joint_model_gives_the_positions_of_locate(ipsys: Ipsys, fitted: 
     level = model.predict(str(seen.camera), corners_px, rig.marker_length_m, heights_m)
     free = model.predict(str(seen.camera), corners_px, rig.marker_length_m)
     assert np.abs(level - expected_m).max() < 0.002
-    assert np.abs(free - expected_m)[:, :2].max() < 0.03
+    assert np.abs(free - expected_m)[:, :2].max() < 0.01
     with pytest.raises(IpsysError, match="has no camera 'blue'"):
         model.predict("blue", corners_px, 0.2)
     with pytest.raises(IpsysError, match=r"corners_px has the shape \(3,\)"):
@@ -206,7 +210,7 @@ def test_wrong_tape_reading_is_an_outlier_of_joint(ipsys: Ipsys, tmp_path: Path)
     (model,) = json.loads(done.out)["models"].values()
     (suspect,) = model["suspects"]
     assert (suspect["measurement"], suspect["kind"]) == ("s004", "distance")
-    assert "10" in suspect["text"]
+    assert "distance to A" in suspect["text"]
     assert 5 < np.linalg.norm(suspect["residual_cm"]) < 25
     with Session([log]) as session:
         (evaluation,) = session.payloads(session.topics(EVALUATION, "joint"))

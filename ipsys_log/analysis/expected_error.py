@@ -165,6 +165,8 @@ def _modes(
     """
     view = see_markers(model, size_px, points_m, heights_m, length_m)
     count = len(view.corners_px)
+    if not count:
+        return view.seen, np.zeros((0, 2, model.modes.shape[1]))
     exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
     lengths_m = np.full(count, length_m)
     located = locate_markers(

@@ -208,8 +208,6 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
 
 def _distort(points_uv: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:
     """Return the pixels (n, 2) of normalized image coordinates (n, 2)."""
-    if not len(points_uv):  # OpenCV refuses an empty array
-        return np.zeros((0, 2))
     if lens.distortion_model == "kannala_brandt":
         # The result is bit-identical to that of projectPoints, which also computes a Jacobian and takes 30
         # times as long.
@@ -231,6 +229,8 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
     (n, 2), in px of the raw image.
     """
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 3)
+    if not len(points):  # OpenCV refuses an empty array
+        return np.zeros((0, 2))
     if lens.distortion_model == "kannala_brandt":
         depths = points[:, 2:]
         if not depths.all():

@@ -152,20 +152,29 @@ def joint_pictures(findings: Findings) -> list[Picture]:
         )
     ]
     if has_clocks(cameras):
-        text = "Clock offsets of the cameras. Bars: two standard deviations"
+        text = (
+            "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the reference, or "
+            "that of a camera that saw no drive"
+        )
         pictures.append(_picture(clocks_figure(cameras), text))
     most_px = residual_limit_px(cameras)
     for camera in cameras:
         if camera.residuals is None:
             continue
-        outliers = camera.residuals.outliers
         caption = (
             f"Corner residuals in the image of {camera.camera}, estimated minus measured, as means of cells; "
-            f"arrows are enlarged. {outliers} {'sighting' if outliers == 1 else 'sightings'} without a fit "
-            f"{'is' if outliers == 1 else 'are'} left out"
+            f"arrows are enlarged{_left_out(camera.residuals.outliers)}"
         )
         pictures.append(_picture(residuals_figure(camera, most_px), caption))
     return pictures
+
+
+def _left_out(outliers: int) -> str:
+    if not outliers:
+        return ""
+    return (
+        f". Without {'one sighting that does' if outliers == 1 else f'{outliers} sightings that do'} not fit"
+    )
 
 
 def coverage_picture(findings: Findings) -> Picture | None:

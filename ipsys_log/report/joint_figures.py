@@ -100,7 +100,7 @@ def clocks_figure(cameras: Sequence[CalibratedCamera]) -> Figure:
         colour, shape = styles[camera.camera]
         offset_ms, sigma_ms = camera.clock_s * _MS_PER_S, camera.clock_sigma_s * _MS_PER_S
         axes.errorbar(offset_ms, row, xerr=2 * sigma_ms, fmt=shape, color=colour, ms=6, capsize=3)
-        text = f"{offset_ms:+.2f} ± {sigma_ms:.2f} ms" if sigma_ms else "reference"
+        text = f"{offset_ms:+.2f} ± {sigma_ms:.2f} ms" if sigma_ms else "constant"
         labels.append(f"{shorten(camera.camera)}\n{text}")
     axes.axvline(0.0, color=NOTE, lw=1.0)
     axes.set_yticks(range(len(cameras)), labels)
@@ -131,7 +131,7 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     )  # fmt: skip
     arrows.set_clim(0.0, most_px)
     axes.scatter(
-        *residuals.cells_px.T, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=9, zorder=4
+        *residuals.cells_px.T, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4
     )
     axes.set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height), aspect="equal")
     axes.set_xticks([0, width])

@@ -76,7 +76,7 @@ def test_page_has_a_picture_of_each_kind(cameras: tuple[CalibratedCamera, ...], 
     assert captions[0].startswith("Poses of the cameras")
     assert captions[1].startswith("Clock offsets")
     assert "image of black" in captions[2]
-    assert captions[3].endswith("1 sighting without a fit is left out")
+    assert captions[3].endswith(". Without one sighting that does not fit")
     assert all(one["width"] < 480 for one in joint_pictures(findings))
     still = tuple(replace(camera, clock_sigma_s=0.0, residuals=None) for camera in cameras)
     assert len(joint_pictures(replace(findings, calibrated=still))) == 1

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.expected_error import ExpectedErrors, mean_error, see_markers, some_modes
+from ipsys_log.analysis.expected_error import ExpectedErrors, see_markers
+from ipsys_log.analysis.taped_points import mean_error, some_modes
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.settings import JointSettings

@@ -8,14 +8,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.expected_error import (
-    ExpectedErrors,
-    FloorGrid,
-    TapeCovariances,
-    choose_points,
-    expect_errors,
-)
-from ipsys_log.analysis.plan import MeasurementPlan, PlannedPlace, mean_length
+from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors, mean_lengths
+from ipsys_log.analysis.plan import MeasurementPlan, PlannedPlace
+from ipsys_log.analysis.taped_points import TapeCovariances, choose_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.model import JointModel
 
@@ -88,7 +83,6 @@ def _least(expected: Sequence[ExpectedErrors], update: Array | None) -> Array:
     least_m = np.full(len(expected[0].seen), np.nan)
     for one in expected:
         modes_m = one.modes_m if update is None else one.modes_m @ update
-        covariances_m2 = modes_m @ modes_m.swapaxes(1, 2)
-        errors_m = mean_length(covariances_m2[:, [0, 1, 0], [0, 1, 1]].T)
+        errors_m = mean_lengths(modes_m @ modes_m.swapaxes(1, 2))
         least_m[one.seen] = np.fmin(least_m[one.seen], errors_m)
     return least_m

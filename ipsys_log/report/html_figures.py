@@ -153,8 +153,8 @@ def joint_pictures(findings: Findings) -> list[Picture]:
     ]
     if has_clocks(cameras):
         text = (
-            "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the reference, or "
-            "that of a camera that saw no drive"
+            "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the "
+            "reference, or that of a camera that saw no drive"
         )
         pictures.append(_picture(clocks_figure(cameras), text))
     most_px = residual_limit_px(cameras)

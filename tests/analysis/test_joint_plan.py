@@ -9,14 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ipsys_log.analysis.drive_plan import choose_drive
-from ipsys_log.analysis.expected_error import (
-    ExpectedErrors,
-    FloorGrid,
-    choose_points,
-    expect_errors,
-    posterior_root,
-)
+from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors
 from ipsys_log.analysis.joint_plan import plan_joint_points
+from ipsys_log.analysis.taped_points import choose_points, posterior_root
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.model import JointModel, build_models

@@ -16,7 +16,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION
-from ipsys_log.models.table import AppliedModel
+from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.opened_log import Export, Listing, Log, StrPath
 from ipsys_log.player import Player
 from ipsys_log.runs.options import Progress, Request
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipsys_log.capture.frames import Clock
+    from ipsys_log.joint.fitted_corners import FittedCornerModel
     from ipsys_log.sinks.sink import Sink
 
 __all__ = [
@@ -243,12 +244,16 @@ class FittedModel:
         return self._applied[camera].predict(points, heights)
 
 
-def load_model(path: StrPath, name: str | None = None) -> FittedModel:
+def load_model(path: StrPath, name: str | None = None) -> FittedModel | FittedCornerModel:
     """Load the newest fitted model of a log.
 
     Parameters
     ----------
     name : the name in the table of models, such as ``best``; None: the newest of all.
+
+    Returns
+    -------
+    A model that reads camera points; or, for ``joint``, one that reads the corners of markers.
 
     Raises
     ------
@@ -258,7 +263,12 @@ def load_model(path: StrPath, name: str | None = None) -> FittedModel:
     from ipsys_log.runs.select import fitted_in
 
     with Session([Path(path)]) as session:
-        return FittedModel(fitted_in(session, name)[0])
+        model = fitted_in(session, name)[0]
+    if not reads_corners(model.name):
+        return FittedModel(model)
+    from ipsys_log.joint.fitted_corners import FittedCornerModel  # late: scipy takes 1 s
+
+    return FittedCornerModel(model)
 
 
 def calibrate(

@@ -41,14 +41,14 @@ from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
 from ipsys_log.capture.recorder import Recording, Source, open_recording, write_each
-from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.errors import FitError, IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
-from ipsys_log.models.table import MODELS
+from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.execute import compute_messages, run_stage, sign
@@ -57,7 +57,7 @@ from ipsys_log.runs.model_checks import check_fits
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.provenance import Outcome
-from ipsys_log.runs.select import wanted_models
+from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import WiredStage, in_threads, run
 from ipsys_log.sinks.sink import Consumer, Consumers, Sink
 
@@ -93,7 +93,8 @@ def replay(
         The input has a fault that the user must correct.
     """
     stages = stages_until(until)
-    models = wanted_models(request, paths, tuple(MODELS) if EVALUATION in stages[-1].writes else ("poly",))
+    usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
+    models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)
     outcomes: list[Outcome] = []
     unchecked = list(models) if len(models) > 1 else []
@@ -126,9 +127,15 @@ def replay(
                 do(stage, shared)
         for model in models:
             inputs = dict(shared)
-            for stage in stages:
-                if is_of_model(stage):
-                    do(stage, inputs, model)
+            try:
+                for stage in stages:
+                    if is_of_model(stage):
+                        do(stage, inputs, model)
+            except FitError as error:
+                # The checks before cannot know if corners determine all cameras.
+                if model in request.models or not reads_corners(model):
+                    raise
+                say(f"{model} is left out: {error}")
     return outcomes
 
 

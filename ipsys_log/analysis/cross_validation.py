@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ __all__ = [
     "FOLDS",
     "REPEATS",
     "SUBSETS",
+    "Predict",
     "cross_validate",
     "gather_points",
     "labelled_subsets",
@@ -37,6 +39,11 @@ Array = NDArray[np.float64]
 
 FOLDS = 5
 REPEATS = 4
+SUBSETS = 10
+
+# A function from ids of measurements that a fit leaves out to the predictions of that fit for all points,
+# (n, 3) in m by camera. It raises FitError if the other points determine no model.
+Predict = Callable[[Collection[str]], Mapping[str, Array]]
 
 
 def gather_points(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, CalibrationPoints]:
@@ -181,7 +188,6 @@ def _each_left_out(
     return predictions
 
 
-SUBSETS = 10
 _SIZES = (5, 7, 10, 15, 20, 30, 40, 60, 80, 120, 160, 240)
 # Least number of held-out points for an error.
 _LEAST_REST = 5
@@ -194,7 +200,11 @@ def learning_sizes(name: str, cameras: Mapping[str, CalibrationPoints]) -> list[
 
 
 def learning_curve(
-    name: str, cameras: Mapping[str, CalibrationPoints], seed: int
+    name: str,
+    cameras: Mapping[str, CalibrationPoints],
+    seed: int,
+    predict: Predict | None = None,
+    subsets: int = SUBSETS,
 ) -> Iterator[list[LearningPoint]]:
     """Yield the errors of models that are fitted to random subsets, for one subset size after the other.
 
@@ -205,16 +215,19 @@ def learning_curve(
     name : name in the table of models.
     cameras : all calibration points; the errors are those at the points that are not in a subset.
     seed : random seed of the subsets.
+    predict : predictions of a fit to some points; None for those of :func:`predict_without`.
+    subsets : number of subsets of each size.
     """
+    predict = predict or partial(predict_without, name, cameras)
     rng = np.random.default_rng(seed)
     points = sorted({point for places in cameras.values() for point in places.point_names})
     for size in learning_sizes(name, cameras):
         errors: dict[str, list[tuple[float, float]]] = {camera: [] for camera in cameras}
-        for _ in range(SUBSETS):
+        for _ in range(subsets):
             order = rng.permutation(points).tolist()
             used = {point for places in cameras.values() for point in _first(places, order, size)}
             left_out = set(_measurements(cameras, set(points) - used))
-            for camera, means_m in _errors(name, cameras, left_out, left_out).items():
+            for camera, means_m in _errors(predict, cameras, left_out, left_out).items():
                 errors[camera].append(means_m)
         yield [_point(camera, size, np.array(rows)) for camera, rows in errors.items() if rows]
 
@@ -236,13 +249,18 @@ def labelled_subsets(measurements: Iterable[Measurement]) -> dict[str, set[str]]
 
 
 def published_curve(
-    name: str, cameras: Mapping[str, CalibrationPoints], subsets: Mapping[str, set[str]], held_out: set[str]
+    name: str,
+    cameras: Mapping[str, CalibrationPoints],
+    subsets: Mapping[str, set[str]],
+    held_out: set[str],
+    predict: Predict | None = None,
 ) -> list[LearningPoint]:
     """Return errors at held-out points of models fitted to labelled subsets (the paper's figures 10, 11)."""
+    predict = predict or partial(predict_without, name, cameras)
     names = {name for places in cameras.values() for name in places.names}
     points = []
     for label, used in sorted(subsets.items()):
-        for camera, means_m in _errors(name, cameras, names - used, held_out - used).items():
+        for camera, means_m in _errors(predict, cameras, names - used, held_out - used).items():
             count = sum(place in used for place in cameras[camera].names)
             points.append(LearningPoint(camera, count, *means_m, subsets=1, label=label))
     return points
@@ -254,11 +272,11 @@ def _first(places: CalibrationPoints, order: list[str], size: int) -> list[str]:
 
 
 def _errors(
-    name: str, cameras: Mapping[str, CalibrationPoints], left_out: set[str], looked_at: set[str]
+    predict: Predict, cameras: Mapping[str, CalibrationPoints], left_out: set[str], looked_at: set[str]
 ) -> dict[str, tuple[float, float]]:
     """Return the mean 3D error and floor error by camera; none if the other points determine no model."""
     try:
-        predicted = predict_without(name, cameras, left_out)
+        predicted = predict(left_out)
     except FitError:
         return {}
     errors = {}

@@ -1,14 +1,13 @@
-"""Expected error over the floor of a joint calibration, its gaps, and the points that reduce the error most.
+"""Expected error over the floor of a joint calibration, and its gaps.
 
 The covariance of a joint calibration gives the expected error at each node of a grid, without ground truth.
-The errors of all cameras are linear functions of the same independent normal numbers. So the effect of one
-more taped point on the whole floor follows from a small linear system, without a fit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +26,12 @@ __all__ = [
     "ExpectedErrors",
     "FloorGap",
     "FloorGrid",
-    "TapeCovariances",
-    "TapedPoint",
-    "choose_points",
+    "MarkerView",
+    "camera_modes",
     "expect_errors",
     "find_gaps",
+    "mean_lengths",
+    "see_markers",
 ]
 
 Array = NDArray[np.float64]
@@ -41,13 +41,6 @@ Mask = NDArray[np.bool_]
 _COVERED_M = 0.35
 # Smaller gaps are not reported.
 _LEAST_GAP_M2 = 0.1
-# Repeatable error of the position of a marker by one camera, for the choice of points.
-_CORNER_SIGMA_M = 0.0003
-# So many camera-nodes give the mean error over the floor accurately enough for the choice of points.
-_ENOUGH_NODES = 800
-
-# A function from points (n, 2) to the covariances (n, 2, 2) of their tape readings.
-TapeCovariances = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,15 +99,6 @@ class FloorGap:
     error_m: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TapedPoint:
-    """A point to measure: ``point_m`` (2,), the cameras that see it, and the expected mean error after it."""
-
-    point_m: Array
-    cameras: tuple[str, ...]
-    mean_after_m: float
-
-
 def expect_errors(
     models: Mapping[str, JointModel],
     sizes_px: Mapping[str, tuple[int, int]],
@@ -134,38 +118,72 @@ def expect_errors(
     """
     expected = []
     for camera, model in models.items():
-        seen, modes_m = _modes(model, sizes_px[camera], grid.nodes_m, height_m, length_m)
-        expected.append(ExpectedErrors(camera, seen, _lengths(modes_m @ modes_m.swapaxes(1, 2)), modes_m))
+        seen, modes_m = camera_modes(model, sizes_px[camera], grid.nodes_m, height_m, length_m)
+        expected.append(ExpectedErrors(camera, seen, mean_lengths(modes_m @ modes_m.swapaxes(1, 2)), modes_m))
     return expected
 
 
-def _modes(
-    model: JointModel, size_px: tuple[int, int], points_m: Array, height_m: float, length_m: float
+def camera_modes(
+    model: JointModel, size_px: tuple[int, int], points_m: Array, heights_m: Array | float, length_m: float
 ) -> tuple[Mask, Array]:
-    """Return a mask (p,) of the points (p, 2) at which a camera sees a whole marker, and their modes."""
+    """Return a mask (p,) of the points (p, 2) at which a camera sees a whole marker, and their modes.
+
+    ``heights_m`` is a number or (p,).
+    """
+    view = see_markers(model, size_px, points_m, heights_m, length_m)
+    count = len(view.corners_px)
+    if not count:
+        return view.seen, np.zeros((0, 2, model.modes.shape[1]))
+    exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
+    lengths_m = np.full(count, length_m)
+    located = locate_markers(
+        model, view.corners_px, exact, view.heights_m, lengths_m, 0.0, tilt_sigma_rad=0.0
+    )
+    return view.seen, located.modes_m[:, :2]
+
+
+class MarkerView(NamedTuple):
+    """Markers on the floor as a camera sees them: a mask (p,), and the n seen ones.
+
+    ``corners_px`` (n, 4, 2) are exact, ``centres_m`` (n, 3) and ``turns`` (n, 3, 3) are the poses in the
+    world, ``heights_m`` (n,) the heights above the floor.
+    """
+
+    seen: Mask
+    corners_px: Array
+    centres_m: Array
+    turns: Array
+    heights_m: Array
+
+
+def see_markers(
+    model: JointModel,
+    size_px: tuple[int, int],
+    points_m: Array,
+    heights_m: Array | float,
+    length_m: float,
+    headings_rad: Array | float = 0.0,
+) -> MarkerView:
+    """Return the markers at points (p, 2) that are whole in the image of a camera, with their margins."""
     lens = replace(model.calibration, width=size_px[0], height=size_px[1])
     floor_m = model.floor.heights(points_m, model.amplitudes)[0]
-    centres_m = np.column_stack([points_m, height_m + floor_m])
-
-    turn = level_turns(np.zeros(1))[0]
+    heights_m = np.broadcast_to(heights_m, floor_m.shape)
+    centres_m = np.column_stack([points_m, heights_m + floor_m])
+    turns = level_turns(np.broadcast_to(headings_rad, floor_m.shape))
 
     def corners_c(side_m: float, rows: Mask) -> Array:
-        corners_m = centres_m[rows, None] + marker_corners(side_m) @ turn.T
+        corners_m = centres_m[rows, None] + marker_corners(side_m) @ turns[rows].swapaxes(1, 2)
         return np.asarray((corners_m.reshape(-1, 3) - model.origin_m) @ model.camera_from_world.T)
 
     everywhere = np.ones(len(points_m), dtype=np.bool_)
     around = corners_c(WHOLE_PRINT * length_m, everywhere)
     seen: Mask = np.asarray(in_image(around, lens).reshape(-1, 4).all(axis=1), dtype=np.bool_)
     corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
-    count = len(corners_px)
-    exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
-    located = locate_markers(
-        model, corners_px, exact, np.full(count, height_m), np.full(count, length_m), 0.0, tilt_sigma_rad=0.0
-    )
-    return seen, located.modes_m[:, :2]
+    return MarkerView(seen, corners_px, centres_m[seen], turns[seen], heights_m[seen])
 
 
-def _lengths(covariances_m2: Array) -> Array:
+def mean_lengths(covariances_m2: Array) -> Array:
+    """Return the mean lengths (n,) of errors in the plane with covariances (n, 2, 2)."""
     return mean_length(covariances_m2[:, [0, 1, 0], [0, 1, 1]].T)
 
 
@@ -200,81 +218,3 @@ def find_gaps(expected: ExpectedErrors, grid: FloorGrid, places_m: Array) -> tup
         error_m = float(errors_m.reshape(shape)[inside].mean())
         gaps.append(FloorGap(expected.camera, area_m2, low_m, high_m, error_m))
     return float(1 - open_nodes.mean()), sorted(gaps, key=lambda gap: -gap.area_m2)
-
-
-def choose_points(
-    models: Mapping[str, JointModel],
-    sizes_px: Mapping[str, tuple[int, int]],
-    expected: Sequence[ExpectedErrors],
-    candidates_m: Array,
-    tape_m2: TapeCovariances,
-    length_m: float,
-    goal_m: float,
-    count: int,
-) -> list[TapedPoint]:
-    """Choose the points on the floor whose tape readings reduce the mean expected error most, one by one.
-
-    The choice ends when the error is at most ``goal_m``, after ``count`` points, or without a candidate that
-    a camera sees.
-
-    Parameters
-    ----------
-    models, sizes_px : by camera.
-    expected : of all cameras.
-    candidates_m : (c, 2), possible points.
-    tape_m2 : function for the covariances of their tape readings.
-    length_m : side of the marker.
-    goal_m : wanted mean error.
-    count : the largest number of points.
-
-    References
-    ----------
-    V-optimality, also called I-: Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, ch. 10.
-    """
-    modes_m = np.concatenate([one.modes_m for one in expected])
-    if not len(modes_m) or not len(candidates_m):
-        return []
-    modes_m = modes_m[:: max(1, len(modes_m) // _ENOUGH_NODES)]
-    views = {
-        camera: _modes(model, sizes_px[camera], candidates_m, 0.0, length_m)
-        for camera, model in models.items()
-    }
-    rows = {camera: np.cumsum(seen) - 1 for camera, (seen, _) in views.items()}
-    tapes_m2 = tape_m2(candidates_m)
-    chosen: list[TapedPoint] = []
-    slopes, noise_m2 = np.zeros((0, modes_m.shape[2])), np.zeros((0, 0))
-    mean_m = float(_lengths(modes_m @ modes_m.swapaxes(1, 2)).mean())
-    while len(chosen) < count and mean_m > goal_m:
-        best: tuple[float, int, tuple[str, ...], Array, Array] | None = None
-        for number in range(len(candidates_m)):
-            cameras = tuple(camera for camera, (seen, _) in views.items() if seen[number])
-            if not cameras:
-                continue
-            own = np.concatenate([views[camera][1][rows[camera][number]] for camera in cameras])
-            own_m2 = np.tile(tapes_m2[number], (len(cameras), len(cameras)))
-            own_m2 += _CORNER_SIGMA_M**2 * np.eye(len(own))
-            together, together_m2 = np.concatenate([slopes, own]), _block_diagonal(noise_m2, own_m2)
-            after_m = _mean_after(modes_m, together, together_m2)
-            if best is None or after_m < best[0]:
-                best = after_m, number, cameras, together, together_m2
-        if best is None:
-            break
-        mean_m, number, cameras, slopes, noise_m2 = best
-        chosen.append(TapedPoint(candidates_m[number], cameras, mean_m))
-    return chosen
-
-
-def _block_diagonal(first: Array, second: Array) -> Array:
-    both = np.zeros((len(first) + len(second),) * 2)
-    both[: len(first), : len(first)] = first
-    both[len(first) :, len(first) :] = second
-    return both
-
-
-def _mean_after(modes_m: Array, slopes: Array, noise_m2: Array) -> float:
-    """Return the mean expected error (n, 2, m) after observations with slopes (k, m) and noise (k, k)."""
-    root = np.linalg.cholesky(slopes @ slopes.T + noise_m2)
-    gain = np.linalg.solve(root, slopes @ modes_m.reshape(-1, modes_m.shape[2]).T)
-    gain = gain.T.reshape(len(modes_m), 2, -1)
-    covariances_m2 = modes_m @ modes_m.swapaxes(1, 2) - gain @ gain.swapaxes(1, 2)
-    return float(_lengths(covariances_m2).mean())

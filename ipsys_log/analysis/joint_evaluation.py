@@ -1,100 +1,212 @@
-"""Errors of the joint model on calibration points that were not in its fit."""
+"""Evaluation of the joint model: errors on points that are not in its fit, learning curve, and outliers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
-from ipsys_log.analysis.cross_validation import FOLDS, gather_points, make_folds
+from ipsys_log.analysis.cross_validation import (
+    FOLDS,
+    gather_points,
+    learning_curve,
+    learning_sizes,
+    make_folds,
+    published_curve,
+)
 from ipsys_log.analysis.joint_calibration import fit_without
+from ipsys_log.analysis.joint_outliers import find_joint_outliers
+from ipsys_log.analysis.study import Study
 from ipsys_log.errors import FitError
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import restore_joint
-from ipsys_log.messages import CameraEvaluation, Evaluation, Model, Pair
+from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
 
-__all__ = ["evaluate_joint"]
+__all__ = ["JOINT_SUBSETS", "evaluate_joint"]
 
 Array = NDArray[np.float64]
-Pairs = Mapping[str, Sequence[Pair]]
+Models = Mapping[str, JointModel]
+
+# Random subsets of each size. A fit takes seconds with a drive, so these are fewer than for other models.
+JOINT_SUBSETS = 3
 
 
 def evaluate_joint(
     model: Model,
     observations: Observations,
-    pairs: Pairs,
-    held_out: Collection[str],
-    ground_truth: Mapping[str, Array],
-    seed: int | None,
+    study: Study,
+    excluded: tuple[Suspect, ...],
     time_ns: int,
     notes: list[str],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Evaluation:
-    """Compute errors on held-out points, and by cross-validation with one repeat.
+    """Compute errors on held-out points and by cross-validation, the learning curve, and outliers.
+
+    All fits use all drives. The cross-validation has one repeat, because a fit takes seconds.
 
     Parameters
     ----------
     model : the fitted joint model.
     observations : all observations of the log.
-    pairs : the calibration points that each camera saw.
-    held_out : ids of the held-out measurements.
-    ground_truth : world points (3,) in m by id; empty outside a simulated lab.
-    seed : of the folds; None for a model of another log, which is not fitted again.
+    study : the calibration points; ``seed`` is None for a model of another log, which is not fitted again.
+    excluded : the gross outliers. The errors and the learning curve are without them.
     time_ns : of the last input.
     notes : list of remarks; each impossible step adds a remark.
-    progress : called with the number of fits done, and the number of all fits.
+    progress : called with the number of steps done, and the number of all steps.
     """
+    study = replace(study, pairs=_located(observations, study.pairs))
     cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
     used = {pair.measurement for camera in model.cameras for pair in camera.pairs}
-    rest = set(held_out) - used
-    rows = _error_rows(model, [_predict(cameras, observations, pairs, rest)], ground_truth, HELD_OUT)
-    if seed is not None:
+    if study.seed is None:
+        rows = _held_out_rows(model, cameras, observations, study, used)
+        return Evaluation(time_ns, model.name, tuple(rows))
+    gross = {suspect.measurement for suspect in excluded}
+    clean, reduced = study, cameras
+    if gross:
+        names = {point.name for point in observations.points}
         try:
-            parts = []
-            folds = make_folds(gather_points(pairs), FOLDS, np.random.default_rng(seed))
-            for done, fold in enumerate(folds):
-                progress(done, len(folds))
-                fitted = build_models(fit_without(observations, fold))
-                parts.append(_predict(fitted, observations, pairs, fold))
-            progress(len(folds), len(folds))
-            rows += _error_rows(model, parts, ground_truth, CROSS_VALIDATION)
+            reduced = build_models(fit_without(observations, (names - used) | gross))
+            clean = _without(study, gross)
         except FitError as error:
-            notes.append(f"no cross-validation: {error}")
-    return Evaluation(time_ns, model.name, tuple(rows))
+            notes.append(f"gross outliers are not excluded: {error}")
+            excluded, gross = (), set()
+    points = gather_points(clean.pairs)
+    sizes = learning_sizes(model.name, points) if points else []
+    steps = _Steps(FOLDS * (1 + bool(gross)) + len(sizes) + 1, progress)
+    rows = _held_out_rows(model, reduced, observations, clean, used)
+    rows += _cross_validated_rows(model, observations, clean, gross, notes, steps)
+    learning = _learning(model.name, observations, clean, gross, steps)
+    with_excluded: list[CameraEvaluation] = []
+    if gross:
+        with_excluded = _held_out_rows(model, cameras, observations, study, used)
+        with_excluded += _cross_validated_rows(model, observations, study, set(), [], steps)
+    suspects = _suspects(observations, study, notes)
+    steps.done()
+    return Evaluation(
+        time_ns, model.name, tuple(rows), tuple(learning), suspects, excluded, tuple(with_excluded)
+    )
+
+
+class _Steps:
+    """The steps of an evaluation, and how many of them are done."""
+
+    def __init__(self, total: int, progress: Callable[[int, int], None]) -> None:
+        self._count, self._total, self._progress = 0, total, progress
+        progress(0, total)
+
+    def done(self) -> None:
+        self._count += 1
+        self._progress(min(self._count, self._total), self._total)
+
+
+def _located(observations: Observations, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, list[Pair]]:
+    """Return the pairs whose corners a camera saw in the stationary interval."""
+    located = {}
+    for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
+        seen = {observations.points[point].name for point in sightings.point.tolist() if point >= 0}
+        located[camera.name] = [pair for pair in pairs.get(camera.name, ()) if pair.measurement in seen]
+    return located
+
+
+def _without(study: Study, names: Collection[str]) -> Study:
+    pairs = {
+        camera: [pair for pair in own if pair.measurement not in names] for camera, own in study.pairs.items()
+    }
+    return replace(study, pairs=pairs, held_out=study.held_out - set(names))
+
+
+def _held_out_rows(
+    model: Model, cameras: Models, observations: Observations, study: Study, used: Collection[str]
+) -> list[CameraEvaluation]:
+    predicted = _predict(cameras, observations, study, study.held_out - set(used))
+    return _error_rows(model, [predicted], study, HELD_OUT)
+
+
+def _cross_validated_rows(
+    model: Model,
+    observations: Observations,
+    study: Study,
+    left_out: set[str],
+    notes: list[str],
+    steps: _Steps,
+) -> list[CameraEvaluation]:
+    assert study.seed is not None
+    parts = []
+    try:
+        for fold in make_folds(gather_points(study.pairs), FOLDS, np.random.default_rng(study.seed)):
+            fitted = build_models(fit_without(observations, fold | left_out))
+            parts.append(_predict(fitted, observations, study, fold))
+            steps.done()
+    except FitError as error:
+        notes.append(f"no cross-validation: {error}")
+        return []
+    return _error_rows(model, parts, study, CROSS_VALIDATION)
+
+
+def _learning(
+    name: str, observations: Observations, study: Study, excluded: set[str], steps: _Steps
+) -> list[LearningPoint]:
+    """Return the errors by the number of calibration points, each with all drives."""
+    assert study.seed is not None
+    cameras = gather_points(study.pairs)
+    if not cameras:
+        return []
+
+    def predict(left_out: Collection[str]) -> dict[str, Array]:
+        models = build_models(fit_without(observations, {*left_out, *excluded}))
+        # A camera without a sighting has no model: then this subset counts for no camera.
+        if missing := cameras.keys() - models.keys():
+            raise FitError(f"camera {min(missing)}: it saw no point of the subset")
+        everything = {name for places in cameras.values() for name in places.names}
+        predicted = _predict(models, observations, study, everything)
+        return {camera: points_m for camera, (_, points_m, _) in predicted.items()}
+
+    points = published_curve(name, cameras, study.subsets, study.held_out, predict)
+    for more in learning_curve(name, cameras, study.seed, predict, JOINT_SUBSETS):
+        points += more
+        steps.done()
+    return points
+
+
+def _suspects(observations: Observations, study: Study, notes: list[str]) -> tuple[Suspect, ...]:
+    """Return the measurements that contradict a fit to all points."""
+    try:
+        return find_joint_outliers(fit_without(observations, ()), study.places)
+    except FitError as error:
+        notes.append(f"no search for outliers: {error}")
+        return ()
 
 
 # Pairs of a camera, with their predictions (n, 3) and covariances (n, 3, 3).
 _Predicted = dict[str, tuple[list[Pair], Array, Array]]
 
 
-def _predict(
-    cameras: Mapping[str, JointModel], observations: Observations, pairs: Pairs, names: Collection[str]
-) -> _Predicted:
+def _predict(cameras: Models, observations: Observations, study: Study, names: Collection[str]) -> _Predicted:
     """Locate the markers at some calibration points by their mean corners and measured heights."""
     predicted: _Predicted = {}
     for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
-        by_name = {pair.measurement: pair for pair in pairs.get(camera.name, ()) if pair.measurement in names}
-        rows = [
-            row
+        row_of = {
+            observations.points[point].name: row
             for row, point in enumerate(sightings.point.tolist())
-            if point >= 0 and observations.points[point].name in by_name
-        ]
+            if point >= 0
+        }
+        own = [pair for pair in study.pairs.get(camera.name, ()) if pair.measurement in names]
         model = cameras.get(camera.name)
-        if model is None or not rows:
+        if model is None or not own:
             continue
+        rows = [row_of[pair.measurement] for pair in own]
         points = [observations.points[int(sightings.point[row])] for row in rows]
-        bodies = [observations.bodies[point.body] for point in points]
-        own = [by_name[point.name] for point in points]
         located = locate_markers(
             model,
             sightings.pixels[rows],
             sightings.covariances_px2[rows],
             np.array([pair.world_m[2] for pair in own]),
-            np.array([body.length_m for body in bodies]),
+            np.array([observations.bodies[point.body].length_m for point in points]),
             np.array([point.height_sigma_m for point in points]),
         )
         predicted[camera.name] = (own, located.points_m, located.covariances_m2)
@@ -102,7 +214,7 @@ def _predict(
 
 
 def _error_rows(
-    model: Model, parts: Sequence[_Predicted], ground_truth: Mapping[str, Array], scheme: str
+    model: Model, parts: Sequence[_Predicted], study: Study, scheme: str
 ) -> list[CameraEvaluation]:
     found: dict[str, tuple[list[Pair], Array]] = {}
     covariances: dict[str, Array | None] = {}
@@ -111,4 +223,4 @@ def _error_rows(
         predicted_m = np.concatenate([points_m for _, points_m, _ in own])[None]
         found[camera] = ([pair for kept, _, _ in own for pair in kept], predicted_m)
         covariances[camera] = np.concatenate([c for _, _, c in own])
-    return error_rows(model, found, covariances, ground_truth, scheme)
+    return error_rows(model, found, covariances, study.truth, scheme)

@@ -15,7 +15,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement, TapePoint, with_usual_tap
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import Suspect
 
-__all__ = ["LeaveOneOut", "find_outliers", "is_gross"]
+__all__ = ["LeaveOneOut", "describe_outlier", "find_outliers", "is_gross"]
 
 Array = NDArray[np.float64]
 
@@ -105,6 +105,29 @@ def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement
     by_id = {place.measurement.id: place for place in places}
     outliers = [_suspect(by_id[name], findings[name]) for name in taken]
     return tuple(sorted(outliers, key=lambda suspect: -float(np.linalg.norm(suspect.residual_m))))
+
+
+def describe_outlier(
+    place: RiggedMeasurement, cameras: tuple[str, ...], predicted_m: Array, usual_m2: Array, score: float
+) -> Suspect:
+    """Return an outlier with the simplest mistake that explains it.
+
+    Parameters
+    ----------
+    place : the measurement, and the rig in force.
+    cameras : those that saw the point.
+    predicted_m : (3,), the point by all other observations.
+    usual_m2 : (3, 3), covariance of the prediction.
+    score : size of its error in units of the usual error.
+
+    Raises
+    ------
+    IpsysError
+        The measurement forms no world point.
+    """
+    place = replace(place, rig=with_usual_tape(place.rig))
+    residual_m = predicted_m - world_point(place.measurement, place.rig).world_m
+    return _suspect(place, _Finding(cameras, predicted_m, residual_m, usual_m2, score))
 
 
 def is_gross(suspect: Suspect) -> bool:

@@ -11,7 +11,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
 from ipsys_log.messages.stage import Plan, Stage
-from ipsys_log.models.table import reads_height
+from ipsys_log.models.table import needs_height
 from ipsys_log.runs.execute import LiveRun, copy_messages
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, stages_until
 from ipsys_log.runs.options import Request
@@ -174,7 +174,7 @@ def _check(
     for model in models:
         check_model(model, cameras)
         heights = [rig.height_of(marker.id) for marker in rig.markers] or [rig.marker_height_m]
-        if reads_height(model.name) and None in heights:
+        if needs_height(model.name) and None in heights:
             raise IpsysError(
                 f"{model.name} needs the height of the markers above the floor: write marker_height_m into "
                 "lab.toml"

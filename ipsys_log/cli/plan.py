@@ -17,6 +17,7 @@ from ipsys_log.cli.stages import derive
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ipsys_log.analysis.drive_plan import PlannedDrive
     from ipsys_log.messages import Rig
     from ipsys_log.report.plan import PlannedFloor
 
@@ -63,6 +64,9 @@ def plan(
 ) -> None:
     """Propose the next points to measure, which reduce the predicted error over the floor most.
 
+    For the model joint, the command proposes a drive of a robot, too. Its errors are those of the calibration
+    alone, without the noise of an image.
+
     If the log has no such model yet, the command fits one first.
     """
     from ipsys_log.messages.channels import MODEL, RIG
@@ -100,6 +104,8 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
     else:
         console.print(_table(found))
         console.print(_headline(found))
+        if found.drive is not None:
+            console.print(_drive_line(found.drive), highlight=False)
     for note in found.notes:
         remarks.print(note, style="yellow", markup=False)
     if plot is not None:
@@ -145,6 +151,22 @@ def _headline(found: PlannedFloor) -> str:
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
     subject = "this point" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} points"
     return f"predicted mean error over the floor: {before} cm now, {after} cm with {subject}"
+
+
+def _drive_line(drive: PlannedDrive) -> str:
+    """Return the line of the drive that reduces the error most, with its effect without new points."""
+    from ipsys_log.analysis.drive_plan import DRIVE_S
+    from ipsys_log.report.plan import means_cm
+    from ipsys_log.units import CM_PER_M
+
+    if not drive.is_useful:
+        return "another drive changes little: most of the predicted error is that of the tape"
+    (x0, y0), (x1, y1) = (
+        (corner_m * CM_PER_M).round().astype(int) for corner_m in (drive.low_m, drive.high_m)
+    )
+    before, after = means_cm(drive.mean_before_m, drive.mean_after_m)
+    where = f"x {x0} to {x1}, y {y0} to {y1} cm (seen by {', '.join(drive.cameras)})"
+    return f"or drive a robot for {DRIVE_S:.0f} s, in curves, through {where}: {before} -> {after} cm"
 
 
 def _table(found: PlannedFloor) -> Table:
@@ -198,5 +220,20 @@ def _plan_json(found: PlannedFloor) -> dict[str, Any]:
         "mean_before_cm": places[0]["mean_before_cm"],
         "mean_after_cm": places[-1]["mean_after_cm"],
         "places": places,
+        **({} if found.drive is None else {"drive": _drive_json(found.drive)}),
         "notes": list(found.notes),
+    }
+
+
+def _drive_json(drive: PlannedDrive) -> dict[str, Any]:
+    from ipsys_log.analysis.drive_plan import DRIVE_S
+    from ipsys_log.units import CM_PER_M
+
+    return {
+        "low_m": drive.low_m.tolist(),
+        "high_m": drive.high_m.tolist(),
+        "duration_s": DRIVE_S,
+        "cameras": list(drive.cameras),
+        "mean_before_cm": drive.mean_before_m * CM_PER_M,
+        "mean_after_cm": drive.mean_after_m * CM_PER_M,
     }

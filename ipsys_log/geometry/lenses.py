@@ -192,6 +192,8 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
     [[0.25, -0.125]]
     """
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
+    if not len(points):  # OpenCV refuses an empty array
+        return np.zeros((0, 2))
     if lens.distortion_model == "kannala_brandt":
         uv = cv2.fisheye.undistortPoints(points, lens.K, lens.D, criteria=_CRITERIA)
     else:

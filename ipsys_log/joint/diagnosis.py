@@ -11,9 +11,9 @@ from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.trajectories import Kind
-from ipsys_log.units import MM_PER_M
+from ipsys_log.units import CM_PER_M
 
-__all__ = ["Finding", "Reading", "find_faults", "standardise_readings"]
+__all__ = ["Finding", "Reading", "find_faults", "point_covariances", "standardise_readings"]
 
 Array = NDArray[np.float64]
 
@@ -139,6 +139,12 @@ def _spread_of_points(fit: JointFit) -> _PointSpread:
     )
 
 
+def point_covariances(fit: JointFit) -> Array:
+    """Return the covariances (t, 3, 3) of the estimated calibration points in the world, in m^2."""
+    spread = _spread_of_points(fit)
+    return np.asarray(spread.own + spread.by_global @ fit.covariance @ spread.by_global.swapaxes(1, 2))
+
+
 def find_faults(fit: JointFit) -> list[Finding]:
     """Return probable faults: causes of other faults first, then by their scores."""
     findings = [
@@ -166,15 +172,15 @@ def _wrong_readings(fit: JointFit) -> list[Finding]:
             continue
         tape = [reading for reading in readings if reading.kind == "distance"]
         if len(tape) > 1:
-            largest_mm = max(abs(reading.residual_m) for reading in tape) * MM_PER_M
+            largest_cm = max(abs(reading.residual_m) for reading in tape) * CM_PER_M
             text = (
-                f"point {name}: its distances disagree with the cameras by up to {largest_mm:.0f} mm; check "
+                f"point {name}: its distances disagree with the cameras by up to {largest_cm:.1f} cm; check "
                 "the side, the id of the marker, and if the marker was moved"
             )
             findings.append(Finding("distance", name, worst.score, text))
             continue
         text = ", ".join(
-            f"{_reading_name(reading)} is {abs(reading.residual_m) * MM_PER_M:.0f} mm too "
+            f"{_reading_name(reading)} is {abs(reading.residual_m) * CM_PER_M:.1f} cm too "
             f"{'short' if reading.residual_m > 0 else 'long'}"
             for reading in readings
         )
@@ -208,17 +214,17 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
     for number, body in enumerate(bodies):
         score = abs(float(residuals[layout.scales][number]))
         if score > _WRONG:
-            side_mm = body.length_m * MM_PER_M
+            side_cm = body.length_m * CM_PER_M
             text = (
-                f"marker {body.name}: its side is {side_mm * scales[number]:.1f} mm, not {side_mm:.1f} mm; "
+                f"marker {body.name}: its side is {side_cm * scales[number]:.2f} cm, not {side_cm:.2f} cm; "
                 "measure the print, and correct the rig"
             )
             findings.append(Finding("length", body.name, score, text))
         score = abs(float(residuals[layout.heights][number]))
         if score > _WRONG and body.height_m is not None:
             text = (
-                f"marker {body.name}: a robot carries it at {heights[number] * MM_PER_M:.0f} mm, not at "
-                f"{body.height_m * MM_PER_M:.0f} mm; correct the rig, or exchange the markers of two robots"
+                f"marker {body.name}: a robot carries it at {heights[number] * CM_PER_M:.1f} cm, not at "
+                f"{body.height_m * CM_PER_M:.1f} cm; correct the rig, or exchange the markers of two robots"
             )
             findings.append(Finding("robot_height", body.name, score, text))
     return findings
@@ -227,9 +233,9 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
 def _moved_cameras(fit: JointFit) -> list[Finding]:
     findings = []
     for motion in find_moved_cameras(fit):
-        shift_mm = float(np.linalg.norm(motion.shift_m)) * MM_PER_M
+        shift_cm = float(np.linalg.norm(motion.shift_m)) * CM_PER_M
         text = (
-            f"camera {motion.camera}: it was moved after about {motion.time_s:.0f} s, by {shift_mm:.0f} mm "
+            f"camera {motion.camera}: it was moved after about {motion.time_s:.0f} s, by {shift_cm:.1f} cm "
             f"and {np.degrees(motion.turn_rad):.2f} degrees; calibrate with the observations before or after"
         )
         findings.append(Finding("camera", motion.camera, float(np.sqrt(motion.chi2)), text))

@@ -33,6 +33,8 @@ class Poses:
     covariances_m2 : (n, 3, 3), of the points: noise and calibration.
     chi2 : (n,), squared residuals in units of the noise, with two degrees of freedom.
     modes_m : (n, 3, m), errors of the points by the modes of the calibration.
+    noise_m2 : (n, 3, 3), the part of the covariances by the noise of the corners.
+    heading_noise_rad : (n,), standard deviation of the headings by the same noise.
     """
 
     points_m: Array
@@ -40,6 +42,8 @@ class Poses:
     covariances_m2: Array
     chi2: Array
     modes_m: Array
+    noise_m2: Array
+    heading_noise_rad: Array
 
     @property
     def headings_rad(self) -> Array:
@@ -71,12 +75,15 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
     left = now.residuals[:, :, None] - now.by_pose @ change[:, :, None]
     count = now.by_camera.shape[2]
     modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes[:count]
+    noise_m2 = spread[:, :3, :3]
     return Poses(
         points_m,
         turns,
-        spread[:, :3, :3] + modes_m @ modes_m.swapaxes(1, 2),
+        noise_m2 + modes_m @ modes_m.swapaxes(1, 2),
         (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0],
         modes_m,
+        noise_m2,
+        np.sqrt(spread[:, 5, 5]),
     )
 
 

@@ -14,7 +14,9 @@ __all__ = ["check_overlaps", "find_new_ids", "rename_ids"]
 
 
 def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) -> None:
-    """Refuse logs that have the same run, or images of the same camera at the same time.
+    """Refuse logs that have images of the same camera, or results of the same run, at the same time.
+
+    Sessions one after the other may have runs of the same name: such a run is read as one.
 
     Raises
     ------
@@ -32,10 +34,10 @@ def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) 
                     f"two cameras have the same name: {topic} is in {other.path} and, at the same time, "
                     f"in {reader.path}; leave one of them out"
                 )
-            if run_of_topic(topic) is not None:
+            if run_of_topic(topic) is not None and _overlap(reader, other, topic):
                 raise LogError(
-                    f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or compute "
-                    "the run again with --run and another name"
+                    f"{topic} is in {other.path} and, at the same time, in {reader.path}; leave one of "
+                    "them out"
                 )
 
 

@@ -30,6 +30,7 @@ __all__ = [
     "inputs",
     "is_known",
     "min_pairs",
+    "needs_height",
     "parameters",
     "predict_array",
     "reads_corners",
@@ -106,7 +107,7 @@ MODEL_VERSIONS = {
     "kriging-regression": 1,
     "rayplane": 2,
     "best": 1,
-    "joint": 1,
+    "joint": 2,
 }
 
 
@@ -168,6 +169,11 @@ def reads_height(name: str) -> bool:
     if reads_corners(name):
         return True
     return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
+
+
+def needs_height(name: str) -> bool:
+    """Return whether a model gives no position to a marker whose height is unknown."""
+    return reads_height(name) and not reads_corners(name)
 
 
 def inputs(name: str, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.analysis.calibration_points import measured, split_ids
+from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
-from ipsys_log.messages.channels import EVALUATION, MODEL
+from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
+from ipsys_log.models.table import reads_corners
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, uses_height
-from ipsys_log.runs.graph import writes
+from ipsys_log.runs.graph import input_runs, method_of, writes
+from ipsys_log.runs.provenance import complete_runs, replaced_lenses
+from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.selection import rig_in_force
+
+if TYPE_CHECKING:
+    from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 
 __all__ = [
     "Findings",
@@ -59,6 +69,7 @@ class Findings:
     fitted : fitted models by name; a model of a log by other software may be missing.
     cameras : cameras in the order of the rig, which is the order of the paper's tables.
     advice : advice from learning curves; None without learning curves.
+    calibrated : cameras of the joint model; empty without such a model.
     """
 
     rig: Rig | None
@@ -66,6 +77,7 @@ class Findings:
     fitted: Mapping[str, Model]
     cameras: tuple[str, ...]
     advice: Advice | None
+    calibrated: tuple[CalibratedCamera, ...] = ()
 
     @property
     def models(self) -> list[str]:
@@ -183,7 +195,30 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
         {name: model for name, model in models.items() if model is not None},
         (*ordered, *sorted(cameras - {*ordered})),
         advise(evaluations),
+        _calibrated(session, [model for model in models.values() if model is not None]),
     )
+
+
+def _calibrated(session: Session, models: Sequence[Model]) -> tuple[CalibratedCamera, ...]:
+    """Return the cameras of the joint model among some models."""
+    model = next((model for model in models if reads_corners(model.name)), None)
+    if model is None:
+        return ()
+    # Late: scipy takes 1 s, and most reports have no joint model.
+    from ipsys_log.analysis.calibrated_cameras import describe_cameras
+    from ipsys_log.analysis.joint_calibration import fit_without, observe
+
+    records = [run for run in complete_runs(session) if writes(run, MODEL)]
+    record = next((r for r in reversed(records) if method_of(session, r) == model.name), None)
+    view, fit = LogView(session), None
+    if record is not None and {read.topic for read in record.inputs} & {*session.topics(MEASUREMENTS)}:
+        view = LogView(session, input_runs(record), record.rig, replaced_lenses(record))
+        measurements = [point.measurement for point in measured(view)]
+        used, _ = split_ids(measurements, record.parameters)
+        with suppress(FitError):
+            fit = fit_without(observe(view), {one.id for one in measurements} - used)
+    sizes_px = {camera: (lens.width, lens.height) for camera, lens in view.calibrations().items()}
+    return describe_cameras(model, sizes_px, fit)
 
 
 def _model(session: Session, run: str) -> Model | None:

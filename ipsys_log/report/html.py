@@ -94,6 +94,7 @@ def _figure_values(findings: Findings) -> dict[str, Any]:
         "residual_pictures": html_figures.residual_pictures(findings),
         "learning_pictures": html_figures.learning_pictures(findings),
         "published_pictures": html_figures.published_pictures(findings),
+        "joint_pictures": html_figures.joint_pictures(findings),
         "coverage_picture": html_figures.coverage_picture(findings),
     }
 

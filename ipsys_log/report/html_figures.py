@@ -12,6 +12,13 @@ from matplotlib.lines import Line2D
 from ipsys_log.report.advice import has_published, label
 from ipsys_log.report.figures import svg_data_uri
 from ipsys_log.report.findings import Findings
+from ipsys_log.report.joint_figures import (
+    clocks_figure,
+    has_clocks,
+    poses_figure,
+    residual_limit_px,
+    residuals_figure,
+)
 from ipsys_log.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
 from ipsys_log.report.paper_figures import (
     HELD_OUT,
@@ -25,6 +32,7 @@ from ipsys_log.report.points_figure import draw_coverage
 
 __all__ = [
     "coverage_picture",
+    "joint_pictures",
     "learning_pictures",
     "models_pictures",
     "published_pictures",
@@ -130,6 +138,43 @@ def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
         for caption, curves in panels.items()
         if curves
     ]
+
+
+def joint_pictures(findings: Findings) -> list[Picture]:
+    """Return the poses and the clocks of the cameras of the joint model, and the residuals in each image."""
+    cameras = findings.calibrated
+    if not cameras:
+        return []
+    pictures = [
+        _picture(
+            poses_figure(cameras, findings.rig),
+            "Poses of the cameras, with their fields of view on the floor. Arrow: optical axis, to the floor",
+        )
+    ]
+    if has_clocks(cameras):
+        text = (
+            "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the "
+            "reference, or that of a camera that saw no drive"
+        )
+        pictures.append(_picture(clocks_figure(cameras), text))
+    most_px = residual_limit_px(cameras)
+    for camera in cameras:
+        if camera.residuals is None:
+            continue
+        caption = (
+            f"Corner residuals in the image of {camera.camera}, estimated minus measured, as means of cells; "
+            f"arrows are enlarged{_left_out(camera.residuals.outliers)}"
+        )
+        pictures.append(_picture(residuals_figure(camera, most_px), caption))
+    return pictures
+
+
+def _left_out(outliers: int) -> str:
+    if not outliers:
+        return ""
+    return (
+        f". Without {'one sighting that does' if outliers == 1 else f'{outliers} sightings that do'} not fit"
+    )
 
 
 def coverage_picture(findings: Findings) -> Picture | None:

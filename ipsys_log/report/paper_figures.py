@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
+from ipsys_log.report import joint_figures
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import HEIGHT_NOTE, has_published, label, uses_height
 from ipsys_log.report.figures import png, scale_logarithmic, style_axes
@@ -234,7 +235,25 @@ _FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]
     "learning_curve.png": (lambda f: bool(mean_curves(f, False)), lambda f: png(learning_figure(f))),
     "errors_floor.png": (lambda f: bool(shown_models(f)), lambda f: png(residuals_figure(f))),
     "models.png": (_has_models, lambda f: png(models_figure(f))),
+    "camera_poses.png": (
+        lambda f: bool(f.calibrated),
+        lambda f: png(joint_figures.poses_figure(f.calibrated, f.rig)),
+    ),
+    "clock_offsets.png": (
+        lambda f: joint_figures.has_clocks(f.calibrated),
+        lambda f: png(joint_figures.clocks_figure(f.calibrated)),
+    ),
 }
+
+
+def _image_residuals(findings: Findings) -> dict[str, bytes]:
+    """Return a map of the corner residuals in the image of each camera of the joint model."""
+    most_px = joint_figures.residual_limit_px(findings.calibrated)
+    return {
+        f"image_residuals_{camera.camera}.png": png(joint_figures.residuals_figure(camera, most_px))
+        for camera in findings.calibrated
+        if camera.residuals is not None
+    }
 
 
 def write_plots(findings: Findings, folder: Path) -> list[str]:
@@ -250,6 +269,7 @@ def write_plots(findings: Findings, folder: Path) -> list[str]:
         No model was evaluated.
     """
     files = {name: draw(findings) for name, (has_data, draw) in _FILES.items() if has_data(findings)}
+    files.update(_image_residuals(findings))
     if not files:
         raise IpsysError(
             f"{folder}: nothing to draw: no model was evaluated, because no calibration point is held out; "

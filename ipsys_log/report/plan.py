@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,12 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.models.rigid import rigid_transform
-from ipsys_log.models.table import AppliedModel
+from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.units import CM_PER_M
+
+if TYPE_CHECKING:
+    from ipsys_log.analysis.drive_plan import PlannedDrive
 
 __all__ = ["PlannedFloor", "means_cm", "mesh", "plan_floor", "view_of_model"]
 
@@ -37,6 +41,8 @@ _MOST_HEIGHTS = 5
 # uncertainty.py.
 _USUAL_NOISE, _USUAL_FIT = 3e-4, 2.5e-3
 _LITTLE = 0.05
+# For a model of corners, candidates are this many times as far apart: its error changes slowly.
+_COARSE = 4
 # The leverage has this many terms. With fewer points, it has no upper bound.
 _LEAST_PLACES = 6
 
@@ -53,6 +59,7 @@ class PlannedFloor:
     height_m : height of the marker whose error is predicted.
     measured_m : (n, 3), the points that the model was fitted on.
     notes : remarks on the plan.
+    drive : the drive that reduces the error most; None for a model that reads no drives.
     """
 
     model: str
@@ -64,6 +71,7 @@ class PlannedFloor:
     height_m: float
     measured_m: Array
     notes: tuple[str, ...]
+    drive: PlannedDrive | None = None
 
     def distances_m(self, point_m: Array) -> dict[str, float]:
         """Return the approximate tape distances to a point (3,), by reference point."""
@@ -101,6 +109,8 @@ def plan_floor(
         No camera sees a marker of these heights anywhere on the floor.
     """
     model: Model = session.payloads(session.topics(MODEL, run))[-1]
+    if reads_corners(model.name):
+        return _plan_corner_model(session, model, run, rig, lenses, count, heights_m)
     views = [
         view_of_model(model.name, camera, lenses.get(camera.camera))
         for camera in model.cameras
@@ -109,13 +119,10 @@ def plan_floor(
     if not views:
         raise IpsysError(f"run {run}: its model does not contain its calibration points; fit it again")
     measured_m = np.unique(np.vstack([view.fitted_m for view in views]), axis=0)
-    # The known heights of the robots' markers.
-    carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id)) is not None]
-    height_m = round(float(np.median(carried_m or measured_m[:, 2])), 3)
+    height_m = _usual_height(rig, measured_m)
     low_m, high_m = _corners(rig, measured_m)
-    step_m = _STEP_M * max(1, round(float((high_m - low_m).max()) / _SPAN_M))
-    xs_m, ys_m = (np.arange(a + step_m / 2, b, step_m) for a, b in zip(low_m, high_m, strict=True))
-    side_m = max((rig.length_of(marker.id) for marker in rig.markers), default=rig.marker_length_m)
+    step_m, xs_m, ys_m = _cells(low_m, high_m)
+    side_m = _side(rig)
     plan = plan_points(
         views,
         mesh(xs_m, ys_m, [height_m]),
@@ -126,6 +133,61 @@ def plan_floor(
     )
     notes = tuple(_notes(model, rig, lenses, plan))
     return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes)
+
+
+def _plan_corner_model(
+    session: Session,
+    model: Model,
+    run: str,
+    rig: Rig,
+    lenses: Lenses,
+    count: int,
+    heights_m: Sequence[float],
+) -> PlannedFloor:
+    """Plan points and a drive for a model of corners: its covariance gives their effect."""
+    # Late: scipy takes 1 s, and plans of other models do not need these.
+    from ipsys_log.analysis.drive_plan import choose_drive
+    from ipsys_log.analysis.expected_error import FloorGrid
+    from ipsys_log.analysis.joint_plan import expect_on_floor, plan_joint_points
+    from ipsys_log.joint.payload import restore_joint
+
+    models = {camera.camera: restore_joint(camera) for camera in model.cameras if camera.camera in lenses}
+    if not models:
+        raise IpsysError(f"run {run}: no camera of its model has a calibration; give one with --calibration")
+    sizes_px = {name: (lenses[name].width, lenses[name].height) for name in models}
+    pairs = [pair for camera in model.cameras for pair in camera.pairs]
+    measured_m = np.unique(np.array([pair.world_m for pair in pairs]).reshape(-1, 3), axis=0)
+    if rig.floor is None and not len(measured_m):
+        raise IpsysError("the rig has no floor; write its width_m and depth_m into lab.toml, and give --rig")
+    low_m, high_m = _corners(rig, measured_m)
+    step_m, xs_m, ys_m = _cells(low_m, high_m)
+    side_m, height_m = _side(rig), _usual_height(rig, measured_m)
+    expected = expect_on_floor(models, sizes_px, FloorGrid(xs_m, ys_m, step_m), height_m, side_m)
+    candidates_m = _candidates(rig, low_m, high_m, _COARSE * step_m, side_m / 2, heights_m or [0.0])
+    tape_m2 = _tape_covariances(session, rig)
+    plan = plan_joint_points(models, sizes_px, expected, candidates_m, tape_m2, side_m, count)
+    drive = choose_drive(models, sizes_px, expected, low_m, high_m, height_m, side_m)
+    notes = tuple(_joint_notes(rig, {*models}))
+    return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes, drive)
+
+
+def _usual_height(rig: Rig, measured_m: Array) -> float:
+    """Return the usual known height of the robots' markers, or that of the measured points (n, 3)."""
+    carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id)) is not None]
+    if not carried_m and rig.marker_height_m is not None:
+        carried_m = [rig.marker_height_m]
+    return round(float(np.median(carried_m or measured_m[:, 2].tolist() or [0.0])), 3)
+
+
+def _cells(low_m: Array, high_m: Array) -> tuple[float, Array, Array]:
+    """Return the size of the floor's cells, and the x and y of their centres."""
+    step_m = _STEP_M * max(1, round(float((high_m - low_m).max()) / _SPAN_M))
+    xs_m, ys_m = (np.arange(a + step_m / 2, b, step_m) for a, b in zip(low_m, high_m, strict=True))
+    return step_m, xs_m, ys_m
+
+
+def _side(rig: Rig) -> float:
+    return max((rig.length_of(marker.id) for marker in rig.markers), default=rig.marker_length_m)
 
 
 def view_of_model(name: str, camera: CameraModel, lens: CameraCalibration | None) -> FittedCamera:
@@ -194,20 +256,47 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
 
     Without two reference points, the function returns 0.
     """
+    covariances = _tape_covariances(session, rig)
+
+    def variances(world_m: Array) -> Array:
+        if len(rig.reference_points) < 2:
+            return np.zeros(len(world_m))
+        floor_m, rows = np.unique(world_m[:, :2], axis=0, return_inverse=True)
+        return np.trace(covariances(floor_m), axis1=1, axis2=2)[rows.reshape(-1)]
+
+    return variances
+
+
+def _tape_covariances(session: Session, rig: Rig) -> Callable[[Array], Array]:
+    """Return a function for the covariances (n, 2, 2) of tape measurements at points (n, 2).
+
+    Without two reference points, a point is known as well as a tape measures a distance.
+    """
     known_m = _references(rig)
     payloads = session.payloads(session.topics(MEASUREMENTS)) if rig.tape_sigma_m is None else []
     named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
     sigma_m = rig.tape_sigma_m or float(np.median(named_m or USUAL_TAPE_SIGMA_M))
 
-    def variances(world_m: Array) -> Array:
+    def covariances(points_m: Array) -> Array:
         if len(known_m) < 2:
-            return np.zeros(len(world_m))
+            return np.broadcast_to(sigma_m**2 * np.eye(2), (len(points_m), 2, 2))
         sigmas_m = np.full(len(known_m), sigma_m)
-        floor_m, rows = np.unique(world_m[:, :2], axis=0, return_inverse=True)
-        variances_m2 = [np.trace(tape_covariance(point_m, known_m, sigmas_m)) for point_m in floor_m]
-        return np.array(variances_m2)[rows.reshape(-1)]
+        return np.array([tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m])
 
-    return variances
+    return covariances
+
+
+def _joint_notes(rig: Rig, fitted: set[str]) -> Iterator[str]:
+    for camera in sorted({camera.name for camera in rig.cameras} - fitted):
+        yield f"camera {camera} has no model: drive a robot through its field of view first"
+    yield from _rig_notes(rig)
+
+
+def _rig_notes(rig: Rig) -> Iterator[str]:
+    if rig.floor is None:
+        yield "the rig has no floor: the plan covers the measured points and 50 cm around them"
+    if len(rig.reference_points) < 2:
+        yield "the rig has fewer than two reference points: the plan ignores tape errors"
 
 
 def _notes(model: Model, rig: Rig, lenses: Lenses, plan: MeasurementPlan) -> Iterator[str]:
@@ -232,10 +321,7 @@ def _notes(model: Model, rig: Rig, lenses: Lenses, plan: MeasurementPlan) -> Ite
             yield (
                 f"camera {row.camera} has too few points for an estimate of its noise: usual noise is assumed"
             )
-    if rig.floor is None:
-        yield "the rig has no floor: the plan covers the measured points and 50 cm around them"
-    if len(rig.reference_points) < 2:
-        yield "the rig has fewer than two reference points: the plan ignores tape errors"
+    yield from _rig_notes(rig)
     if plan.places[-1].mean_after_m > (1 - _LITTLE) * plan.places[0].mean_before_m:
         yield "these points change little: most of the predicted error is camera noise, not fit error"
 

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from ipsys_log.analysis.drive_plan import PlannedDrive
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.plan import PlannedFloor, means_cm, mesh
@@ -75,12 +76,22 @@ def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float)
     shown_m = np.vstack([seen_m - half_m, seen_m + half_m, found.measured_m[:, :2]])
     middle_m, span_m = (shown_m.max(axis=0) + shown_m.min(axis=0)) / 2, float(np.ptp(shown_m, axis=0).max())
     _draw_rings(axes, found, _RING * span_m)
+    if found.drive is not None and found.drive.is_useful:
+        axes.add_patch(_drive_area(found.drive))
     (x0, y0), (x1, y1) = middle_m - 0.52 * span_m, middle_m + 0.52 * span_m
     axes.set(xlim=(x0, x1), ylim=(y0, y1), xlabel="x in m", ylabel="y in m")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10]))
     axes.spines[:].set_visible(False)
     return shades
+
+
+def _drive_area(drive: PlannedDrive) -> Rectangle:
+    width_m, depth_m = (drive.high_m - drive.low_m).tolist()
+    corner_m = float(drive.low_m[0]), float(drive.low_m[1])
+    return Rectangle(
+        corner_m, width_m, depth_m, fill=False, ec=NOTE, lw=1.8, ls="--", zorder=4, label="or drive here"
+    )
 
 
 def _draw_views(axes: Axes, found: PlannedFloor, shape: tuple[int, int], half_m: float) -> None:

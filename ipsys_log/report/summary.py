@@ -13,6 +13,7 @@ from rich.text import Text
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.consistency import FEWEST_POINTS
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
+from ipsys_log.models.table import reads_corners
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
@@ -168,12 +169,18 @@ def _length(residual_m: Any) -> str:
 def _screened(accuracy: Accuracy) -> bool:
     """Return whether a model was used to search for outliers; some models are, if they have enough points."""
     rows = [row for row in accuracy.rows(True) if row.camera != POOLED]
-    return accuracy.model in SCREENING and any(row.error_2d.count >= FEWEST_POINTS for row in rows)
+    if accuracy.model not in SCREENING:
+        return False
+    # A model of corners compares each reading with its own covariance, which needs no number of points.
+    return reads_corners(accuracy.model) or any(row.error_2d.count >= FEWEST_POINTS for row in rows)
 
 
 def _needed() -> str:
+    usual = ", ".join(model for model in SCREENING if not reads_corners(model))
+    corners = ", ".join(model for model in SCREENING if reads_corners(model))
     return (
-        f"The search needs {FEWEST_POINTS} points of a camera, and one of the models {', '.join(SCREENING)}"
+        f"The search needs {FEWEST_POINTS} points of a camera, and one of the models {usual}; or the model "
+        f"{corners}"
     )
 
 

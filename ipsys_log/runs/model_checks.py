@@ -16,15 +16,14 @@ from ipsys_log.messages import CameraModel
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
-    MARKERS,
     POSITIONS,
     RIG,
     Channel,
 )
-from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
+from ipsys_log.models.table import AppliedModel, min_pairs, needs_height, reads_corners
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
-from ipsys_log.runs.select import copied_run, fitted_in
+from ipsys_log.runs.select import copied_run, fitted_in, has_corners
 from ipsys_log.runs.view import LogView
 from ipsys_log.stages.evaluate import can_evaluate
 from ipsys_log.stages.fit import BESIDE_LINE_M, check_different, check_pairs
@@ -77,7 +76,7 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
 
 def _check_corners(session: Session, model: str) -> None:
     """Check that the log has corners of markers, or images to detect them in."""
-    if not session.images and newest_run(session, MARKERS) is None:
+    if not has_corners(session):
         raise FitError(
             f"{session}: {model} is fitted to the corners of markers, but the log has only camera points; "
             "use --model best"
@@ -182,7 +181,7 @@ def _restore(name: str, camera: CameraModel) -> object:
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:
-    """Check that the rig has a height for each marker, if a model reads the heights of markers.
+    """Check that the rig has a height for each marker, if a model needs the heights of markers.
 
     Raises
     ------
@@ -193,7 +192,7 @@ def check_heights(session: Session, request: Request, models: Sequence[str]) -> 
     for name in models:
         for rig in rigs:
             missing = [m.id for m in rig.markers if rig.height_of(m.id) is None]
-            if reads_height(name) and (missing or (not rig.markers and rig.marker_height_m is None)):
+            if needs_height(name) and (missing or (not rig.markers and rig.marker_height_m is None)):
                 which = f"marker {missing[0]}" if missing else "the markers"
                 raise IpsysError(
                     f"{session}: {name} needs the height of {which} above the floor: write marker_height_m "

@@ -17,7 +17,7 @@ import threadpoolctl
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import ChannelRead, Run
+from ipsys_log.messages import CameraCalibration, ChannelRead, Run
 from ipsys_log.messages.channels import Channel
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "newest_run",
     "read_channels",
     "recorded_version",
+    "replaced_lenses",
 ]
 
 _MOST_DIGITS = 6
@@ -77,6 +78,16 @@ def read_channels(session: Session, topics: Iterable[str]) -> tuple[ChannelRead,
 def _identity(run: Run) -> bytes:
     """Return the identity of a run of a stage: all fields except names, times and the environment."""
     return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
+
+
+def replaced_lenses(run: Run) -> dict[str, CameraCalibration]:
+    """Return the intrinsics that replaced those of the log in a run."""
+    return {
+        lens.camera: CameraCalibration(
+            0, lens.camera, lens.width, lens.height, lens.distortion_model, lens.d, lens.k
+        )
+        for lens in run.lenses
+    }
 
 
 def complete_runs(session: Session) -> list[Run]:

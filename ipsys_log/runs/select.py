@@ -14,7 +14,7 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Model, Rig
 from ipsys_log.messages.channels import MARKERS, MODEL, RIG
-from ipsys_log.models.table import check_name
+from ipsys_log.models.table import CORNER_MODELS, MODELS, check_name
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import complete_runs, newest_run
 from ipsys_log.runs.view import LogView
@@ -23,7 +23,9 @@ __all__ = [
     "LEAST_OFFSET_PX",
     "MIN_OFFSETS",
     "copied_run",
+    "evaluated_models",
     "fitted_in",
+    "has_corners",
     "rig_with_offsets",
     "wanted_models",
 ]
@@ -64,6 +66,17 @@ def wanted_models(
         if copied:
             return copied
     return tuple(usual)
+
+
+def has_corners(session: Session) -> bool:
+    """Return whether a log has the corners of markers, or images to detect them in."""
+    return bool(session.images) or newest_run(session, MARKERS) is not None
+
+
+def evaluated_models(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Return all models that the logs of ``paths`` can have: those of corners only if they have corners."""
+    with Session(paths) as session:
+        return (*MODELS, *(CORNER_MODELS if has_corners(session) else ()))
 
 
 def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:

@@ -22,12 +22,13 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
-from ipsys_log.messages import IMPORTED, CameraCalibration, FrameTransforms, Message, Run
+from ipsys_log.messages import IMPORTED, FrameTransforms, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
+from ipsys_log.runs.provenance import replaced_lenses
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 
 __all__ = ["diff", "explain_diff", "verify"]
@@ -244,17 +245,11 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
 
 def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stored]:
     stage = stage_named(run.stage)
-    task = plan_stage(stage, session, run.parameters, input_runs(run), run.rig, _lenses(run)) if stage else ""
+    task = (
+        plan_stage(stage, session, run.parameters, input_runs(run), run.rig, replaced_lenses(run))
+        if stage
+        else ""
+    )
     if isinstance(task, Task):
         for message in compute_messages(task, session, run.run, progress):
             yield message, encode(message.payload)
-
-
-def _lenses(run: Run) -> dict[str, CameraCalibration]:
-    """Return the intrinsics that replaced those of the log in a run."""
-    return {
-        lens.camera: CameraCalibration(
-            0, lens.camera, lens.width, lens.height, lens.distortion_model, lens.d, lens.k
-        )
-        for lens in run.lenses
-    }

@@ -133,7 +133,7 @@ ENTRIES: tuple[StageEntry, ...] = (
         name="evaluate",
         help="Evaluate models: their errors, the learning curve and outliers of the measurements.\n\n"
         "The errors are on held-out calibration points and by cross-validation. Without --model, the command "
-        "evaluates all models.",
+        "evaluates all models; joint only if the log has images or markers.",
         prints=("plots", "details"),
     ),
     StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),

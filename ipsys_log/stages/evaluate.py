@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import replace
 
 from ipsys_log.analysis.accuracy import evaluate_cross_validated, evaluate_held_out
 from ipsys_log.analysis.calibration_points import (
@@ -31,43 +28,22 @@ from ipsys_log.analysis.cross_validation import (
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
 from ipsys_log.analysis.outliers import find_outliers, is_gross
-from ipsys_log.analysis.pairs import RiggedMeasurement
+from ipsys_log.analysis.study import Study
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
 from ipsys_log.models.table import CalibrationPoints, min_pairs, reads_corners
 
-__all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
+__all__ = ["SCREENING", "STAGE", "can_evaluate", "evaluate_model"]
 
 # Models that check the measurements. They fit in milliseconds, and they follow the calibration points
 # closely enough to show an error of some centimetres.
-SCREENING = ("poly", "rayplane", "best")
+SCREENING = ("poly", "rayplane", "best", "joint")
 # The same model selects the gross outliers for all evaluations, so that all models have the same points. The
 # polynomial is a hundred times as fast; with fewer points of a camera, it is too uncertain.
 _GROSS_MODEL, _GROSS_MODEL_FEW, _FEW = "poly", "best", 20
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Study:
-    """The data for an evaluation.
-
-    Attributes
-    ----------
-    places : the measurements that count.
-    pairs : pairs of all measurements that a camera saw, by camera.
-    held_out : ids of the held-out measurements.
-    subsets : ids by the label of a published subset for fitting.
-    truth : ground-truth world points (3,) in m by id; empty outside a simulated lab.
-    seed : of folds and random subsets; None for a model of another log, which is not fitted again.
-    """
-
-    places: Sequence[RiggedMeasurement]
-    pairs: Mapping[str, Sequence[Pair]]
-    held_out: set[str]
-    subsets: Mapping[str, set[str]]
-    truth: Mapping[str, NDArray[np.float64]]
-    seed: int | None
 
 
 def evaluate_model(
@@ -201,6 +177,19 @@ def _is_fitted_here(view: StageView, options: Mapping[str, str], model: str) -> 
     return has_measurements(view) or all(copy.name != model for _, copy in view.copied(MODEL))
 
 
+def _evaluate_joint(
+    view: StageView, model: Model, study: Study, time_ns: int, notes: list[str], progress: Progress
+) -> Evaluation:
+    """Evaluate the model of all corners, without the gross outliers that all models leave out."""
+    # Late: scipy takes 1 s, and most commands need no joint model.
+    from ipsys_log.analysis.joint_calibration import observe
+    from ipsys_log.analysis.joint_evaluation import evaluate_joint
+
+    cameras = gather_points(_fitted_pairs(model, study))
+    excluded = () if study.seed is None else _gross_outliers(cameras, study.places)
+    return evaluate_joint(model, observe(view), study, excluded, time_ns, notes, progress)
+
+
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     model: Model = view.payloads(MODEL)[-1]
     if not can_evaluate(view, options, model.name):
@@ -214,22 +203,6 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     def compute(progress: Progress) -> Evaluation:
         points = measured(view)
         measurements = [point.measurement for point in points]
-        if joint:
-            # Late: scipy takes 1 s, and most commands need no joint model.
-            from ipsys_log.analysis.joint_calibration import observe
-            from ipsys_log.analysis.joint_evaluation import evaluate_joint
-
-            return evaluate_joint(
-                model,
-                observe(view),
-                find_pairs(view, points),
-                held_out_ids(measurements, options),
-                true_points(points, gather_tracks(view.messages(TRUTH))),
-                int(seed) if again else None,
-                view.last_ns(*reads),
-                notes,
-                progress,
-            )
         study = Study(
             points,
             find_pairs(view, points),
@@ -238,7 +211,10 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
             true_points(points, gather_tracks(view.messages(TRUTH))),
             int(seed) if again else None,
         )
-        return evaluate_model(model, study, view.last_ns(*reads), notes, progress)
+        time_ns = view.last_ns(*reads)
+        if joint:
+            return _evaluate_joint(view, model, study, time_ns, notes, progress)
+        return evaluate_model(model, study, time_ns, notes, progress)
 
     folds = {"folds": str(FOLDS), "repeats": "1" if joint else str(REPEATS), "seed": seed}
     return Plan(

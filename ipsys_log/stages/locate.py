@@ -1,9 +1,9 @@
-"""The stage *locate*: camera points to world positions, with the model of each camera."""
+"""The stage *locate*: camera points or corners to world positions, with the model of each camera."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
-    Marker,
-    Markers,
     Message,
     Model,
     Position,
@@ -21,15 +19,11 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, POSITIONS, RIG
-from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
+from ipsys_log.messages.stage import Plan, Stage, StageView, Step, model_read
 from ipsys_log.models.table import AppliedModel, reads_corners, reads_height
 from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
-from ipsys_log.units import NS_PER_S
 
-if TYPE_CHECKING:
-    from ipsys_log.joint.model import JointModel
-
-__all__ = ["STAGE", "Locate", "LocateCorners"]
+__all__ = ["STAGE", "Locate"]
 
 Array = NDArray[np.float64]
 
@@ -126,76 +120,6 @@ def _world_poses(
     return world, np.arctan2(along[:, 1], along[:, 0])
 
 
-# Corners without a covariance have about this error.
-_CORNER_SIGMA_PX = 0.25
-# A marker that is not where its corners say that it is, at its height, has larger residuals: with five
-# degrees of freedom, one in a million is larger by chance.
-_MOST_CHI2 = 37.0
-
-
-class LocateCorners:
-    """The stage *locate* for the model of all corners: each marker is level, at the height of the rig."""
-
-    def __init__(self, model: Model) -> None:
-        # Late: scipy takes 1 s, and most commands need no joint model.
-        from ipsys_log.joint.payload import restore_joint
-
-        self._name = model.name
-        self._cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
-        self._rig: Rig | None = None
-
-    def __call__(self, message: Message) -> Iterator[Any]:
-        if isinstance(message.payload, Rig):
-            self._rig = message.payload
-            return
-        if not isinstance(message.payload, Markers):
-            return
-        camera = self._cameras.get(str(message.camera))
-        if camera is not None:
-            markers = message.payload.markers
-            positions = self._positions(camera, markers) if markers else ()
-            yield Positions(message.publish_time_ns, positions)
-
-    def _positions(self, camera: JointModel, markers: tuple[Marker, ...]) -> tuple[Position, ...]:
-        from ipsys_log.joint.locate import locate_markers
-
-        unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
-        located = locate_markers(
-            camera,
-            np.array([marker.corners_px for marker in markers], dtype=np.float64),
-            np.array([m.covariance_px2 if m.covariance_px2 is not None else unknown for m in markers]),
-            np.array([_height(self._name, self._rig, marker.id) for marker in markers]),
-            np.array([self._rig.length_of(marker.id) if self._rig else 0.0 for marker in markers]),
-        )
-        headings_rad = located.headings_rad.tolist()
-        heading_noise_rad = located.heading_noise_rad.tolist()
-        return tuple(
-            Position(
-                marker.id,
-                x_m,
-                y_m,
-                z_m,
-                headings_rad[n],
-                located.covariances_m2[n],
-                bool(located.chi2[n] < _MOST_CHI2),
-                _time_offset_ns(camera, marker),
-                located.noise_m2[n],
-                heading_noise_rad[n],
-            )
-            for n, (marker, (x_m, y_m, z_m)) in enumerate(
-                zip(markers, located.points_m.tolist(), strict=True)
-            )
-            if np.isfinite(x_m)
-        )
-
-
-def _time_offset_ns(camera: JointModel, marker: Marker) -> int | None:
-    """Return the time from the stamp of the frame to the exposure of the marker, by the common clock."""
-    rows = float(marker.corners_px[:, 1].mean())
-    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s + camera.clock_s) * NS_PER_S)
-    return offset_ns if offset_ns or marker.time_offset_ns is not None else None
-
-
 def _height(model: str, rig: Rig | None, marker_id: int) -> float:
     """Return the height of a marker above the floor, in m."""
     height_m = rig.height_of(marker_id) if rig else None
@@ -207,6 +131,13 @@ def _height(model: str, rig: Rig | None, marker_id: int) -> float:
     return height_m
 
 
+def _locate_corners(model: Model) -> Step:
+    # Late: scipy takes 1 s, and most commands need no joint model.
+    from ipsys_log.joint.locate_step import LocateCorners
+
+    return LocateCorners(model)
+
+
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
     model: Model = view.payloads(MODEL)[-1]
     if reads_corners(model.name):
@@ -214,7 +145,7 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
             run=view.run(MODEL),
             parameters={},
             reads=(RIG, MARKERS, MODEL),
-            step=lambda run: LocateCorners(model),
+            step=lambda run: _locate_corners(model),
         )
     return Plan(
         run=view.run(MODEL),

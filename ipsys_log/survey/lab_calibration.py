@@ -13,13 +13,11 @@ from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
     FloorGap,
     FloorGrid,
-    TapeCovariances,
-    TapedPoint,
-    choose_points,
     expect_errors,
     find_gaps,
 )
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
+from ipsys_log.analysis.taped_points import TapeCovariances, TapedPoint, choose_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, tape_covariance
 from ipsys_log.joint.diagnosis import Finding, find_faults

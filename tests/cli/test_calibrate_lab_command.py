@@ -15,6 +15,7 @@ import pytest
 
 from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
 from ipsys_log.exchange.calibration_files import read_intrinsics
+from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
@@ -155,6 +156,54 @@ def test_a_proposed_point_gives_the_predicted_error(
     write_log(log, simulate_session(more))
     measured = described(ipsys, log)
     assert measured["mean_mm"] == pytest.approx(best["mean_after_mm"], rel=0.1)
+
+
+def test_plan_for_joint_names_points_and_a_drive(
+    ipsys: Ipsys, fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = tmp_path / "plan.png"
+    done = ipsys("plan", fitted, "--model", "joint", "--places", "3", "--plot", drawn, "--json")
+    assert done.code == 0, done.err
+    answer = json.loads(done.out)
+    places = [(place["x_m"], place["y_m"]) for place in answer["places"]]
+    assert len(set(places)) == 3
+    means_cm = [answer["mean_before_cm"], *(place["mean_after_cm"] for place in answer["places"])]
+    assert means_cm == sorted(means_cm, reverse=True)
+    assert means_cm[-1] < 0.9 * means_cm[0]
+    assert all(place["height_m"] == 0 and place["cameras"] for place in answer["places"])
+    drive = answer["drive"]
+    assert drive["mean_after_cm"] < drive["mean_before_cm"] < 1
+    assert cv2.imread(str(drawn)) is not None
+    monkeypatch.setenv("COLUMNS", "80")
+    text = ipsys("plan", fitted, "--model", "joint", "--places", "1").out
+    assert max(map(len, text.splitlines())) <= 80
+    # After a drive, the error is that of the tape; without a drive, another one helps.
+    assert "another drive changes little" in text
+    still = replace(SETTINGS, lab=replace(SETTINGS.lab, drive_s=0.0))
+    points_only = tmp_path / "points.mcap"
+    write_log(points_only, simulate_session(build_lab(still)))
+    text = ipsys("plan", points_only, "--model", "joint", "--places", "1").out
+    assert "or drive a robot for 30 s, in curves, through x " in text
+    high = ipsys("plan", fitted, "--model", "joint", "--places", "1", "--height-m", "0.3", "--json")
+    assert json.loads(high.out)["places"][0]["height_m"] == 0.3
+
+
+def test_the_fit_of_calibrate_lab_runs_once(
+    ipsys: Ipsys, session_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fits = []
+
+    def count(*arguments: Any, **options: Any) -> Any:
+        fits.append(1)
+        return fit_jointly(*arguments, **options)
+
+    monkeypatch.setattr("ipsys_log.analysis.joint_calibration.fit_jointly", count)
+    monkeypatch.setattr("ipsys_log.analysis.joint_calibration._LAST_FIT", [])
+    log = Path(shutil.copy(session_log, tmp_path / "lab.mcap"))
+    assert ipsys("calibrate-lab", log, "--goal-mm", "20").code == 0
+    assert len(fits) == 1
+    assert ipsys("calibrate-lab", log, "--goal-mm", "10").code == 0
+    assert len(fits) == 1
 
 
 def test_the_model_is_the_usual_run(ipsys: Ipsys, session_log: Path, tmp_path: Path) -> None:

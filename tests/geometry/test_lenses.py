@@ -65,6 +65,8 @@ def test_undistort_is_the_inverse_of_project(model: str, d: tuple[float, ...]) -
     uv = rng.uniform((-0.7, -0.4), (0.7, 0.4), (200, 2))
     seen = project(np.column_stack([uv, np.ones(200)]) * 2.1, lens(model, d))
     np.testing.assert_allclose(undistort(seen, lens(model, d)), uv, atol=1e-8)
+    assert project(np.zeros((0, 3)), lens(model, d)).shape == (0, 2)
+    assert undistort(np.zeros((0, 2)), lens(model, d)).shape == (0, 2)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ import numpy as np
 
 from ipsys_log import pipeline
 from ipsys_log.log.dataset import Session
-from ipsys_log.models.table import MODELS
+from ipsys_log.models.table import CORNER_MODELS, MODELS
 from ipsys_log.runs.graph import VERSIONS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import fingerprint
@@ -52,13 +52,13 @@ def environment() -> dict[str, str]:
 def computed(corners: str, method: str) -> Channels:
     """Compute all stages on the golden log with all models, and return the contents of their channels.
 
-    Models are evaluated, and positions fused, with ``poly`` only.
+    Models are evaluated, and positions fused, with ``poly`` and with the models of corners only.
     """
     with tempfile.TemporaryDirectory() as folder:
         log = Path(shutil.copy(LOG, folder))
-        request = Request(models=tuple(MODELS), corners=corners, method=method)
+        request = Request(models=(*MODELS, *CORNER_MODELS), corners=corners, method=method)
         pipeline.replay([log], request, "locate")
-        pipeline.replay([log], dataclasses.replace(request, models=("poly",)))
+        pipeline.replay([log], dataclasses.replace(request, models=("poly", *CORNER_MODELS)))
         with Session([log]) as session:
             topics = sorted(
                 topic

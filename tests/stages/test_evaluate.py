@@ -23,11 +23,12 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.analysis.study import Study
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
 from ipsys_log.models.table import AppliedModel, CalibrationPoints, group_dependent_cameras, min_pairs
-from ipsys_log.stages.evaluate import Study, evaluate_model
+from ipsys_log.stages.evaluate import evaluate_model
 from ipsys_log.stages.fit import fit_model
 from tests import labs
 

@@ -8,13 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from ipsys_log import api
+from ipsys_log.analysis.joint_evaluation import JOINT_SUBSETS
 from ipsys_log.api import load_model
-from ipsys_log.errors import IpsysError
-from ipsys_log.messages import TRUTH_TOPIC, Markers, Message, Run, Tracks
+from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.joint.fitted_corners import FittedCornerModel
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import TRUTH_TOPIC, Markers, Measurement, Message, Model, Run, Tracks
+from ipsys_log.messages.channels import EVALUATION, MARKERS, MEASUREMENTS_TOPIC, POSITIONS, RIG
+from ipsys_log.models.table import MODELS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
+from ipsys_log.runs.select import evaluated_models
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
@@ -59,6 +67,21 @@ def log(calibration: Path, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def fitted_log(calibration: Path) -> Path:
+    path = calibration.with_name("fitted.mcap")
+    path.write_bytes(calibration.read_bytes())
+    api.replay(path, models=["joint"], until="fit")
+    return path
+
+
+@pytest.fixture
+def fitted(fitted_log: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "lab.mcap"
+    path.write_bytes(fitted_log.read_bytes())
+    return path
+
+
 def replay(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
     """Return the models in the JSON of a replay."""
     done = ipsys("replay", *arguments, "--json")
@@ -74,6 +97,16 @@ def test_joint_model_halves_the_error_of_rayplane(ipsys: Ipsys, log: Path) -> No
     assert truth["joint"] < 0.6 * truth["rayplane"]
     assert tracks["joint"] < 0.6 * tracks["rayplane"]
     assert tracks["joint"] < 0.15
+    with Session([log]) as session:
+        (evaluation,) = session.payloads(session.topics(EVALUATION, "joint"))
+    curve = {(point.camera, point.pairs): point for point in evaluation.learning}
+    cameras = {camera for camera, _ in curve}
+    assert len(cameras) == 3
+    for camera in cameras:
+        # With a drive, five points are nearly enough; the tape is most of the error.
+        few = curve[camera, 5]
+        assert few.subsets == JOINT_SUBSETS
+        assert few.mean_2d_m < 0.02
 
 
 def test_replay_of_the_joint_model_gives_the_same_bytes(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
@@ -116,13 +149,133 @@ def test_log_with_camera_points_only_is_refused(ipsys: Ipsys, tmp_path: Path, da
     assert log.read_bytes() == before
 
 
-def test_joint_model_for_camera_points_is_refused_in_one_line(ipsys: Ipsys, log: Path) -> None:
-    assert ipsys("fit", log, "--model", "joint").code == 0
-    done = ipsys("plan", log, "--model", "joint")
-    assert (done.code, done.err.count("\n")) == (1, 1)
-    assert "cannot be used with camera points" in done.err
-    with pytest.raises(IpsysError, match="cannot be used with camera points"):
-        load_model(log, "joint")
+def test_loaded_joint_model_gives_the_positions_of_locate(ipsys: Ipsys, fitted: Path) -> None:
+    assert ipsys("locate", fitted, "--model", "joint").code == 0
+    model = load_model(fitted, "joint")
+    assert isinstance(model, FittedCornerModel)
+    with Session([fitted]) as session:
+        rig = session.payloads(session.topics(RIG))[-1]
+        located = {
+            (m.camera, m.log_time_ns): m.payload.positions
+            for m in session.messages(session.topics(POSITIONS, "joint"))
+        }
+        # A marker on a robot is at the height of the rig, other than one at a calibration point.
+        seen, positions = next(
+            (m, positions)
+            for m in session.messages(session.topics(MARKERS, "geometric"))
+            if (positions := located[m.camera, m.log_time_ns]) and all(p.inside for p in positions)
+        )
+    markers = seen.payload.markers
+    corners_px = np.array([marker.corners_px for marker in markers])
+    covariances_px2 = np.array([marker.covariance_px2 for marker in markers])
+    heights_m = [rig.height_of(marker.id) for marker in markers]
+    found = model.locate(str(seen.camera), corners_px, rig.marker_length_m, heights_m, covariances_px2)
+    assert [p.id for p in positions] == [marker.id for marker in markers]
+    expected_m = np.array([(p.x_m, p.y_m, p.z_m) for p in positions])
+    assert np.abs(found.points_m - expected_m).max() < 1e-9
+    assert np.abs(found.headings_rad - [p.heading_rad for p in positions]).max() < 1e-9
+    level = model.predict(str(seen.camera), corners_px, rig.marker_length_m, heights_m)
+    free = model.predict(str(seen.camera), corners_px, rig.marker_length_m)
+    assert np.abs(level - expected_m).max() < 0.002
+    assert np.abs(free - expected_m)[:, :2].max() < 0.01
+    with pytest.raises(IpsysError, match="has no camera 'blue'"):
+        model.predict("blue", corners_px, 0.2)
+    with pytest.raises(IpsysError, match=r"corners_px has the shape \(3,\)"):
+        model.predict(str(seen.camera), np.zeros(3), 0.2)
+    with pytest.raises(IpsysError, match="heights_m has the shape"):
+        model.predict(str(seen.camera), corners_px, 0.2, np.zeros(len(markers) + 7))
+
+
+def test_logs_with_runs_of_one_name_are_fitted_together(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
+    """A drive of another hour has runs of the same names; the fit uses the sightings of both."""
+    drive, alone, both = (tmp_path / name for name in ("drive.mcap", "alone.mcap", "both.mcap"))
+    later = [m for m in hour_later(simulate_session(lab(4, 8.0))) if m.topic != MEASUREMENTS_TOPIC]
+    write_log(drive, later)
+    assert ipsys("fit", fitted, "--model", "joint", "-o", alone).code == 0
+    done = ipsys("fit", fitted, drive, "--model", "joint", "-o", both)
+    assert done.code == 0, done.err
+    with Session([fitted, drive, both]) as session:
+        record = next(run for run in reversed(session.runs()) if run.stage == "fit")
+        counts = {read.topic: read.messages for read in record.inputs if "/markers" in read.topic}
+        assert counts
+        for topic, count in counts.items():
+            assert count == sum(r.channels[topic].message_count for r in session.readers[:2])
+    same_time = tmp_path / "same_time.mcap"
+    same_time.write_bytes(fitted.read_bytes())
+    refused = ipsys("fit", fitted, same_time, "--model", "joint")
+    assert (refused.code, refused.err.count("\n")) == (1, 1)
+    assert "at the same time" in refused.err
+    assert "leave one of them out" in refused.err
+
+
+def test_wrong_tape_reading_is_an_outlier_of_joint(ipsys: Ipsys, tmp_path: Path) -> None:
+    """A drive shows a wrong reading among few points, where other models cannot search."""
+
+    def wrong(message: Message) -> Message:
+        payload = message.payload
+        if not isinstance(payload, Measurement) or payload.id != "s004":
+            return message
+        first, second = payload.distances
+        longer = replace(first, distance_m=first.distance_m + 0.1)
+        return replace(message, payload=replace(payload, distances=(longer, second)))
+
+    log = tmp_path / "wrong.mcap"
+    write_log(log, map(wrong, simulate_session(lab(12, 10.0))))
+    done = ipsys("evaluate", log, "--model", "joint", "--json")
+    assert done.code == 0, done.err
+    (model,) = json.loads(done.out)["models"].values()
+    (suspect,) = model["suspects"]
+    assert (suspect["measurement"], suspect["kind"]) == ("s004", "distance")
+    assert "distance to A" in suspect["text"]
+    assert 5 < np.linalg.norm(suspect["residual_cm"]) < 25
+    assert "Outliers: measure 1 point again" in ipsys("evaluate", log, "--model", "joint").out
+
+
+def test_usual_models_have_joint_where_there_are_corners(calibration: Path, tmp_path: Path) -> None:
+    points_only = tmp_path / "points.mcap"
+    with Session([calibration]) as session:
+        topics = [t for reader in session.readers for t in reader.channels if "/markers" not in t]
+        messages = [m for m in session.messages(topics) if not isinstance(m.payload, Run)]
+    write_log(points_only, messages)
+    assert evaluated_models([calibration]) == (*MODELS, "joint")
+    assert evaluated_models([points_only]) == tuple(MODELS)
+
+
+def test_usual_joint_model_that_cannot_be_fitted_is_left_out(
+    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_arguments: object) -> Model:
+        raise FitError("camera red: no overlap")
+
+    monkeypatch.setattr("ipsys_log.pipeline.evaluated_models", lambda paths: ("rigid", "joint"))
+    monkeypatch.setattr("ipsys_log.analysis.joint_calibration.fit_joint_model", fail)
+    done = ipsys("evaluate", log)
+    assert done.code == 0, done.err
+    assert "joint is left out: camera red: no overlap" in done.err
+    named = ipsys("evaluate", log, "--model", "joint")
+    assert (named.code, named.err.count("\n")) == (1, 1)
+
+
+def test_marker_without_a_height_gets_its_full_pose(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
+    rig, located = tmp_path / "lab.toml", tmp_path / "located.mcap"
+    assert ipsys("init", rig, "--from", fitted).code == 0
+    rig.write_text(rig.read_text().replace("marker_height_m = 0.1\n", ""))
+    drive = tmp_path / "drive.mcap"
+    write_log(drive, simulate_session(lab(4, 10.0)))
+    before = drive.read_bytes()
+    options = ("--model", "joint", "--model-from", fitted, "--rig", rig, "-o", located)
+    tracks = replay(ipsys, drive, *options)["joint"]["tracks"]["truth"]
+    assert drive.read_bytes() == before
+    assert tracks["2d"]["mean_cm"] < 0.4
+    assert tracks["3d"]["mean_cm"] < 1.5
+    with Session([drive, located]) as session:
+        positions = [p for one in session.payloads(session.topics(POSITIONS, "joint")) for p in one.positions]
+    heights_m = np.array([p.z_m for p in positions])
+    sigmas_m = np.sqrt([p.covariance_m2[2, 2] for p in positions if p.covariance_m2 is not None])
+    assert abs(float(np.median(heights_m)) - 0.1) < 0.005
+    # The covariance of a full pose is true: heights differ from 0.1 m by as much as it says.
+    assert 0.5 < float(np.median(np.abs(heights_m - 0.1) / sigmas_m)) / 0.6745 < 2
+    assert np.mean([bool(p.inside) for p in positions]) > 0.99
 
 
 def test_joint_results_with_another_rig_are_verified(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:

@@ -1,0 +1,145 @@
+"""The step from the markers of a frame to world positions, by the joint model of their camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.joint.locate import Positions as LocatedMarkers
+from ipsys_log.joint.locate import locate_markers
+from ipsys_log.joint.locate_poses import Poses, locate_poses
+from ipsys_log.joint.model import JointModel
+from ipsys_log.joint.payload import restore_joint
+from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["MOST_CHI2", "MOST_CHI2_OF_POSE", "LocateCorners", "corner_covariances"]
+
+Array = NDArray[np.float64]
+
+# Corners without a covariance have about this error.
+_CORNER_SIGMA_PX = 0.25
+# Usual standard deviation of the height of a marker on its robot.
+_HEIGHT_SIGMA_M = 0.001
+# A marker that is not where its corners say that it is has larger residuals. One in a million is larger by
+# chance: with five degrees of freedom at a known height, and with two for a full pose.
+MOST_CHI2 = 37.0
+MOST_CHI2_OF_POSE = 27.6
+
+
+class _Located(NamedTuple):
+    """A located marker.
+
+    ``fits`` is True if its residuals are usual. ``noise_m2`` (3, 3) and ``heading_noise_rad`` are the part of
+    the uncertainty that changes from frame to frame.
+    """
+
+    point_m: Array
+    heading_rad: float
+    covariance_m2: Array
+    fits: bool
+    noise_m2: Array
+    heading_noise_rad: float
+
+
+def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
+    """Return the covariances (n, 8, 8) of corners, with the usual one for those that have none."""
+    unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
+    return np.array([unknown if one is None else one for one in covariances_px2]).reshape(-1, 8, 8)
+
+
+class LocateCorners:
+    """The step from markers to positions. A camera that is not in the model has no positions.
+
+    A marker whose height is in the rig is level, at this height. Other markers get their full pose.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._name = model.name
+        self._cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
+        self._rig: Rig | None = None
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        if isinstance(message.payload, Rig):
+            self._rig = message.payload
+            return
+        if not isinstance(message.payload, Markers):
+            return
+        camera = self._cameras.get(str(message.camera))
+        if camera is not None:
+            yield Positions(message.publish_time_ns, self._positions(camera, message.payload.markers))
+
+    def _positions(self, camera: JointModel, markers: Sequence[Marker]) -> tuple[Position, ...]:
+        if markers and self._rig is None:
+            raise IpsysError(f"{self._name} needs the size of the markers; give a rig with --rig lab.toml")
+        located: dict[int, _Located] = {}
+        for by_height in (True, False):
+            rows = [n for n, marker in enumerate(markers) if self._has_height(marker) is by_height]
+            own = [markers[row] for row in rows]
+            if own:
+                locate = self._locate_at_height if by_height else self._locate_poses
+                located.update(zip(rows, locate(camera, own), strict=True))
+        return tuple(
+            Position(
+                marker.id,
+                *located[n].point_m.tolist(),
+                located[n].heading_rad,
+                located[n].covariance_m2,
+                located[n].fits,
+                _time_offset_ns(camera, marker),
+                located[n].noise_m2,
+                located[n].heading_noise_rad,
+            )
+            for n, marker in enumerate(markers)
+            if np.isfinite(located[n].point_m).all()
+        )
+
+    def _has_height(self, marker: Marker) -> bool:
+        return self._rig is not None and self._rig.height_of(marker.id) is not None
+
+    def _locate_at_height(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
+        assert self._rig is not None
+        sigmas_m = [self._rig.height_sigma_of(marker.id) for marker in markers]
+        found = locate_markers(
+            camera,
+            *_corners(markers),
+            np.array([self._rig.height_of(marker.id) for marker in markers], dtype=np.float64),
+            np.array([self._rig.length_of(marker.id) for marker in markers]),
+            np.array([_HEIGHT_SIGMA_M if sigma_m is None else sigma_m for sigma_m in sigmas_m]),
+        )
+        return _rows(found, MOST_CHI2)
+
+    def _locate_poses(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
+        assert self._rig is not None
+        lengths_m = np.array([self._rig.length_of(marker.id) for marker in markers])
+        return _rows(locate_poses(camera, *_corners(markers), lengths_m), MOST_CHI2_OF_POSE)
+
+
+def _rows(located: LocatedMarkers | Poses, most_chi2: float) -> list[_Located]:
+    """Return the rows of located markers; residuals above ``most_chi2`` are unusual."""
+    columns = (
+        located.points_m,
+        located.headings_rad.tolist(),
+        located.covariances_m2,
+        (located.chi2 < most_chi2).tolist(),
+        located.noise_m2,
+        located.heading_noise_rad.tolist(),
+    )
+    return [_Located(*row) for row in zip(*columns, strict=True)]
+
+
+def _corners(markers: Sequence[Marker]) -> tuple[Array, Array]:
+    """Return the corners (n, 4, 2) of markers, and their covariances (n, 8, 8)."""
+    corners_px = np.array([marker.corners_px for marker in markers], dtype=np.float64)
+    return corners_px, corner_covariances([marker.covariance_px2 for marker in markers])
+
+
+def _time_offset_ns(camera: JointModel, marker: Marker) -> int | None:
+    """Return the time from the stamp of the frame to the exposure of the marker, by the common clock."""
+    rows = float(marker.corners_px[:, 1].mean())
+    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s + camera.clock_s) * NS_PER_S)
+    return offset_ns if offset_ns or marker.time_offset_ns is not None else None

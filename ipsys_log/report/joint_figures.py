@@ -1,0 +1,153 @@
+"""Figures of a joint calibration: camera poses, clock offsets, and the corner residuals in each image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
+from ipsys_log.messages import Rig
+from ipsys_log.report.figures import style_axes
+from ipsys_log.report.floor_figure import draw_ground
+from ipsys_log.report.styles import NOTE, camera_styles, shorten
+
+__all__ = ["clocks_figure", "has_clocks", "poses_figure", "residual_limit_px", "residuals_figure"]
+
+Array = NDArray[np.float64]
+
+_MM_PER_M = 1000.0
+_MS_PER_S = 1000.0
+# Colours from pale (small residual) to dark, readable with any colour vision.
+_COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
+_WIDTH_IN = 4.7
+# A residual that is usual in the image has an arrow of this share of the image's width.
+_ARROW = 0.04
+
+
+def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure:
+    """Draw the cameras from above and from the side, each with its field of view on the floor."""
+    figure = Figure(figsize=(_WIDTH_IN, 7.0), layout="constrained")
+    above, beside = figure.subplots(2, 1, height_ratios=[3.2, 1.4])
+    styles = camera_styles(camera.camera for camera in cameras)
+    around_m = [part for camera in cameras for part in (camera.outline_m, camera.origin_m[None, :2])]
+    draw_ground(above, rig, [part for part in around_m if len(part)])
+    for camera in cameras:
+        colour, shape = styles[camera.camera]
+        x_m, y_m, z_m = camera.origin_m.tolist()
+        if len(camera.outline_m):
+            above.add_patch(Polygon(camera.outline_m, fill=False, ec=colour, lw=1.5))
+        above.plot(x_m, y_m, shape, color=colour, ms=8, label=_pose_label(camera), zorder=4)
+        _draw_axis(above, camera, colour)
+        beside.plot(x_m, z_m, shape, color=colour, ms=8, zorder=4)
+        for end_m in _ends_m(camera):
+            beside.plot([x_m, end_m], [z_m, 0.0], color=colour, lw=1.0)
+    above.set_title("From above", loc="left", fontsize=10)
+    beside.axhline(0.0, color=NOTE, lw=1.2)
+    beside.set(xlabel="x in m", ylabel="height in m")
+    beside.set_ylim(bottom=0.0, top=1.15 * max(float(camera.origin_m[2]) for camera in cameras))
+    beside.set_title("From the side, along y", loc="left", fontsize=10)
+    beside.set_xlim(above.get_xlim())
+    style_axes(beside)
+    for axes in (above, beside):
+        axes.tick_params(labelsize=8)
+    figure.legend(loc="outside lower center", frameon=False, fontsize=8)
+    return figure
+
+
+def _pose_label(camera: CalibratedCamera) -> str:
+    flat_mm = float(np.hypot(*camera.sigmas_m[:2])) * _MM_PER_M
+    return (
+        f"{shorten(camera.camera)}: height {camera.origin_m[2]:.3f} m ± {camera.sigmas_m[2] * _MM_PER_M:.1f} "
+        f"mm, place ± {flat_mm:.1f} mm"
+    )
+
+
+def _draw_axis(axes: Axes, camera: CalibratedCamera, colour: str) -> None:
+    """Draw an arrow from the camera to the point of the floor on its optical axis."""
+    if camera.axis[2] >= 0:
+        return
+    start_m = camera.origin_m[:2]
+    end_m = start_m - camera.axis[:2] * camera.origin_m[2] / camera.axis[2]
+    axes.annotate("", tuple(end_m), tuple(start_m), arrowprops={"arrowstyle": "->", "color": colour})
+
+
+def _ends_m(camera: CalibratedCamera) -> list[float]:
+    """Return the x of the outermost points of the field of view."""
+    if not len(camera.outline_m):
+        return []
+    return [float(camera.outline_m[:, 0].min()), float(camera.outline_m[:, 0].max())]
+
+
+def has_clocks(cameras: Sequence[CalibratedCamera]) -> bool:
+    """Return whether a drive determined a clock offset."""
+    return any(camera.clock_sigma_s > 0 for camera in cameras)
+
+
+def clocks_figure(cameras: Sequence[CalibratedCamera]) -> Figure:
+    """Draw the clock offset of each camera with two standard deviations."""
+    figure = Figure(figsize=(_WIDTH_IN, 1.3 + 0.32 * len(cameras)), layout="constrained")
+    axes = figure.add_subplot()
+    styles = camera_styles(camera.camera for camera in cameras)
+    labels = []
+    for row, camera in enumerate(cameras):
+        colour, shape = styles[camera.camera]
+        offset_ms, sigma_ms = camera.clock_s * _MS_PER_S, camera.clock_sigma_s * _MS_PER_S
+        axes.errorbar(offset_ms, row, xerr=2 * sigma_ms, fmt=shape, color=colour, ms=6, capsize=3)
+        text = f"{offset_ms:+.2f} ± {sigma_ms:.2f} ms" if sigma_ms else "constant"
+        labels.append(f"{shorten(camera.camera)}\n{text}")
+    axes.axvline(0.0, color=NOTE, lw=1.0)
+    axes.set_yticks(range(len(cameras)), labels)
+    axes.set_ylim(len(cameras) - 0.5, -0.5)
+    axes.set_xlabel("time to add to the stamps, in ms")
+    style_axes(axes, "x")
+    axes.tick_params(labelsize=8)
+    return figure
+
+
+def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
+    """Draw the mean corner residuals over the image of a camera.
+
+    Parameters
+    ----------
+    camera : with residuals.
+    most_px : residual of the last colour; the same for all cameras.
+    """
+    assert camera.residuals is not None
+    assert camera.size_px is not None
+    (width, height), residuals = camera.size_px, camera.residuals
+    figure = Figure(figsize=(_WIDTH_IN, 0.95 + _WIDTH_IN * height / width), layout="constrained")
+    axes = figure.add_subplot()
+    axes.add_patch(Rectangle((0, 0), width, height, fill=False, ec="black", lw=1.0))
+    arrows = axes.quiver(
+        *residuals.cells_px.T, *residuals.means_px.T, residuals.rms_px, cmap=_COLOURS, angles="xy",
+        scale_units="xy", scale=most_px / (_ARROW * width), width=0.005, zorder=3,
+    )  # fmt: skip
+    arrows.set_clim(0.0, most_px)
+    axes.scatter(
+        *residuals.cells_px.T, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4
+    )
+    axes.set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height), aspect="equal")
+    axes.set_xticks([0, width])
+    axes.set_yticks([0, height])
+    axes.tick_params(labelsize=8)
+    axes.spines[:].set_visible(False)
+    label = f"{shorten(camera.camera)}: {residuals.total_rms_px:.3f} px RMS, {residuals.corners} corners"
+    axes.set_title(label, loc="left", fontsize=9)
+    bar = figure.colorbar(arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30)
+    bar.set_label("residual in px, RMS of a cell", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    return figure
+
+
+def residual_limit_px(cameras: Sequence[CalibratedCamera]) -> float:
+    """Return the residual of the last colour for all cameras: few cells have a larger one."""
+    rms_px = [camera.residuals.rms_px for camera in cameras if camera.residuals is not None]
+    everything = np.concatenate(rms_px) if rms_px else np.zeros(0)
+    return float(np.quantile(everything, 0.95)) if len(everything) else 1.0

@@ -116,7 +116,7 @@ def _table_nodes(name: str, camera: CameraModel, grid: Grid, height_m: float) ->
 
 
 def _side_by_side(cameras: dict[str, NodeModes]) -> dict[str, NodeModes]:
-    """Return the nodes with the amplitudes of all cameras, each camera with its own; the last one is common."""
+    """Return the nodes with the amplitudes of all cameras: each has its own, and the last one is common."""
     counts = [node.modes_m.shape[2] - 1 for node in cameras.values()]
     ends = np.cumsum([0, *counts])
     joined = {}

@@ -29,7 +29,8 @@ class MotionNoise:
         correlation time.
     turn_rad_s2, climb_m_s2 : changes of the turn rate and of the vertical speed: square root of the density
         of white noise, as their standard deviation after one second.
-    start_m_s, start_rad_s : standard deviations of the velocity and of the turn rate of a new track.
+    start_m_s, start_climb_m_s, start_rad_s : standard deviations of the velocity on the floor, of the vertical
+        speed, and of the turn rate of a new track.
     """
 
     acceleration_m_s2: float = 3.0
@@ -37,6 +38,7 @@ class MotionNoise:
     turn_rad_s2: float = 2.0
     climb_m_s2: float = 0.05
     start_m_s: float = 1.0
+    start_climb_m_s: float = 0.05
     start_rad_s: float = 2.0
 
 

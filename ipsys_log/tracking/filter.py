@@ -98,7 +98,9 @@ def start(sightings: Sightings, noise: MotionNoise) -> States:
     unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
     covariances[unknown, 3, 3] = _START_HEADING_RAD2
     sigmas = (
-        [noise.start_m_s] * 2 + [noise.start_climb_m_s, noise.start_rad_s] + [noise.acceleration_m_s2] * 2
+        [noise.start_m_s] * 2
+        + [noise.start_climb_m_s, noise.start_rad_s]
+        + [noise.start_acceleration_m_s2] * 2
     )
     rates = np.arange(RATES.start, ACCELERATION.stop)
     covariances[:, rates, rates] = np.square(sigmas)
@@ -107,7 +109,8 @@ def start(sightings: Sightings, noise: MotionNoise) -> States:
 
 def predict(states: States, durations_s: Array, noise: MotionNoise) -> States:
     """Return the states after durations (k,) in s, which are at least 0."""
-    forward, spread = transition(durations_s, noise)
+    speeds_m_s = np.hypot(states.means[:, 4], states.means[:, 5])
+    forward, spread = transition(durations_s, speeds_m_s, noise)
     means = (forward @ states.means[:, :, None])[:, :, 0]
     covariances = forward @ states.covariances @ forward.swapaxes(1, 2) + spread
     return States(means, covariances, forward @ states.cross)

@@ -113,8 +113,10 @@ def _between(
     covariances_m2 = weights.mix_variances(
         rows.covariances_m2[[before, after]], rows.velocity_covariances_m2_s2[[before, after]]
     )
-    on_floor_m2 = weights.unknown_motion(_ON_FLOOR, noise)
-    unknown_m2 = np.stack([on_floor_m2, on_floor_m2, weights.unknown_motion(_UP, noise)], axis=1)
+    # The chord between both rows, if they have no velocities.
+    speeds_m_s = np.linalg.norm((ends_m[1] - ends_m[0])[:, :2], axis=1) / np.where(whole_s > 0, whole_s, 1.0)
+    on_floor_m2, up_m2 = (weights.unknown_motion(columns, speeds_m_s, noise) for columns in (_ON_FLOOR, _UP))
+    unknown_m2 = np.stack([on_floor_m2, on_floor_m2, up_m2], axis=1)
     turning = np.isfinite(rows.turn_rates_rad_s[before] + rows.turn_rates_rad_s[after])
     turns = _Weights.of(elapsed_s, whole_s, turning)
     headings_rad, turn_rates_rad_s = turns.mix(
@@ -128,7 +130,7 @@ def _between(
         covariances_m2 + unknown_m2[:, :, None] * np.eye(3),
         velocities_m_s,
         (headings_rad + np.pi) % (2 * np.pi) - np.pi,
-        np.sqrt(variances_rad2 + turns.unknown_motion(_TURN, noise)),
+        np.sqrt(variances_rad2 + turns.unknown_motion(_TURN, speeds_m_s, noise)),
         turn_rates_rad_s,
     )
 
@@ -187,17 +189,18 @@ class _Weights:
         """Return variances (k, ...) of values from the variances of both rows, (2, k, ...)."""
         return _sum(self.values, of_values) + _sum(self.rates**2, np.nan_to_num(of_rates))
 
-    def unknown_motion(self, columns: tuple[int, ...], noise: MotionNoise) -> Array:
+    def unknown_motion(self, columns: tuple[int, ...], speeds_m_s: Array, noise: MotionNoise) -> Array:
         """Return the variance (k,) of the motion between the rows, along some columns of the state.
 
         The rows are exact. The acceleration of the first row, if it is a column, has its usual deviation.
         """
-        own = np.ix_(np.arange(len(self.elapsed_s)), columns, columns)
-        _, spread = (one[own] for one in transition(self.elapsed_s, noise))
-        forward = transition(self.elapsed_s, noise)[0][own]
-        onward, more = (one[own] for one in transition(np.maximum(self.whole_s - self.elapsed_s, 0.0), noise))
+        own = np.ix_(np.arange(len(speeds_m_s)), columns, columns)
+        rest_s = np.maximum(self.whole_s - self.elapsed_s, 0.0)
+        forward, spread = (one[own] for one in transition(self.elapsed_s, speeds_m_s, noise))
+        onward, more = (one[own] for one in transition(rest_s, speeds_m_s, noise))
         if len(columns) == 3:
-            effect = forward[:, :, 2] * noise.acceleration_m_s2
+            usual_m_s2 = np.hypot(noise.acceleration_m_s2, noise.bend_rad_s * speeds_m_s)
+            effect = forward[:, :, 2] * usual_m_s2[:, None]
             spread = spread + effect[:, :, None] * effect[:, None]
         cross = spread @ onward.swapaxes(1, 2)
         end = onward @ cross + more

@@ -19,6 +19,8 @@ __all__ = ["smooth"]
 Array = NDArray[np.float64]
 
 _HEADING = 3
+# The speed of a robot is that between two sightings this long before and after: cameras differ by some mm.
+_SPEED_S = 0.1
 
 
 def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> States:
@@ -38,7 +40,8 @@ def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> Stat
     ----------
     Rauch, Tung and Striebel, AIAA Journal 1965. Covariances are sums of squares, as in the form of Joseph.
     """
-    forward, spread = transition(durations_s, noise)
+    speeds_m_s = _speeds(sightings.poses[:, :2], durations_s)
+    forward, spread = transition(durations_s, speeds_m_s, noise)
     means, covariances = _filter(sightings, forward, spread, noise)
     gains, rest = _gains(covariances[:-1], forward, spread)
     for n in range(len(durations_s) - 1, -1, -1):
@@ -50,6 +53,16 @@ def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> Stat
         covariances[n] = rest[n] + gains[n] @ covariances[n + 1] @ gains[n].T
     covariances = (covariances + covariances.swapaxes(1, 2)) / 2
     return States(means[:, :MOTION], covariances[:, :MOTION, :MOTION], covariances[:, :MOTION, MOTION:])
+
+
+def _speeds(points_m: Array, durations_s: Array) -> Array:
+    """Return the speed (n - 1,) over each step, from sightings before and after it."""
+    times_s = np.concatenate([[0.0], np.cumsum(durations_s)])
+    first = np.maximum(np.searchsorted(times_s, times_s[:-1] - _SPEED_S, side="right") - 1, 0)
+    last = np.minimum(np.searchsorted(times_s, times_s[1:] + _SPEED_S), len(times_s) - 1)
+    way_m = np.linalg.norm(points_m[last] - points_m[first], axis=1)
+    speeds: Array = way_m / np.maximum(times_s[last] - times_s[first], _SPEED_S)
+    return speeds
 
 
 def _filter(sightings: Sightings, forward: Array, spread: Array, noise: MotionNoise) -> tuple[Array, Array]:

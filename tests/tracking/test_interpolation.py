@@ -94,9 +94,10 @@ def test_unknown_motion_equals_its_integral(share: float, with_rates: bool) -> N
     weights = np.full(len(times_s), times_s[1])
     weights[[0, -1]] /= 2
     apart_s = np.abs(times_s[:, None] - times_s)
-    acceleration = NOISE.acceleration_m_s2**2 * np.exp(-apart_s / NOISE.hold_s)
-    expected_m2 = (kernel * weights) @ acceleration @ (kernel * weights)
     rows = make_rows([0, 500_000_000], exact=True)
+    speed_m_s = np.linalg.norm(np.diff(rows.points_m, axis=0)) / whole_s
+    variance = NOISE.acceleration_m_s2**2 + (NOISE.bend_rad_s * speed_m_s) ** 2
+    expected_m2 = (kernel * weights) @ (variance * np.exp(-apart_s / NOISE.hold_s)) @ (kernel * weights)
     if not with_rates:
         missing = np.full_like(rows.velocities_m_s, np.nan)
         rows = replace(rows, velocities_m_s=missing, velocity_covariances_m2_s2=np.full((2, 3, 3), np.nan))

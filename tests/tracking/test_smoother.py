@@ -12,7 +12,8 @@ from ipsys_log.tracking.smoother import smooth
 
 Array = NDArray[np.float64]
 
-NOISE, MODES = MotionNoise(), 3
+# The acceleration does not grow with the speed, which the smoother estimates.
+NOISE, MODES = MotionNoise(acceleration_m_s2=3.0, bend_rad_s=0.0), 3
 
 
 def make_sightings(seed: int, count: int) -> tuple[Array, Sightings]:
@@ -36,7 +37,7 @@ def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Arra
     means[0, :MOTION] = first.means[0]
     joint[0, :, 0] = np.block([[first.covariances[0], first.cross[0]], [first.cross[0].T, np.eye(MODES)]])
     for n, duration_s in enumerate(durations_s):
-        (motion,), (spread,) = transition(np.array([duration_s]), NOISE)
+        (motion,), (spread,) = transition(np.array([duration_s]), np.zeros(1), NOISE)
         forward = np.eye(size)
         forward[:MOTION, :MOTION] = motion
         means[n + 1] = forward @ means[n]

@@ -29,7 +29,7 @@ def test_transition_solves_the_differential_equation(duration_s: float) -> None:
 
     def growth(time_s: float) -> Array:
         moved = expm(slope * time_s)
-        return np.asarray(moved * density @ moved.T)
+        return np.asarray((moved * density) @ moved.T)
 
     forward, spread = transition(np.array([duration_s]), np.array([0.7]), noise)
     np.testing.assert_allclose(forward[0], expm(slope * duration_s), atol=1e-12)

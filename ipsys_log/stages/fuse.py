@@ -24,9 +24,10 @@ from ipsys_log.messages import (
     Vector3,
 )
 from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
-from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
+from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.position_sightings import read_sightings
+from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
 __all__ = ["STAGE", "Fuse"]
@@ -101,40 +102,11 @@ class Fuse:
     def _messages(self, poses: list[Pose]) -> Iterator[Any]:
         tracks_by_time: dict[int, list[Track]] = defaultdict(list)
         for pose in poses:
-            tracks_by_time[pose.time_ns].append(_track(pose))
+            tracks_by_time[pose.time_ns].append(make_track(pose))
         for time_ns, tracks in sorted(tracks_by_time.items()):
             tracks.sort(key=lambda track: track.id)
             yield Tracks(time_ns, tuple(tracks))
             yield FrameTransforms(tuple(_transform(track, self._run, time_ns) for track in tracks))
-
-
-def _track(pose: Pose) -> Track:
-    mean, covariance = pose.states.means[pose.state], pose.states.covariances[pose.state]
-    robot, marker_id = pose.robot
-    x_m, y_m, z_m, heading_rad, _, _, _, turn_rate, _, _ = mean.tolist()
-    sigmas = np.sqrt(covariance.diagonal()).tolist()
-    has_heading = sigmas[3] < _UNKNOWN_HEADING_RAD
-    return Track(
-        robot,
-        marker_id,
-        x_m,
-        y_m,
-        z_m,
-        (heading_rad + np.pi) % (2 * np.pi) - np.pi if has_heading else None,
-        covariance[:3, :3] + pose.rest_m2 if pose.has_covariance else None,
-        pose.cameras,
-        pose.inside,
-        mean[4:7],
-        covariance[4:7, 4:7] if pose.has_covariance else None,
-        sigmas[3] if has_heading and pose.has_covariance else None,
-        turn_rate if has_heading else None,
-        sigmas[7] if has_heading and pose.has_covariance else None,
-        pose.coasting_ns,
-    )
-
-
-# A heading that was never measured has a larger standard deviation.
-_UNKNOWN_HEADING_RAD = 2.0
 
 
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:

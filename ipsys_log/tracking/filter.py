@@ -31,8 +31,8 @@ class States:
     ----------
     means : (k, 10). Headings are continuous: they can be outside of one turn.
     covariances : (k, 10, 10), of all errors, those of the calibration included.
-    cross : (k, 10, m), covariance of the errors and the amplitudes of the calibration. The covariance of the
-        calibration part of two states is the product of their rows.
+    cross : (k, 10, m), errors (estimate minus truth) by the amplitudes of the calibration. The covariance of
+        two states by their calibration is the product of their rows.
     """
 
     means: Array
@@ -76,7 +76,7 @@ class Innovations:
     differences : (k, 4), sighting minus prediction, in m and rad; 0 for a heading that was not measured.
     covariances : (k, 4, 4), of the differences.
     modes : (k, 4, m), sensitivities of the sightings with the errors of their times.
-    across : (k, 10, 4), covariance of the state and the difference.
+    across : (k, 10, 4), minus the covariance of the errors of the states and the differences.
     chi2 : (k,), squared differences in units of their covariances.
     """
 
@@ -124,9 +124,9 @@ def compare(states: States, sightings: Sightings) -> Innovations:
     known = sightings.noise[:, 3, 3] < UNKNOWN_RAD2
     differences[:, 3] = np.where(known, (differences[:, 3] + np.pi) % (2 * np.pi) - np.pi, 0.0)
     turned = modes.swapaxes(1, 2)
-    across = states.covariances[:, :, POSE] + states.cross @ turned
-    covariances = across[:, POSE] + modes @ states.cross[:, POSE].swapaxes(1, 2) + modes @ turned
-    covariances += sightings.noise
+    # Errors are estimate minus truth. The difference is modes b + noise - error, so a common error cancels.
+    across = states.covariances[:, :, POSE] - states.cross @ turned
+    covariances = across[:, POSE] + modes @ (turned - states.cross[:, POSE].swapaxes(1, 2)) + sightings.noise
     solved = np.linalg.solve(covariances, differences[:, :, None])
     chi2 = (differences[:, None] @ solved)[:, 0, 0]
     return Innovations(differences, covariances, modes, across, chi2)
@@ -152,7 +152,7 @@ def update(states: States, sightings: Sightings, innovations: Innovations) -> St
     means = states.means + (gains @ innovations.differences[:, :, None])[:, :, 0]
     # (1 - K H) P (1 - K H)' + K R K', one factor after the other, because H has only four rows.
     left = states.covariances - gains @ across.swapaxes(1, 2)
-    cross = states.cross - gains @ (states.cross[:, POSE] + modes)
-    observed = left[:, :, POSE] + cross @ modes.swapaxes(1, 2)
+    cross = states.cross - gains @ (states.cross[:, POSE] - modes)
+    observed = left[:, :, POSE] - cross @ modes.swapaxes(1, 2)
     covariances = left + (gains @ sightings.noise - observed) @ gains.swapaxes(1, 2)
     return States(means, (covariances + covariances.swapaxes(1, 2)) / 2, cross)

@@ -34,11 +34,14 @@ class Record(NamedTuple):
 class History:
     """The records of one robot, for as long as a late sighting can change them.
 
-    ``rows_ns`` are the instants of the poses that were given out.
+    ``rows_ns`` are the instants of the poses that were given out. A ``complete`` history forgets nothing, for
+    processing after the recording. ``began_ns`` is the time of the first record.
     """
 
     records: list[Record] = field(default_factory=list)
     rows_ns: set[int] = field(default_factory=set)
+    complete: bool = False
+    began_ns: int = 0
 
     @property
     def newest(self) -> Record:
@@ -53,7 +56,11 @@ class History:
 
     def replace_from(self, place: int, records: list[Record]) -> None:
         """Replace the records from a place on, and forget those that no late sighting can reach."""
+        if not self.records or records[0].time_ns < self.began_ns:
+            self.began_ns = records[0].time_ns
         self.records[place:] = records
+        if self.complete:
+            return
         oldest_ns = self.newest.time_ns - HISTORY_NS
         # The last record before the oldest time stays: a sighting at that time starts from it.
         kept = 0

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)
 MOTION = 10
 # Gauss-Legendre nodes on 0 to 1: the integrals of the noise are exact to 1e-9 for up to 1 s.
-_NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(5))
+_NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(7))
 _NODES = _NODES + 0.5
 
 
@@ -25,9 +25,9 @@ class MotionNoise:
 
     Attributes
     ----------
-    acceleration_m_s2, bend_rad_s, hold_s : standard deviation of the acceleration on the floor along each axis
-        of a robot that stands; its growth with the speed, because a robot in a bend has the product of speed
-        and turn rate; its correlation time.
+    acceleration_m_s2, bend_rad_s, hold_s : standard deviation of the acceleration along each axis of the floor
+        of a robot that stands; its growth with the speed, because the acceleration in a bend is the product
+        of speed and turn rate; its correlation time.
     turn_rad_s2, climb_m_s2 : changes of the turn rate and of the vertical speed: square root of the density
         of white noise, as their standard deviation after one second.
     start_m_s, start_climb_m_s, start_rad_s, start_acceleration_m_s2 : standard deviations of a new track: of

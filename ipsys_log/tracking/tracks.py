@@ -13,7 +13,7 @@ from ipsys_log.tracking.history import HISTORY_NS, History, Record
 from ipsys_log.tracking.motion import MotionNoise
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Pose", "RobotTracks", "TrackSettings"]
+__all__ = ["Pose", "RobotTracks", "TrackSettings", "gather_sightings"]
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,7 @@ class Pose:
     rest_m2: Array
     has_covariance: bool
     coasting_ns: int | None = None
+    age_ns: int | None = None
 
 
 @dataclass(slots=True)
@@ -101,11 +102,22 @@ class RobotTracks:
 
     A sighting outside the gate changes nothing. If several of them agree with one another, and none agrees
     with the track, the track starts again with them.
+
+    Parameters
+    ----------
+    settings : limits of the tracks.
+    complete : keep all sightings of all tracks, for their smoothing.
     """
 
-    def __init__(self, settings: TrackSettings | None = None) -> None:
+    def __init__(self, settings: TrackSettings | None = None, complete: bool = False) -> None:
         self._settings = settings or TrackSettings()
+        self._complete = complete
         self._tracks: dict[Hashable, _Track] = {}
+        self._ended: list[tuple[Hashable, History]] = []
+
+    def histories(self) -> list[tuple[Hashable, History]]:
+        """Return all tracks with their robots, ended ones first; only if the histories are ``complete``."""
+        return [*self._ended, *((robot, track.history) for robot, track in self._tracks.items())]
 
     def observe(
         self,
@@ -148,6 +160,7 @@ class RobotTracks:
         for robot, track in list(self._tracks.items()):
             age_ns = time_ns - track.history.newest.time_ns
             if age_ns > settings.coast_ns:
+                self._end(robot, track.history)
                 del self._tracks[robot]
             elif age_ns > settings.gap_ns and time_ns not in track.history.rows_ns:
                 coasting.append((robot, track, age_ns))
@@ -169,6 +182,7 @@ class RobotTracks:
                 track.rest_m2,
                 track.has_covariance,
                 age_ns,
+                time_ns - track.history.began_ns,
             )
             for row, (robot, track, age_ns) in enumerate(coasting)
         ]
@@ -185,7 +199,7 @@ class RobotTracks:
                 places.append(track.history.place_of(time_ns) if records else 0)
         if not rows:
             return []
-        accepted = self._filter(batch, np.array(rows), tracks, places)
+        accepted = self._filter(batch, robots, np.array(rows), tracks, places)
         return [
             pose
             for row, track, is_accepted in zip(rows, tracks, accepted.tolist(), strict=True)
@@ -197,12 +211,23 @@ class RobotTracks:
         ended = track is not None and (
             batch.times_ns[row] - track.history.newest.time_ns > self._settings.coast_ns
         )
+        if track is not None and ended:
+            self._end(robot, track.history)
         if track is None or ended:
-            track = self._tracks[robot] = _Track(History(), batch.rest_m2[row])
+            track = self._tracks[robot] = _Track(History(complete=self._complete), batch.rest_m2[row])
         return track
 
+    def _end(self, robot: Hashable, history: History) -> None:
+        if self._complete:
+            self._ended.append((robot, history))
+
     def _filter(
-        self, batch: _Batch, rows: NDArray[np.intp], tracks: list[_Track], places: list[int]
+        self,
+        batch: _Batch,
+        robots: Sequence[Hashable],
+        rows: NDArray[np.intp],
+        tracks: list[_Track],
+        places: list[int],
     ) -> NDArray[np.bool_]:
         """Filter the sightings of some rows, and the later ones again; return a mask of the accepted rows."""
         sightings = batch.sightings.take(rows)
@@ -224,7 +249,7 @@ class RobotTracks:
                 batch.times_ns[row], batch.camera, batch.inside[row], batch.sightings, row, states, number
             )
             if not accepted[number]:
-                accepted[number] = self._contradict(track, record, batch.rest_m2[row])
+                accepted[number] = self._contradict(robots[row], track, record, batch.rest_m2[row])
                 continue
             track.rival, track.hits = None, 0
             later.append((track, place, [record, *track.history.records[place:]]))
@@ -240,7 +265,7 @@ class RobotTracks:
             predicted = self._predicted(
                 [records[step - 1] for records in waiting], [records[step].time_ns for records in waiting]
             )
-            seen = _gather_sightings([records[step] for records in waiting])
+            seen = gather_sightings([records[step] for records in waiting])
             states = update(predicted, seen, compare(predicted, seen))
             for row, records in enumerate(waiting):
                 records[step] = records[step]._replace(states=states, state=row)
@@ -261,7 +286,7 @@ class RobotTracks:
         chi2 = (innovations.differences[:, None] @ solved)[:, 0, 0]
         return np.asarray(chi2 < settings.gate)
 
-    def _contradict(self, track: _Track, record: Record, rest_m2: Array) -> bool:
+    def _contradict(self, robot: Hashable, track: _Track, record: Record, rest_m2: Array) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
         seen, rival = record.sightings.take(_ONE + record.sighting), track.rival
         states, hits = start(seen, self._settings.motion), 1
@@ -272,11 +297,12 @@ class RobotTracks:
                 states, hits = update(predicted, seen, innovations), track.hits + 1
         own = record._replace(states=states, state=0)
         if hits == 1 or rival is None:
-            rival = History()
+            rival = History(complete=self._complete)
         rival.replace_from(len(rival.records), [own])
         track.rival, track.hits = rival, hits
         if hits < self._settings.restart:
             return False
+        self._end(robot, track.history)
         rival.rows_ns = track.history.rows_ns
         track.history, track.rest_m2, track.rival, track.hits = rival, rest_m2, None, 0
         return True
@@ -298,6 +324,7 @@ class RobotTracks:
             any(flags) if flags else None,
             batch.rest_m2[row],
             batch.has_covariance[row],
+            age_ns=time_ns - track.history.began_ns,
         )
 
 
@@ -310,7 +337,7 @@ def _gather(records: Sequence[Record]) -> States:
     )
 
 
-def _gather_sightings(records: Sequence[Record]) -> Sightings:
+def gather_sightings(records: Sequence[Record]) -> Sightings:
     """Return the sightings of records of different messages together."""
     return Sightings(
         np.array([record.sightings.poses[record.sighting] for record in records]),

@@ -21,6 +21,7 @@ from ipsys_log.opened_log import Export, Listing, Log, StrPath
 from ipsys_log.player import Player
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome
+from ipsys_log.sampled_track import SampledTrack
 from ipsys_log.tracker import LiveTracks, Tracker
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ __all__ = [
     "Outcome",
     "Player",
     "ReplayResult",
+    "SampledTrack",
     "Tracker",
     "calibrate",
     "live",

@@ -8,7 +8,7 @@ from html import escape
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
@@ -16,6 +16,7 @@ from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, Channel
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
+from ipsys_log.sampled_track import SampledTrack, sample_track, time_in_ns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -232,6 +233,30 @@ class Log:
         wanted = [run] if run is None or isinstance(run, str) else list(run)
         return [self._run_of(channel, name) for name in wanted]
 
+    def track_at(self, robot: str, times: Any, run: str | None = None) -> SampledTrack:
+        """Return the poses of a robot at any times, with covariances, from its track.
+
+        The smoothed tracks of the run are read if there are any, otherwise its tracks. Between two rows, the
+        robot moves on a cubic polynomial, and the covariance contains the unknown motion.
+
+        Parameters
+        ----------
+        robot : its name, such as ``robot_0``.
+        times : capture times: integers in ns, datetimes with a time zone, or a pandas index or column; one or
+            several.
+        run : the run of the tracks; None: the newest complete one.
+
+        Returns
+        -------
+        SampledTrack : NaN where the robot has no track.
+
+        Raises
+        ------
+        IpsysError
+            There is no such robot or run, or a time has no time zone.
+        """
+        return sample_track(self._session, robot, times, run)
+
     def _run_of(self, channel: Channel, run: str | None) -> str | None:
         if not channel.is_derived:
             if run is not None:
@@ -255,9 +280,4 @@ def _channel_named(name: str) -> Channel:
 
 
 def _ns(time: Time | None) -> int | None:
-    if time is None or isinstance(time, int):
-        return time
-    if time.tzinfo is None:
-        raise IpsysError(f"{time}: has no time zone; give one, for example datetime.now(timezone.utc)")
-    whole = int(time.replace(microsecond=0).timestamp())
-    return whole * 1_000_000_000 + time.microsecond * 1_000
+    return time if time is None or isinstance(time, int) else time_in_ns(time)

@@ -44,11 +44,14 @@ class TrackErrors(NamedTuple):
 
 
 def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
-    """Return positions of tracks by marker, in order of time; those of equal time in log order."""
+    """Return positions of tracks by marker, in order of time; those of equal time in log order.
+
+    Predicted positions of unseen robots are left out.
+    """
     rows: dict[int, list[tuple[int, float, float, float]]] = {}
     for message in messages:
         if isinstance(message.payload, Tracks):
-            for track in message.payload.tracks:
+            for track in (one for one in message.payload.tracks if one.coasting_ns is None):
                 row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m)
                 rows.setdefault(track.id, []).append(row)
     for values in rows.values():
@@ -99,8 +102,7 @@ def track_errors(
         known = ground_truth.get(marker_id)
         if known is None:
             continue
-        # The last pose of an instant uses all cameras. Cameras that expose a marker at different times have
-        # no common instant: the pose of each camera counts.
+        # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
         true_m, is_known = _between(known, times_ns)
         offsets.append((track.points_m[::-1][last] - true_m)[is_known])

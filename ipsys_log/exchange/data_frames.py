@@ -40,7 +40,19 @@ _CORNERS = [f"{axis}{corner}_px" for corner in range(4) for axis in "xy"]
 _BATCH = 1 << 16  # number of messages that are read at once: a larger batch takes memory, and is no faster
 
 _POINT = ("id", "x_m", "y_m", "z_m", "heading_rad", "covariance_m2")
-_TRACK = ("robot", *_POINT, "cameras", "inside")
+_MOTION = (
+    "velocity_m_s",
+    "velocity_covariance_m2_s2",
+    "turn_rate_rad_s",
+    "heading_sigma_rad",
+    "turn_rate_sigma_rad_s",
+    "coasting_ns",
+    "age_ns",
+)
+_TRACK = ("robot", *_POINT, "cameras", "inside", *_MOTION)
+
+
+_Expand = Callable[[str, Column], dict[str, Any]]
 
 
 class _Table(NamedTuple):
@@ -187,17 +199,18 @@ def _number(name: str, column: Column) -> dict[str, Any]:
     return {name: column.values}
 
 
-def _covariance(_: str, column: Column) -> dict[str, Any]:
-    rows = column.values if column.values.shape[1] == 9 else np.zeros((len(column.values), 9))
-    missing = column.missing | (column.values.shape[1] != 9)
-    return {
-        f"cov_{axes}_m2": np.where(missing, np.nan, rows[:, place]) for axes, place in _COVARIANCE.items()
-    }
+def _elements(names: Sequence[str], places: Sequence[int], size: int) -> _Expand:
+    """Return the function that makes a column of each element of a list of ``size`` numbers, by its name."""
 
+    def expand(_: str, column: Column) -> dict[str, Any]:
+        complete = column.values.ndim == 2 and column.values.shape[1] == size
+        rows = column.values if complete else np.zeros((len(column.values), size))
+        missing = column.missing | (not complete)
+        return {
+            name: np.where(missing, np.nan, rows[:, place]) for name, place in zip(names, places, strict=True)
+        }
 
-def _corners(_: str, column: Column) -> dict[str, Any]:
-    rows = column.values if column.values.shape[1] == 8 else np.full((len(column.values), 8), np.nan)
-    return {name: rows[:, place] for place, name in enumerate(_CORNERS)}
+    return expand
 
 
 def _optional_flag(name: str, column: Column) -> dict[str, Any]:
@@ -213,14 +226,20 @@ def _optional_integer(name: str, column: Column) -> dict[str, Any]:
     return {name: values}
 
 
-_EXPAND: dict[str, Callable[[str, Column], dict[str, Any]]] = {
-    "covariance_m2": _covariance,
-    "corners_px": _corners,
+_EXPAND: dict[str, _Expand] = {
+    "covariance_m2": _elements([f"cov_{axes}_m2" for axes in _COVARIANCE], [*_COVARIANCE.values()], 9),
+    "velocity_m_s": _elements(["vx_m_s", "vy_m_s", "vz_m_s"], range(3), 3),
+    "velocity_covariance_m2_s2": _elements(
+        [f"cov_v{axes[0]}_v{axes[1]}_m2_s2" for axes in _COVARIANCE], [*_COVARIANCE.values()], 9
+    ),
+    "corners_px": _elements(_CORNERS, range(8), 8),
     "inside": _optional_flag,
     "time_offset_ns": _optional_integer,
+    "coasting_ns": _optional_integer,
+    "age_ns": _optional_integer,
 }
 _TIMES = ("time", "still_start", "still_end", "received", "detected", "located", "fused", "published")
-_INTEGERS = ("time_offset_ns",)
+_INTEGERS = ("time_offset_ns", "coasting_ns", "age_ns")
 
 
 def _typed(pd: Any, table: pd.DataFrame) -> pd.DataFrame:

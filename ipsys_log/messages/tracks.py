@@ -50,7 +50,8 @@ class Track:
     """The pose of a robot at one instant, from all sightings up to then, and its motion.
 
     ``cameras`` are those of the recent sightings. ``coasting_ns`` is the time since the last sighting, in a
-    pose that is predicted because no camera sees the robot; otherwise None.
+    pose that is predicted because no camera sees the robot; otherwise None. ``age_ns`` is the time since the
+    first sighting of the track: a robot that is carried away begins a new track.
     """
 
     robot: str
@@ -68,6 +69,7 @@ class Track:
     turn_rate_rad_s: float | None = None
     turn_rate_sigma_rad_s: float | None = None
     coasting_ns: int | None = None
+    age_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

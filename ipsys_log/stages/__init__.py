@@ -137,7 +137,7 @@ ENTRIES: tuple[StageEntry, ...] = (
         prints=("plots", "details"),
     ),
     StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),
-    StageEntry(name="fuse", help="Combine the positions of all cameras into one pose per robot."),
+    StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),
 )
 
 

@@ -1,12 +1,12 @@
-"""One pose per robot from the positions of all cameras that see it."""
+"""The stage *fuse*: the positions of all cameras to one track per robot."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
@@ -15,61 +15,64 @@ from ipsys_log.messages import (
     FrameTransform,
     FrameTransforms,
     Message,
-    Position,
+    Model,
+    Positions,
     Quaternion,
     Rig,
     Track,
     Tracks,
     Vector3,
 )
-from ipsys_log.messages.channels import EVENTS, POSES, POSITIONS, RIG, TRACKS
+from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
+from ipsys_log.tracking.bias_modes import BiasModes
+from ipsys_log.tracking.position_sightings import read_sightings
+from ipsys_log.tracking.track_rows import make_track
+from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
-__all__ = ["STAGE", "Fuse", "fuse_positions"]
+__all__ = ["STAGE", "Fuse"]
 
 
 class Fuse:
-    """The stage *fuse*: it averages positions of one instant, weighted by their inverse covariances.
+    """The stage *fuse*: it filters the positions of all cameras, each at its own capture time.
 
-    Every message of positions gives a pose of each robot in it. The pose uses this camera and the other
-    cameras that saw the robot within ``window_ns``. At 2 m/s a robot moves 1 cm in 5 ms, so unsynchronized
-    cameras are not averaged. Synchronized cameras give one pose each; the last pose uses all cameras.
+    A message of positions gives one pose of each robot in it, at the instant at which the marker was exposed.
+    With time offsets (rolling shutter), the markers of a frame have several instants, earlier ones first.
+    If synchronised cameras see a robot at the same instant, the first message gives the pose; the others
+    improve the later poses. So a robot has one pose per instant, and no pose waits for another camera.
 
-    A pose is valid for the instant at which its marker was exposed. With time offsets (rolling shutter), each
-    marker of a frame gets its own message, earlier ones first. Two such cameras see a robot in different
-    rows, up to 30 ms apart; beyond the window they are not averaged either.
+    A robot that no camera sees has predicted poses at the instants of the frames, until its track ends.
 
     Late frames have wrong times; an event of their camera names them. Their positions are in no pose.
     """
 
-    def __init__(self, run: str, window_ns: int = 5_000_000) -> None:
-        self._run = run
-        self._window_ns = window_ns
+    def __init__(self, run: str, model: Model | None = None, settings: TrackSettings | None = None) -> None:
+        self._run, self._model = run, model
         self._rig: Rig | None = None
-        self._latest: dict[int, dict[str, tuple[int, Position]]] = {}
+        self._modes = BiasModes.none()
+        self._tracks = RobotTracks(settings)
         # By camera, the start and end time of its last late frames; None if there is no end yet.
         self._late_ns: dict[str, tuple[int, int | None]] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
-            self._rig = message.payload
-            return
-        if isinstance(message.payload, Event):
+            self._use_rig(message.payload)
+        elif isinstance(message.payload, Event):
             self._note_late(message.payload)
-            return
-        if self._is_late(message):
-            return
-        if self._rig is None:
-            raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
-        tracks_by_time: dict[int, list[Track]] = {}
-        for position in message.payload.positions:
-            now_ns = message.publish_time_ns + (position.time_offset_ns or 0)
-            tracks_by_time.setdefault(now_ns, []).append(
-                self._track(position, str(message.camera), now_ns, self._rig)
-            )
-        for now_ns, tracks in sorted(tracks_by_time.items()):
-            yield Tracks(now_ns, tuple(tracks))
-            yield FrameTransforms(tuple(_transform(track, self._run, now_ns) for track in tracks))
+        elif isinstance(message.payload, Positions) and not self._is_late(message):
+            if self._rig is None:
+                raise IpsysError(
+                    "the log has no rig (robots and their markers): give one with --rig lab.toml"
+                )
+            yield from self._messages(self._poses(message, self._rig))
+
+    def _use_rig(self, rig: Rig) -> None:
+        self._rig = rig
+        if self._model is not None:
+            # Late: the modes of a joint model need scipy.
+            from ipsys_log.tracking.calibration_modes import calibration_modes
+
+            self._modes = calibration_modes(self._model, rig)
 
     def _note_late(self, event: Event) -> None:
         if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
@@ -80,76 +83,30 @@ class Fuse:
         time_ns = message.publish_time_ns
         return start_ns is not None and start_ns <= time_ns and (end_ns is None or time_ns <= end_ns)
 
-    def _track(self, position: Position, camera: str, now_ns: int, rig: Rig) -> Track:
-        seen = self._latest.setdefault(position.id, {})
-        seen[camera] = (now_ns, position)
-        together = {
-            name: recent
-            for name, (time_ns, recent) in sorted(seen.items())
-            if abs(now_ns - time_ns) <= self._window_ns
-        }
-        fused = fuse_positions(list(together.values()))
-        return Track(
-            rig.robot_of(position.id),
-            position.id,
-            fused.x_m,
-            fused.y_m,
-            fused.z_m,
-            fused.heading_rad,
-            fused.covariance_m2,
-            tuple(together),
-            _any_inside([recent.inside for recent in together.values()]),
-        )
+    def _poses(self, message: Message, rig: Rig) -> list[Pose]:
+        camera, positions = str(message.camera), message.payload.positions
+        poses: list[Pose] = []
+        if positions:
+            sightings, rest_m2 = read_sightings(camera, positions, self._modes)
+            poses = self._tracks.observe(
+                camera,
+                [(rig.robot_of(position.id), position.id) for position in positions],
+                [message.publish_time_ns + (position.time_offset_ns or 0) for position in positions],
+                sightings,
+                rest_m2,
+                [position.inside for position in positions],
+                [position.covariance_m2 is not None for position in positions],
+            )
+        return poses + self._tracks.coast(message.publish_time_ns)
 
-
-def _any_inside(flags: list[bool | None]) -> bool | None:
-    known = [flag for flag in flags if flag is not None]
-    return any(known) if known else None
-
-
-def fuse_positions(positions: list[Position]) -> Position:
-    """Return the best single position of one marker at one instant.
-
-    Parameters
-    ----------
-    positions : at least one, of one marker id, in m.
-
-    Returns
-    -------
-    Position : weighted by inverse covariances if every position has a covariance, else the plain mean
-        (without a covariance). The heading is the circular mean of the known headings.
-
-    Examples
-    --------
-    >>> near, far = Position(1, 0.0, 0, 0, None, np.eye(3)), Position(1, 3.0, 0, 0, None, 2 * np.eye(3))
-    >>> round(fuse_positions([near, far]).x_m, 9)
-    1.0
-    """
-    if len(positions) == 1:
-        return positions[0]
-    points = np.array([(p.x_m, p.y_m, p.z_m) for p in positions])
-    weights, covariance_m2 = _weights(positions), None
-    if weights is not None:
-        covariance_m2 = np.linalg.inv(weights.sum(axis=0))
-        mean = covariance_m2 @ np.einsum("nij,nj->i", weights, points)
-    else:
-        mean = points.mean(axis=0)
-    headings = [p.heading_rad for p in positions if p.heading_rad is not None]
-    along = complex(np.exp(1j * np.array(headings)).sum())
-    # Opposite headings have no mean.
-    heading_rad = float(np.angle(along)) if abs(along) > 1e-9 else None
-    x_m, y_m, z_m = mean.tolist()
-    return Position(positions[0].id, x_m, y_m, z_m, heading_rad, covariance_m2)
-
-
-def _weights(positions: list[Position]) -> NDArray[np.float64] | None:
-    """Return inverse covariances (n, 3, 3); None unless every position has a valid covariance."""
-    present = [p.covariance_m2 for p in positions if p.covariance_m2 is not None]
-    covariances = np.array(present)
-    if len(present) < len(positions) or not np.isfinite(covariances).all():
-        return None
-    least = np.linalg.eigvalsh(covariances)[:, 0]  # of the lower triangles
-    return np.asarray(np.linalg.inv(covariances), dtype=np.float64) if (least > 0).all() else None
+    def _messages(self, poses: list[Pose]) -> Iterator[Any]:
+        tracks_by_time: dict[int, list[Track]] = defaultdict(list)
+        for pose in poses:
+            tracks_by_time[pose.time_ns].append(make_track(pose))
+        for time_ns, tracks in sorted(tracks_by_time.items()):
+            tracks.sort(key=lambda track: track.id)
+            yield Tracks(time_ns, tuple(tracks))
+            yield FrameTransforms(tuple(_transform(track, self._run, time_ns) for track in tracks))
 
 
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
@@ -165,22 +122,28 @@ def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
 
 
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
+    models = view.payloads(MODEL) if view.run(MODEL) else []
     has_late_frames = any(event.kind == STAMP_UNRELIABLE for event in view.payloads(EVENTS))
     return Plan(
         run=view.run(POSITIONS),
         parameters={},
         # A log without such events keeps its existing runs.
-        reads=(RIG, POSITIONS, *([EVENTS] if has_late_frames else [])),
-        step=Fuse,
+        reads=(RIG, POSITIONS, *([MODEL] if models else []), *([EVENTS] if has_late_frames else [])),
+        step=lambda run: Fuse(run, models[-1] if models else None),
     )
 
 
 STAGE = Stage(
     name="fuse",
-    versions={"fuse": 1},
-    reads=(RIG, POSITIONS, EVENTS),
+    versions={"fuse": 2},
+    reads=(RIG, POSITIONS, MODEL, EVENTS),
     writes=(TRACKS, POSES),
     plan=_plan,
-    rig_part=lambda rig, method: {(m.id, m.robot) for m in rig.markers},
+    rig_part=lambda rig, method: (
+        {(m.id, m.robot, m.height_m, m.height_sigma_m) for m in rig.markers},
+        rig.marker_height_m,
+        rig.marker_height_sigma_m,
+        rig.marker_length_m,
+    ),
     per_camera=False,
 )

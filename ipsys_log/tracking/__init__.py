@@ -1,1 +1,1 @@
-"""Tracks of robots over time: a filter of positions with the errors of the calibration; arrays in, arrays out."""
+"""Tracks of robots over time, from positions with the errors of their calibration; arrays in, arrays out."""

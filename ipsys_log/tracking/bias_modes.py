@@ -62,7 +62,7 @@ class BiasModes:
     ----------
     grid : the nodes; between them, the sensitivities are bilinear. Outside, they keep the value at the edge.
     tables : by camera, (nx, ny, 3, m) in m.
-    rest_m2 : by camera, (nx, ny, 3, 3): the variance that the m modes do not contain, and errors of the place.
+    rest_m2 : by camera, (nx, ny, 3, 3): the variance that is not in the m modes, and errors of the place.
     clock_s : by camera, (m,).
     count : the number m of amplitudes.
     """

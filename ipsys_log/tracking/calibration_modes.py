@@ -56,12 +56,27 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
 
 
 def _grid(model: Model) -> Grid | None:
+    """Return a grid over the calibration points, or around the cameras of a joint model without points."""
     points_m = [pair.world_m[:2] for camera in model.cameras for pair in camera.pairs]
+    if reads_corners(model.name):
+        points_m += _below_cameras(model)
     if not points_m:
         return None
     low_m = np.min(points_m, axis=0) - _MARGIN_M
     sizes = np.ceil((np.max(points_m, axis=0) + _MARGIN_M - low_m) / _SPACING_M).astype(int) + 1
     return Grid(low_m, _SPACING_M, (int(sizes[0]), int(sizes[1])))
+
+
+def _below_cameras(model: Model) -> list[Array]:
+    """Return points of the floor around each camera of a joint model, which it sees."""
+    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
+
+    origins_m = [restore_joint(camera).origin_m for camera in model.cameras]
+    reaches_m = [reach * origin_m[2] for origin_m in origins_m for reach in (-1.0, 1.0)]
+    return [
+        origin_m[:2] + reach_m
+        for origin_m, reach_m in zip(np.repeat(origins_m, 2, axis=0), reaches_m, strict=True)
+    ]
 
 
 def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, length_m: float) -> NodeModes:
@@ -116,7 +131,7 @@ def _table_nodes(name: str, camera: CameraModel, grid: Grid, height_m: float) ->
 
 
 def _side_by_side(cameras: dict[str, NodeModes]) -> dict[str, NodeModes]:
-    """Return the nodes with the amplitudes of all cameras, each camera with its own; the last one is common."""
+    """Return the nodes with the amplitudes of all cameras: each has its own, and the last one is common."""
     counts = [node.modes_m.shape[2] - 1 for node in cameras.values()]
     ends = np.cumsum([0, *counts])
     joined = {}

@@ -1,8 +1,8 @@
 """Filter of the motion of robots, whose positions share the errors of the calibration.
 
-The state of a robot is its motion (see :mod:`ipsys_log.tracking.motion`) and m amplitudes of the calibration
-(see :mod:`ipsys_log.tracking.bias_modes`). The amplitudes are standard normal numbers before the first sighting.
-All functions take k robots at once, each at its own time.
+It is a Schmidt-Kalman filter: the m amplitudes of the calibration (:mod:`ipsys_log.tracking.bias_modes`) stay
+independent standard normal numbers. The filter knows how the error of a state depends on them, and does not
+estimate them. All functions take k robots at once, each at its own time.
 """
 
 from __future__ import annotations
@@ -12,27 +12,36 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.tracking.motion import MOTION, POSE, RATES, MotionNoise, transition
+from ipsys_log.tracking.motion import ACCELERATION, MOTION, POSE, RATES, MotionNoise, transition
 
 __all__ = ["UNKNOWN_RAD2", "Innovations", "Sightings", "States", "compare", "predict", "start", "update"]
 
 Array = NDArray[np.float64]
 
-# The variance of a heading that was not measured: its weight is 0 in double precision.
+# The variance of a heading that was not measured: it has no weight in double precision.
 UNKNOWN_RAD2 = 1e6
 _START_HEADING_RAD2 = np.pi**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """The states of k robots: ``means`` (k, n) and ``covariances`` (k, n, n), with n = 10 + m."""
+    """The motion of k robots, see :mod:`ipsys_log.tracking.motion`.
+
+    Attributes
+    ----------
+    means : (k, 10). Headings are continuous: they can be outside of one turn.
+    covariances : (k, 10, 10), of all errors, those of the calibration included.
+    cross : (k, 10, m), errors (estimate minus truth) by the amplitudes of the calibration. The covariance of
+        two states by their calibration is the product of their rows.
+    """
 
     means: Array
     covariances: Array
+    cross: Array
 
     def take(self, rows: NDArray[np.intp]) -> States:
         """Return the states of some robots."""
-        return States(self.means[rows], self.covariances[rows])
+        return States(self.means[rows], self.covariances[rows], self.cross[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,37 +67,6 @@ class Sightings:
         return Sightings(self.poses[rows], self.noise[rows], self.sensitivities[rows], self.clock_s[rows])
 
 
-def start(sightings: Sightings, noise: MotionNoise) -> States:
-    """Return the states of new tracks, after their first sightings."""
-    count, m = len(sightings.poses), sightings.sensitivities.shape[2]
-    means, covariances = np.zeros((count, MOTION + m)), np.zeros((count, MOTION + m, MOTION + m))
-    means[:, POSE] = sightings.poses
-    modes = sightings.sensitivities
-    covariances[:, POSE, POSE] = sightings.noise + modes @ modes.swapaxes(1, 2)
-    # A sighting is the pose plus the errors, so that the pose is the sighting minus the errors.
-    covariances[:, POSE, MOTION:] = -modes
-    covariances[:, MOTION:, POSE] = -modes.swapaxes(1, 2)
-    unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
-    covariances[unknown, 3, 3] = _START_HEADING_RAD2
-    rates = [noise.start_m_s**2, noise.start_m_s**2, noise.climb_m_s2**2, noise.start_rad_s**2]
-    other = np.arange(4, MOTION + m)
-    covariances[:, other, other] = [*rates, *[noise.acceleration_m_s2**2] * 2, *[1.0] * m]
-    return States(means, covariances)
-
-
-def predict(states: States, durations_s: Array, noise: MotionNoise) -> States:
-    """Return the states after durations (k,) in s, which are at least 0."""
-    forward, spread = transition(durations_s, noise)
-    means, old = states.means.copy(), states.covariances
-    means[:, :MOTION] = (forward @ means[:, :MOTION, None])[:, :, 0]
-    covariances = old.copy()
-    moved = forward @ old[:, :MOTION, :MOTION] @ forward.swapaxes(1, 2) + spread
-    covariances[:, :MOTION, :MOTION] = (moved + moved.swapaxes(1, 2)) / 2
-    covariances[:, :MOTION, MOTION:] = across = forward @ old[:, :MOTION, MOTION:]
-    covariances[:, MOTION:, :MOTION] = across.swapaxes(1, 2)
-    return States(means, covariances)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovations:
     """The differences of k sightings from predicted states.
@@ -98,19 +76,44 @@ class Innovations:
     differences : (k, 4), sighting minus prediction, in m and rad; 0 for a heading that was not measured.
     covariances : (k, 4, 4), of the differences.
     modes : (k, 4, m), sensitivities of the sightings with the errors of their times.
-    cross : (k, n, 4), covariance of the state and the prediction of the sighting.
+    across : (k, 10, 4), minus the covariance of the errors of the states and the differences.
+    chi2 : (k,), squared differences in units of their covariances.
     """
 
     differences: Array
     covariances: Array
     modes: Array
-    cross: Array
+    across: Array
+    chi2: Array
 
-    @property
-    def chi2(self) -> Array:
-        """The squared differences (k,) in units of their covariances: with 4 degrees of freedom, or 3."""
-        solved = np.linalg.solve(self.covariances, self.differences[:, :, None])
-        return np.asarray((self.differences[:, None] @ solved)[:, 0, 0])
+
+def start(sightings: Sightings, noise: MotionNoise) -> States:
+    """Return the states of new tracks, after their first sightings."""
+    count, modes = len(sightings.poses), sightings.sensitivities
+    means, covariances = np.zeros((count, MOTION)), np.zeros((count, MOTION, MOTION))
+    cross = np.zeros((count, MOTION, modes.shape[2]))
+    # A sighting is the pose plus the errors of the calibration, so that the pose has minus these errors.
+    means[:, POSE], cross[:, POSE] = sightings.poses, -modes
+    covariances[:, POSE, POSE] = sightings.noise + modes @ modes.swapaxes(1, 2)
+    unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
+    covariances[unknown, 3, 3] = _START_HEADING_RAD2
+    sigmas = (
+        [noise.start_m_s] * 2
+        + [noise.start_climb_m_s, noise.start_rad_s]
+        + [noise.start_acceleration_m_s2] * 2
+    )
+    rates = np.arange(RATES.start, ACCELERATION.stop)
+    covariances[:, rates, rates] = np.square(sigmas)
+    return States(means, covariances, cross)
+
+
+def predict(states: States, durations_s: Array, noise: MotionNoise) -> States:
+    """Return the states after durations (k,) in s, which are at least 0."""
+    speeds_m_s = np.hypot(states.means[:, 4], states.means[:, 5])
+    forward, spread = transition(durations_s, speeds_m_s, noise)
+    means = (forward @ states.means[:, :, None])[:, :, 0]
+    covariances = forward @ states.covariances @ forward.swapaxes(1, 2) + spread
+    return States(means, covariances, forward @ states.cross)
 
 
 def compare(states: States, sightings: Sightings) -> Innovations:
@@ -118,36 +121,38 @@ def compare(states: States, sightings: Sightings) -> Innovations:
     # A camera whose clock is late by d shows the robot v d behind.
     modes = sightings.sensitivities - states.means[:, RATES, None] * sightings.clock_s[:, None]
     differences = sightings.poses - states.means[:, POSE]
-    differences -= (modes @ states.means[:, MOTION:, None])[:, :, 0]
     known = sightings.noise[:, 3, 3] < UNKNOWN_RAD2
     differences[:, 3] = np.where(known, (differences[:, 3] + np.pi) % (2 * np.pi) - np.pi, 0.0)
-    cross = states.covariances[:, :, POSE] + states.covariances[:, :, MOTION:] @ modes.swapaxes(1, 2)
-    covariances = cross[:, POSE] + modes @ cross[:, MOTION:] + sightings.noise
-    return Innovations(differences, covariances, modes, cross)
+    turned = modes.swapaxes(1, 2)
+    # Errors are estimate minus truth. The difference is modes b + noise - error, so a common error cancels.
+    across = states.covariances[:, :, POSE] - states.cross @ turned
+    covariances = across[:, POSE] + modes @ (turned - states.cross[:, POSE].swapaxes(1, 2)) + sightings.noise
+    solved = np.linalg.solve(covariances, differences[:, :, None])
+    chi2 = (differences[:, None] @ solved)[:, 0, 0]
+    return Innovations(differences, covariances, modes, across, chi2)
 
 
-def update(states: States, sightings: Sightings, innovations: Innovations, consider: bool = False) -> States:
-    """Return the states after their sightings, by the Joseph form.
+def update(states: States, sightings: Sightings, innovations: Innovations) -> States:
+    """Return the states after their sightings.
+
+    The covariance has the Joseph form, so rounding cannot make it indefinite.
 
     Parameters
     ----------
     states : predicted to the times of the sightings.
     sightings : of the same k robots.
     innovations : from :func:`compare`.
-    consider : keep the amplitudes of the calibration as they are (Schmidt-Kalman filter), and only take their
-        uncertainty into account.
 
     References
     ----------
-    Schmidt, Advances in Control Systems 1966. Bucy and Joseph, Filtering for Stochastic Processes, 1968.
+    Schmidt, Advances in Control Systems 3, 1966. Bucy and Joseph, Filtering for Stochastic Processes, 1968.
     """
-    gains = innovations.cross @ np.linalg.inv(innovations.covariances)
-    if consider:
-        gains[:, MOTION:] = 0.0
-    across = gains.swapaxes(1, 2)
+    across, modes = innovations.across, innovations.modes
+    gains = np.linalg.solve(innovations.covariances, across.swapaxes(1, 2)).swapaxes(1, 2)
     means = states.means + (gains @ innovations.differences[:, :, None])[:, :, 0]
-    # (1 - K H) P (1 - K H)' + K R K', with one factor after the other: H has only four rows.
-    left = states.covariances - gains @ innovations.cross.swapaxes(1, 2)
-    observed = left[:, :, POSE] + left[:, :, MOTION:] @ innovations.modes.swapaxes(1, 2)
-    covariances = left + (gains @ sightings.noise - observed) @ across
-    return States(means, (covariances + covariances.swapaxes(1, 2)) / 2)
+    # (1 - K H) P (1 - K H)' + K R K', one factor after the other, because H has only four rows.
+    left = states.covariances - gains @ across.swapaxes(1, 2)
+    cross = states.cross - gains @ (states.cross[:, POSE] - modes)
+    observed = left[:, :, POSE] - cross @ modes.swapaxes(1, 2)
+    covariances = left + (gains @ sightings.noise - observed) @ gains.swapaxes(1, 2)
+    return States(means, (covariances + covariances.swapaxes(1, 2)) / 2, cross)

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)
 MOTION = 10
 # Gauss-Legendre nodes on 0 to 1: the integrals of the noise are exact to 1e-9 for up to 1 s.
-_NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(5))
+_NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(7))
 _NODES = _NODES + 0.5
 
 
@@ -25,22 +25,27 @@ class MotionNoise:
 
     Attributes
     ----------
-    acceleration_m_s2, hold_s : standard deviation of the acceleration on the floor along each axis, and its
-        correlation time.
+    acceleration_m_s2, bend_rad_s, hold_s : standard deviation of the acceleration along each axis of the floor
+        of a robot that stands; its growth with the speed, because the acceleration in a bend is the product
+        of speed and turn rate; its correlation time.
     turn_rad_s2, climb_m_s2 : changes of the turn rate and of the vertical speed: square root of the density
         of white noise, as their standard deviation after one second.
-    start_m_s, start_rad_s : standard deviations of the velocity and of the turn rate of a new track.
+    start_m_s, start_climb_m_s, start_rad_s, start_acceleration_m_s2 : standard deviations of a new track: of
+        the velocity on the floor, the vertical speed, the turn rate, and the acceleration.
     """
 
-    acceleration_m_s2: float = 3.0
+    acceleration_m_s2: float = 0.5
+    bend_rad_s: float = 1.5
     hold_s: float = 0.4
     turn_rad_s2: float = 2.0
     climb_m_s2: float = 0.05
     start_m_s: float = 1.0
+    start_climb_m_s: float = 0.05
     start_rad_s: float = 2.0
+    start_acceleration_m_s2: float = 1.5
 
 
-def transition(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array]:
+def transition(durations_s: Array, speeds_m_s: Array, noise: MotionNoise) -> tuple[Array, Array]:
     """Return the transitions of the state and the covariances of its noise.
 
     The acceleration is an Ornstein-Uhlenbeck process (Singer's model), so it fades while a track coasts.
@@ -48,6 +53,7 @@ def transition(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array]:
     Parameters
     ----------
     durations_s : (k,), at least 0.
+    speeds_m_s : (k,), speeds on the floor.
     noise : the usual motion.
 
     Returns
@@ -72,8 +78,8 @@ def transition(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array]:
             by_velocity,
             rest,
         )
-        rows = np.array([axis, 4 + axis, own])
-        spread[:, rows[:, None], rows] = _acceleration_noise(durations_s, noise)
+        columns = np.array([axis, 4 + axis, own])
+        spread[:, columns[:, None], columns] = _acceleration_noise(durations_s, speeds_m_s, noise)
     for axis, density in ((2, noise.climb_m_s2**2), (3, noise.turn_rad_s2**2)):
         spread[:, axis, axis] = density * durations_s**3 / 3
         spread[:, axis, 4 + axis] = spread[:, 4 + axis, axis] = density * durations_s**2 / 2
@@ -88,10 +94,10 @@ def _of_acceleration(durations_s: Array, hold_s: float) -> tuple[Array, Array, A
     return hold_s**2 * (share - lost), hold_s * lost, 1.0 - lost
 
 
-def _acceleration_noise(durations_s: Array, noise: MotionNoise) -> Array:
+def _acceleration_noise(durations_s: Array, speeds_m_s: Array, noise: MotionNoise) -> Array:
     """Return the covariance (k, 3, 3) of position, velocity and acceleration by the noise of the latter."""
     effects = np.stack(_of_acceleration(durations_s[:, None] * _NODES, noise.hold_s), axis=1)
-    density = 2 * noise.acceleration_m_s2**2 / noise.hold_s
-    weights = (density * durations_s)[:, None] * _WEIGHTS
+    variances = noise.acceleration_m_s2**2 + (noise.bend_rad_s * speeds_m_s) ** 2
+    weights = (2 / noise.hold_s * variances * durations_s)[:, None] * _WEIGHTS
     covariance: Array = (effects * weights[:, None]) @ effects.swapaxes(1, 2)
     return covariance

@@ -1,65 +1,123 @@
-"""Smoothing of a whole track: the state at each instant, by the sightings before and after it."""
+"""Smoothing of a whole track: the motion at each instant, by the sightings before and after it.
+
+The state is the motion (:mod:`ipsys_log.tracking.motion`) and the m amplitudes of the calibration
+(:mod:`ipsys_log.tracking.bias_modes`). The amplitudes are constant over the track. The sightings determine
+their differences between cameras and places, and leave the error that all sightings share. A filter that
+only considers the amplitudes has no optimal smoother, so this one estimates them.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.tracking.filter import States, predict
-from ipsys_log.tracking.motion import MOTION, MotionNoise, transition
+from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings, States, start
+from ipsys_log.tracking.motion import MOTION, POSE, RATES, MotionNoise, transition
 
 __all__ = ["smooth"]
 
 Array = NDArray[np.float64]
 
 _HEADING = 3
+# The speed of a robot is that between two sightings this long before and after: cameras differ by some mm.
+_SPEED_S = 0.1
 
 
-def smooth(filtered: States, durations_s: Array, noise: MotionNoise) -> States:
-    """Return the states of one track by all its sightings.
-
-    The amplitudes of the calibration are constant over the track. Smoothing therefore reduces their
-    uncertainty only by the differences between cameras. The error that all cameras share stays.
+def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> States:
+    """Return the motion of one robot by all sightings of its track.
 
     Parameters
     ----------
-    filtered : n states of one robot in order of time, each after the sightings of its instant.
-    durations_s : (n - 1,), times between the states, more than 0.
-    noise : the usual motion, as in the filter.
+    sightings : n of one robot, in order of time.
+    durations_s : (n - 1,), times between the sightings, at least 0.
+    noise : the usual motion.
 
     Returns
     -------
-    States : n.
+    States : n, one at each sighting. Those of the same instant are equal.
 
     References
     ----------
-    Rauch, Tung and Striebel, AIAA Journal 1965. The covariance is in the form of Joseph, a sum of squares.
+    Rauch, Tung and Striebel, AIAA Journal 1965. Covariances are sums of squares, as in the form of Joseph.
     """
-    before = States(filtered.means[:-1], filtered.covariances[:-1])
-    ahead = predict(before, durations_s, noise)
-    gains, spread = _gains(before, ahead, durations_s, noise)
-    means, covariances = filtered.means.copy(), filtered.covariances.copy()
+    speeds_m_s = _speeds(sightings.poses[:, :2], durations_s)
+    forward, spread = transition(durations_s, speeds_m_s, noise)
+    means, covariances = _filter(sightings, forward, spread, noise)
+    gains, rest = _gains(covariances[:-1], forward, spread)
     for n in range(len(durations_s) - 1, -1, -1):
-        change = means[n + 1] - ahead.means[n]
-        change[_HEADING] = (change[_HEADING] + np.pi) % (2 * np.pi) - np.pi
+        ahead = means[n].copy()
+        ahead[:MOTION] = forward[n] @ means[n, :MOTION]
+        change = means[n + 1] - ahead
+        change[_HEADING] = _wrap(change[_HEADING])
         means[n] += gains[n] @ change
-        covariances[n] = spread[n] + gains[n] @ covariances[n + 1] @ gains[n].T
-    return States(means, (covariances + covariances.swapaxes(1, 2)) / 2)
+        covariances[n] = rest[n] + gains[n] @ covariances[n + 1] @ gains[n].T
+    covariances = (covariances + covariances.swapaxes(1, 2)) / 2
+    return States(means[:, :MOTION], covariances[:, :MOTION, :MOTION], covariances[:, :MOTION, MOTION:])
 
 
-def _gains(before: States, ahead: States, durations_s: Array, noise: MotionNoise) -> tuple[Array, Array]:
-    """Return the gains (n, s, s) of each state by the next one, and its covariance if that one is known."""
-    forward, motion = transition(durations_s, noise)
-    cross = before.covariances.copy()
-    cross[:, :, :MOTION] = before.covariances[:, :, :MOTION] @ forward.swapaxes(1, 2)
+def _speeds(points_m: Array, durations_s: Array) -> Array:
+    """Return the speed (n - 1,) over each step, from sightings before and after it."""
+    times_s = np.concatenate([[0.0], np.cumsum(durations_s)])
+    first = np.maximum(np.searchsorted(times_s, times_s[:-1] - _SPEED_S, side="right") - 1, 0)
+    last = np.minimum(np.searchsorted(times_s, times_s[1:] + _SPEED_S), len(times_s) - 1)
+    way_m = np.linalg.norm(points_m[last] - points_m[first], axis=1)
+    speeds: Array = way_m / np.maximum(times_s[last] - times_s[first], _SPEED_S)
+    return speeds
+
+
+def _filter(sightings: Sightings, forward: Array, spread: Array, noise: MotionNoise) -> tuple[Array, Array]:
+    """Return the means (n, s) and covariances (n, s, s) after each sighting."""
+    first = start(sightings.take(np.array([0])), noise)
+    count, m = len(sightings.poses), sightings.sensitivities.shape[2]
+    means, covariances = np.zeros((count, MOTION + m)), np.zeros((count, MOTION + m, MOTION + m))
+    means[0, :MOTION], covariances[0, :MOTION, :MOTION] = first.means[0], first.covariances[0]
+    covariances[0, :MOTION, MOTION:] = first.cross[0]
+    covariances[0, MOTION:, :MOTION] = first.cross[0].T
+    covariances[0, MOTION:, MOTION:] = np.eye(m)
+    for n in range(1, count):
+        mean, covariance = means[n - 1].copy(), covariances[n - 1].copy()
+        mean[:MOTION] = forward[n - 1] @ mean[:MOTION]
+        covariance[:MOTION] = forward[n - 1] @ covariance[:MOTION]
+        covariance[:, :MOTION] = covariance[:, :MOTION] @ forward[n - 1].T
+        covariance[:MOTION, :MOTION] += spread[n - 1]
+        means[n], covariances[n] = _update(mean, covariance, sightings, n)
+    return means, covariances
+
+
+def _update(mean: Array, covariance: Array, sightings: Sightings, n: int) -> tuple[Array, Array]:
+    """Return the mean (s,) and the covariance (s, s) after a sighting, in the form of Joseph."""
+    noise = sightings.noise[n]
+    # A camera whose clock is late by d shows the robot v d behind.
+    modes = sightings.sensitivities[n] - mean[RATES, None] * sightings.clock_s[n]
+    difference = sightings.poses[n] - mean[POSE] - modes @ mean[MOTION:]
+    difference[_HEADING] = _wrap(difference[_HEADING]) if noise[_HEADING, _HEADING] < UNKNOWN_RAD2 else 0.0
+    across = covariance[:, POSE] + covariance[:, MOTION:] @ modes.T
+    gain = np.linalg.solve(across[POSE] + modes @ across[MOTION:] + noise, across.T).T
+    left = covariance - gain @ across.T
+    observed = left[:, POSE] + left[:, MOTION:] @ modes.T
+    after = left + (gain @ noise - observed) @ gain.T
+    return mean + gain @ difference, (after + after.T) / 2
+
+
+def _gains(covariances: Array, forward: Array, spread: Array) -> tuple[Array, Array]:
+    """Return the gains (k, s, s) of states by the next ones, and their covariances if the next are known."""
+    cross = covariances.copy()
+    cross[:, :, :MOTION] = covariances[:, :, :MOTION] @ forward.swapaxes(1, 2)
+    ahead = cross.copy()
+    ahead[:, :MOTION] = forward @ cross[:, :MOTION]
+    ahead[:, :MOTION, :MOTION] += spread
     # Units differ by many orders of magnitude: with a diagonal of 1, the inverse loses no digits.
-    units = np.sqrt(np.diagonal(ahead.covariances, axis1=1, axis2=2))
-    scaled = ahead.covariances / units[:, :, None] / units[:, None]
+    units = np.sqrt(np.diagonal(ahead, axis1=1, axis2=2))
+    scaled = ahead / units[:, :, None] / units[:, None]
     gains = np.linalg.solve(scaled, (cross / units[:, None]).swapaxes(1, 2)).swapaxes(1, 2) / units[:, None]
-    kept = -gains
-    kept[:, :, :MOTION] = -gains[:, :, :MOTION] @ forward
-    diagonal = np.arange(kept.shape[1])
-    kept[:, diagonal, diagonal] += 1.0
     own = gains[:, :, :MOTION]
-    spread = kept @ before.covariances @ kept.swapaxes(1, 2) + own @ motion @ own.swapaxes(1, 2)
-    return gains, spread
+    kept = np.eye(gains.shape[1]) - gains
+    kept[:, :, :MOTION] = -own @ forward
+    diagonal = np.arange(MOTION)
+    kept[:, diagonal, diagonal] += 1.0
+    rest = kept @ covariances @ kept.swapaxes(1, 2) + own @ spread @ own.swapaxes(1, 2)
+    return gains, rest
+
+
+def _wrap(angle_rad: float) -> float:
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi

@@ -22,7 +22,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.stages.detect import Detect, decode_grey
 from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.fuse import Fuse, fuse_positions
+from ipsys_log.stages.fuse import Fuse
 from ipsys_log.stages.locate import Locate
 
 RIG = Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3, robot="ada"),)))
@@ -83,40 +83,55 @@ def at(x_m: float, variance: float | None, heading_rad: float | None = None) -> 
     return Position(3, x_m, 0.0, 0.0, heading_rad, covariance)
 
 
-def test_weights_are_inverse_covariances() -> None:
-    fused = fuse_positions([at(0.0, 1.0), at(1.0, 3.0)])
-    assert fused.x_m == pytest.approx(0.25)
-    assert fused.covariance_m2 is not None
-    np.testing.assert_allclose(fused.covariance_m2, 0.75 * np.eye(3))
-    # Without the covariance of one position, it has no weight: the result is the mean, without covariance.
-    plain = fuse_positions([at(0.0, 1.0), at(1.0, None)])
-    assert plain.x_m == pytest.approx(0.5)
-    assert plain.covariance_m2 is None
+def fused(*sent: tuple[str, int, Position]) -> list[Any]:
+    """Return the payloads of fuse for positions of cameras at times in ms."""
+    fuse = Fuse("poly")
+    list(fuse(RIG))
+    made = []
+    for camera, time_ms, position in sent:
+        time_ns = time_ms * 1_000_000
+        made += fuse(Message("t", time_ns, time_ns, Positions(time_ns, (position,)), camera))
+    return made
+
+
+def test_track_lies_between_positions_by_their_weights() -> None:
+    made = fused(("red", 0, at(0.0, 1e-6)), ("white", 0, at(0.001, 3e-6)), ("red", 1, at(0.0, 1.0)))
+    track = made[2].tracks[0]
+    assert track.x_m == pytest.approx(0.00025, abs=2e-5)
+    assert track.covariance_m2[0, 0] == pytest.approx(0.75e-6, rel=0.1)
+    assert track.cameras == ("red", "white")
+    assert made[3].transforms[0].child_frame_id == "poly/ada"
 
 
 def test_headings_are_averaged_around_the_circle() -> None:
-    fused = fuse_positions([at(0, 1.0, np.pi - 0.1), at(0, 1.0, -np.pi + 0.1)])
-    assert abs(fused.heading_rad or 0.0) == pytest.approx(np.pi)
+    made = fused(("red", 0, at(0, 1e-6, np.pi - 0.001)), ("white", 0, at(0, 1e-6, -np.pi + 0.001)))
+    made += fused(("red", 0, at(0, 1e-6, np.pi - 0.001)), ("white", 1, at(0, 1e-6, -np.pi + 0.001)))
+    assert abs(made[-2].tracks[0].heading_rad) == pytest.approx(np.pi, abs=1e-3)
 
 
-def test_only_positions_of_one_instant_are_fused() -> None:
-    fuse = Fuse("poly", window_ns=5)
-    list(fuse(RIG))
+def test_positions_without_covariance_give_no_covariance() -> None:
+    (tracks, _) = fused(("red", 0, at(0.0, None, 0.1)))
+    (track,) = tracks.tracks
+    assert (track.covariance_m2, track.velocity_covariance_m2_s2, track.heading_sigma_rad) == (None,) * 3
+    assert (track.x_m, track.heading_rad, track.robot) == (0.0, pytest.approx(0.1), "ada")
 
-    def send(camera: str, time_ns: int, x_m: float) -> Any:
-        message = Message("t", time_ns, time_ns, Positions(time_ns, (at(x_m, 1.0),)), camera)
-        tracks, transforms = fuse(message)
-        assert transforms.transforms[0].child_frame_id == "poly/ada"
-        return tracks.tracks[0]
 
-    assert send("red", 100, 0.0).cameras == ("red",)
-    both = send("white", 104, 1.0)
-    assert both.cameras == ("red", "white")
-    assert both.x_m == pytest.approx(0.5)
-    assert both.robot == "ada"
-    late = send("white", 120, 2.0)
-    assert late.cameras == ("white",)
-    assert late.x_m == 2.0
+def test_one_instant_of_two_cameras_has_one_pose() -> None:
+    made = fused(*((camera, 33 * n, at(0.0, 1e-6)) for n in range(5) for camera in ("red", "white")))
+    times_ns = [payload.timestamp for payload in made[::2]]
+    assert times_ns == [33 * n * 1_000_000 for n in range(5)]
+
+
+def test_unseen_robot_coasts_at_the_instants_of_other_frames() -> None:
+    sent = [("red", 33 * n, at(0.01 * n, 1e-6)) for n in range(10)]
+    other = Position(4, 1.0, 1.0, 0.0, None, 1e-6 * np.eye(3))
+    made = fused(*sent, *(("white", 33 * n, other) for n in range(10, 50)))
+    rows = [(p.timestamp, track) for p in made[::2] for track in p.tracks if track.robot == "ada"]
+    coasting = [(t, track) for t, track in rows if track.coasting_ns is not None]
+    assert [t - track.coasting_ns for t, track in coasting] == [297_000_000] * len(coasting)
+    assert 1.2e9 < coasting[-1][0] < 1.3e9
+    assert coasting[-1][1].x_m > 0.15
+    assert coasting[-1][1].cameras == ()
 
 
 def test_no_marker_no_track() -> None:

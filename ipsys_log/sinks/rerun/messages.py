@@ -278,7 +278,9 @@ class RerunSink:
             entity = (*tracks_entity(run), "robots", track.robot)
             self._draw_robot(message, entity, run, track)
             self._fading.seen(entity, message, fade_ns)
-            self._trails.add((run, track.robot), message, (track.x_m, track.y_m, track.z_m), fade_ns)
+            # A trail shows what cameras saw, not predictions.
+            if track.coasting_ns is None:
+                self._trails.add((run, track.robot), message, (track.x_m, track.y_m, track.z_m), fade_ns)
 
     def _draw_robot(self, message: Message, entity: Entity, run: str | None, track: Track) -> None:
         colour = self._robot_colour(run, track.robot)

@@ -72,8 +72,8 @@ class _Pose:
 class Trails(Generic[Key]):
     """The trails of robots: it joins the poses of each robot, and passes each segment to ``draw``.
 
-    Several poses of one instant (one from each camera) count as the last of them, which uses all cameras. So
-    a pose waits until the next instant. There is no line over a gap.
+    Several poses of one instant count as the last of them: tracks of earlier versions have one from each
+    camera. So a pose waits until the next instant. There is no line over a gap.
     """
 
     def __init__(self, draw: Callable[[Key, Segment], None]) -> None:

@@ -17,7 +17,8 @@ __all__ = ["STALE_S", "NewSession", "PoseSource", "StreamPose", "Velocity", "fir
 
 # A robot of 0.26 m/s moves 13 cm in this time.
 STALE_S = 0.5
-# The duration of the poses that give a velocity. A longer one is more precise, and later by half of it.
+# Tracks of earlier versions have no velocity. The duration of the poses that give one: a longer one is more
+# precise, and later by half of it.
 _WINDOW_NS, _SHORTEST_NS = NS_PER_S // 5, NS_PER_S // 20
 _FEWEST_POSES = 3
 _NS_PER_MS = NS_PER_S // 1000
@@ -53,7 +54,7 @@ class StreamPose:
     ----------
     session, sequence : both increase; the sequence begins with 1 in each session.
     time_ns, age_s : the capture time, and the time since then by the clock of the stream.
-    is_stale : the pose is older than the limit.
+    is_stale : the last sighting of the robot is older than the limit.
     is_outside : the position is an extrapolation outside the calibrated volume; None if this is unknown.
     """
 
@@ -122,8 +123,9 @@ class PoseSource:
             return
         self._sequence += 1
         age_s = (self._now_ns() - time_ns) / NS_PER_S
+        unseen_s = age_s + (track.coasting_ns or 0) / NS_PER_S
         yield StreamPose(
-            self._session, self._sequence, time_ns, age_s, track, recent.velocity(), age_s > self._stale_s
+            self._session, self._sequence, time_ns, age_s, track, recent.velocity(), unseen_s > self._stale_s
         )
 
 
@@ -133,7 +135,7 @@ def _is_finite(track: Track) -> bool:
 
 
 class _Recent:
-    """The recent poses of one robot, and their velocity: the slope of straight lines (least squares)."""
+    """The recent poses of one robot, and its velocity."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, Track]] = deque()
@@ -151,7 +153,15 @@ class _Recent:
         return True
 
     def velocity(self) -> Velocity | None:
-        """Return the velocity; None if the poses are too few, or their time is too short."""
+        """Return the velocity of the newest track; that of the recent poses if the track has none."""
+        newest = self._poses[-1][1]
+        if newest.velocity_m_s is None or not np.isfinite(newest.velocity_m_s).all():
+            return self._slope()
+        x_m_s, y_m_s, z_m_s = newest.velocity_m_s.tolist()
+        return Velocity(x_m_s, y_m_s, z_m_s, newest.turn_rate_rad_s)
+
+    def _slope(self) -> Velocity | None:
+        """Return the slope of the poses; None if the poses are too few, or their time is too short."""
         first_ns, last_ns = self._poses[0][0], self._poses[-1][0]
         if len(self._poses) < _FEWEST_POSES or last_ns - first_ns < _SHORTEST_NS:
             return None

@@ -1,0 +1,347 @@
+"""Tracks of robots from the sightings of all cameras, in the order in which they arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
+from ipsys_log.tracking.history import HISTORY_NS, History, Record
+from ipsys_log.tracking.motion import MotionNoise
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Pose", "RobotTracks", "TrackSettings", "gather_sightings"]
+
+Array = NDArray[np.float64]
+
+_ONE = np.zeros(1, dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackSettings:
+    """Limits of tracks.
+
+    Attributes
+    ----------
+    motion : the usual motion of a robot.
+    gate : largest squared difference of a sighting from its prediction, in units of its covariance; 30 is
+        exceeded by chance once in 200,000 sightings.
+    slack_m, slack_rad : errors that the covariances do not contain; they widen the gate.
+    restart : a track starts again after this number of consecutive sightings that contradict it and agree
+        with one another.
+    gap_ns : a robot that is unseen for longer is coasting.
+    coast_ns : a track ends when its robot is unseen for longer.
+    window_ns : the cameras of a pose are those of the sightings in this time.
+    """
+
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    gate: float = 30.0
+    slack_m: float = 0.003
+    slack_rad: float = 0.02
+    restart: int = 3
+    gap_ns: int = NS_PER_S // 10
+    coast_ns: int = NS_PER_S
+    window_ns: int = NS_PER_S // 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """The pose of one robot at one instant: a row of ``states``.
+
+    The covariance of its position is that of the state plus ``rest_m2`` (3, 3). It means nothing without
+    ``has_covariance``: a position of the track has none.
+
+    ``cameras`` are those of the recent sightings, ``newest`` the last sighting; ``coasting_ns`` is the time
+    since then if the robot is unseen, otherwise None.
+    """
+
+    robot: Hashable
+    time_ns: int
+    states: States
+    state: int
+    cameras: tuple[str, ...]
+    inside: bool | None
+    rest_m2: Array
+    has_covariance: bool
+    coasting_ns: int | None = None
+    age_ns: int | None = None
+
+
+@dataclass(slots=True)
+class _Track:
+    """A track, and the sightings that contradict it: a rival track of the same robot."""
+
+    history: History
+    rest_m2: Array
+    has_covariance: bool = True
+    rival: History | None = None
+    hits: int = 0
+
+
+@dataclass(slots=True)
+class _Batch:
+    """The sightings of one message that are filtered together, by their row in the message."""
+
+    camera: str
+    sightings: Sightings
+    rest_m2: Array
+    times_ns: Sequence[int]
+    inside: Sequence[bool | None]
+    has_covariance: Sequence[bool]
+
+
+class RobotTracks:
+    """The tracks of all robots.
+
+    Every sighting updates the track of its robot at its own capture time. A late sighting is filtered again
+    with all later ones, up to :data:`~ipsys_log.tracking.history.HISTORY_NS`. Poses that were given out
+    stay as they are.
+
+    A sighting outside the gate changes nothing. If several of them agree with one another, and none agrees
+    with the track, the track starts again with them.
+
+    Parameters
+    ----------
+    settings : limits of the tracks.
+    complete : keep all sightings of all tracks, for their smoothing.
+    """
+
+    def __init__(self, settings: TrackSettings | None = None, complete: bool = False) -> None:
+        self._settings = settings or TrackSettings()
+        self._complete = complete
+        self._tracks: dict[Hashable, _Track] = {}
+        self._ended: list[tuple[Hashable, History]] = []
+
+    def histories(self) -> list[tuple[Hashable, History]]:
+        """Return all tracks with their robots, ended ones first; only if the histories are ``complete``."""
+        return [*self._ended, *((robot, track.history) for robot, track in self._tracks.items())]
+
+    def observe(
+        self,
+        camera: str,
+        robots: Sequence[Hashable],
+        times_ns: Sequence[int],
+        sightings: Sightings,
+        rest_m2: Array,
+        inside: Sequence[bool | None],
+        has_covariance: Sequence[bool],
+    ) -> list[Pose]:
+        """Update the tracks with the sightings of one message.
+
+        Parameters
+        ----------
+        camera : its name.
+        robots : (k,), one sighting of each robot.
+        times_ns : (k,), capture times.
+        sightings : (k,).
+        rest_m2 : (k, 3, 3), covariances of errors that are neither noise nor modes of the calibration.
+        inside : (k,), flags of the positions.
+        has_covariance : (k,), False for a position whose covariance is unknown.
+
+        Returns
+        -------
+        The poses at the instants of the sightings. An instant of a robot that already has a pose gets none.
+        """
+        batch = _Batch(camera, sightings, rest_m2, times_ns, inside, has_covariance)
+        # A frame can show the same marker twice: one sighting of each robot after the other.
+        poses, waiting = [], list(range(len(robots)))
+        while waiting:
+            first = {robots[row]: row for row in reversed(waiting)}
+            poses += self._observe(batch, robots, sorted(first.values()))
+            waiting = [row for row in waiting if first[robots[row]] != row]
+        return poses
+
+    def coast(self, time_ns: int) -> list[Pose]:
+        """Return the predicted poses of unseen robots at an instant, and end the tracks that are too old."""
+        settings, coasting = self._settings, []
+        for robot, track in list(self._tracks.items()):
+            age_ns = time_ns - track.history.newest.time_ns
+            if age_ns > settings.coast_ns:
+                self._end(robot, track.history)
+                del self._tracks[robot]
+            elif age_ns > settings.gap_ns and time_ns not in track.history.rows_ns:
+                coasting.append((robot, track, age_ns))
+        if not coasting:
+            return []
+        last = _gather([track.history.newest for _, track, _ in coasting])
+        ages_s = np.array([age_ns for _, _, age_ns in coasting]) / NS_PER_S
+        states = predict(last, ages_s, settings.motion)
+        for _, track, _ in coasting:
+            track.history.rows_ns.add(time_ns)
+        return [
+            Pose(
+                robot,
+                time_ns,
+                states,
+                row,
+                (),
+                track.history.newest.inside,
+                track.rest_m2,
+                track.has_covariance,
+                age_ns,
+                time_ns - track.history.began_ns,
+            )
+            for row, (robot, track, age_ns) in enumerate(coasting)
+        ]
+
+    def _observe(self, batch: _Batch, robots: Sequence[Hashable], all_rows: list[int]) -> list[Pose]:
+        rows, tracks, places = [], [], []
+        for row in all_rows:
+            time_ns = batch.times_ns[row]
+            track = self._track_of(robots[row], batch, row)
+            records = track.history.records
+            if not records or time_ns >= records[-1].time_ns - HISTORY_NS:
+                rows.append(row)
+                tracks.append(track)
+                places.append(track.history.place_of(time_ns) if records else 0)
+        if not rows:
+            return []
+        accepted = self._filter(batch, robots, np.array(rows), tracks, places)
+        return [
+            pose
+            for row, track, is_accepted in zip(rows, tracks, accepted.tolist(), strict=True)
+            if is_accepted and (pose := self._pose(robots[row], track, batch, row))
+        ]
+
+    def _track_of(self, robot: Hashable, batch: _Batch, row: int) -> _Track:
+        track = self._tracks.get(robot)
+        ended = track is not None and (
+            batch.times_ns[row] - track.history.newest.time_ns > self._settings.coast_ns
+        )
+        if track is not None and ended:
+            self._end(robot, track.history)
+        if track is None or ended:
+            track = self._tracks[robot] = _Track(History(complete=self._complete), batch.rest_m2[row])
+        return track
+
+    def _end(self, robot: Hashable, history: History) -> None:
+        if self._complete:
+            self._ended.append((robot, history))
+
+    def _filter(
+        self,
+        batch: _Batch,
+        robots: Sequence[Hashable],
+        rows: NDArray[np.intp],
+        tracks: list[_Track],
+        places: list[int],
+    ) -> NDArray[np.bool_]:
+        """Filter the sightings of some rows, and the later ones again; return a mask of the accepted rows."""
+        sightings = batch.sightings.take(rows)
+        states, accepted = start(sightings, self._settings.motion), np.ones(len(rows), dtype=bool)
+        known = np.flatnonzero(places)
+        if len(known):
+            before = [tracks[n].history.records[places[n] - 1] for n in known.tolist()]
+            times_ns = [batch.times_ns[row] for row in rows[known].tolist()]
+            predicted = self._predicted(before, times_ns)
+            seen = sightings.take(known)
+            innovations = compare(predicted, seen)
+            accepted[known] = self._agrees(innovations, batch.rest_m2[rows[known]])
+            after = update(predicted, seen, innovations)
+            states.means[known], states.covariances[known] = after.means, after.covariances
+            states.cross[known] = after.cross
+        later = []
+        for number, (row, track, place) in enumerate(zip(rows.tolist(), tracks, places, strict=True)):
+            record = Record(
+                batch.times_ns[row], batch.camera, batch.inside[row], batch.sightings, row, states, number
+            )
+            if not accepted[number]:
+                accepted[number] = self._contradict(robots[row], track, record, batch.rest_m2[row])
+                continue
+            track.rival, track.hits = None, 0
+            later.append((track, place, [record, *track.history.records[place:]]))
+            if place == len(track.history.records):
+                track.rest_m2, track.has_covariance = batch.rest_m2[row], batch.has_covariance[row]
+        self._filter_again(later)
+        return accepted
+
+    def _filter_again(self, changed: list[tuple[_Track, int, list[Record]]]) -> None:
+        """Filter the records after the first of each list again, and put the lists into the histories."""
+        step = 1
+        while waiting := [records for _, _, records in changed if len(records) > step]:
+            predicted = self._predicted(
+                [records[step - 1] for records in waiting], [records[step].time_ns for records in waiting]
+            )
+            seen = gather_sightings([records[step] for records in waiting])
+            states = update(predicted, seen, compare(predicted, seen))
+            for row, records in enumerate(waiting):
+                records[step] = records[step]._replace(states=states, state=row)
+            step += 1
+        for track, place, records in changed:
+            track.history.replace_from(place, records)
+
+    def _predicted(self, before: Sequence[Record], times_ns: Sequence[int]) -> States:
+        durations_s = np.array([t - r.time_ns for t, r in zip(times_ns, before, strict=True)]) / NS_PER_S
+        return predict(_gather(before), durations_s, self._settings.motion)
+
+    def _agrees(self, innovations: Innovations, rest_m2: Array) -> NDArray[np.bool_]:
+        """Return a mask (k,) of the sightings within the gate."""
+        settings, wide = self._settings, innovations.covariances.copy()
+        wide[:, :3, :3] += rest_m2 + settings.slack_m**2 * np.eye(3)
+        wide[:, 3, 3] += settings.slack_rad**2
+        solved = np.linalg.solve(wide, innovations.differences[:, :, None])
+        chi2 = (innovations.differences[:, None] @ solved)[:, 0, 0]
+        return np.asarray(chi2 < settings.gate)
+
+    def _contradict(self, robot: Hashable, track: _Track, record: Record, rest_m2: Array) -> bool:
+        """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
+        seen, rival = record.sightings.take(_ONE + record.sighting), track.rival
+        states, hits = start(seen, self._settings.motion), 1
+        if rival is not None and rival.newest.time_ns <= record.time_ns:
+            predicted = self._predicted([rival.newest], [record.time_ns])
+            innovations = compare(predicted, seen)
+            if self._agrees(innovations, rest_m2[None])[0]:
+                states, hits = update(predicted, seen, innovations), track.hits + 1
+        own = record._replace(states=states, state=0)
+        if hits == 1 or rival is None:
+            rival = History(complete=self._complete)
+        rival.replace_from(len(rival.records), [own])
+        track.rival, track.hits = rival, hits
+        if hits < self._settings.restart:
+            return False
+        self._end(robot, track.history)
+        rival.rows_ns = track.history.rows_ns
+        track.history, track.rest_m2, track.rival, track.hits = rival, rest_m2, None, 0
+        return True
+
+    def _pose(self, robot: Hashable, track: _Track, batch: _Batch, row: int) -> Pose | None:
+        """Return the pose at the instant of a sighting; None if there is one already."""
+        time_ns = batch.times_ns[row]
+        if time_ns in track.history.rows_ns:
+            return None
+        track.history.rows_ns.add(time_ns)
+        recent = track.history.recent(time_ns, self._settings.window_ns)
+        flags = [record.inside for record in recent if record.inside is not None]
+        return Pose(
+            robot,
+            time_ns,
+            recent[-1].states,
+            recent[-1].state,
+            tuple(sorted({record.camera for record in recent})),
+            any(flags) if flags else None,
+            batch.rest_m2[row],
+            batch.has_covariance[row],
+            age_ns=time_ns - track.history.began_ns,
+        )
+
+
+def _gather(records: Sequence[Record]) -> States:
+    """Return the states of records of different messages together."""
+    return States(
+        np.array([record.states.means[record.state] for record in records]),
+        np.array([record.states.covariances[record.state] for record in records]),
+        np.array([record.states.cross[record.state] for record in records]),
+    )
+
+
+def gather_sightings(records: Sequence[Record]) -> Sightings:
+    """Return the sightings of records of different messages together."""
+    return Sightings(
+        np.array([record.sightings.poses[record.sighting] for record in records]),
+        np.array([record.sightings.noise[record.sighting] for record in records]),
+        np.array([record.sightings.sensitivities[record.sighting] for record in records]),
+        np.array([record.sightings.clock_s[record.sighting] for record in records]),
+    )

@@ -1,0 +1,152 @@
+"""Modes of calibration errors keep the covariances of the models."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.poses import pose_facing_up, transform
+from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.locate import locate_markers
+from ipsys_log.joint.model import JointModel
+from ipsys_log.joint.payload import joint_payload, restore_joint
+from ipsys_log.messages import Model, Pair, Rig
+from ipsys_log.models.table import AppliedModel
+from ipsys_log.stages.fit import fit_model
+from ipsys_log.tracking.bias_modes import BiasModes, Grid, NodeModes, reduce_modes
+from ipsys_log.tracking.calibration_modes import calibration_modes
+from tests.joint.small_lab import LENGTH_M, make_lab
+
+Array = NDArray[np.float64]
+
+GRID = Grid(np.array([-1.0, 0.0]), 0.5, (5, 4))
+
+
+def linear_nodes(rng: np.random.Generator, count: int) -> tuple[Array, NodeModes]:
+    """Return planes (3, 3, M) of the modes over 1, x, y; and the modes at the nodes."""
+    planes = rng.standard_normal((3, 3, count))
+    terms = np.column_stack([np.ones(20), GRID.points_m])
+    return planes, NodeModes(np.einsum("nt,tam->nam", terms, planes), np.zeros((20, 3, 3)), np.zeros(count))
+
+
+def test_plane_of_sensitivities_is_exact_between_nodes() -> None:
+    rng = np.random.default_rng(0)
+    planes, nodes = linear_nodes(rng, 4)
+    modes = reduce_modes(GRID, {"red": nodes}, 4)
+    points_m = rng.uniform([-1, 0], [1, 1.5], (30, 2))
+    headings = rng.uniform(-3, 3, 30)
+    sensitivities, rest_m2 = modes.at("red", points_m, headings)
+    terms = np.column_stack([np.ones(30), points_m])
+    wanted = np.einsum("nt,tam->nam", terms, planes)
+    # The amplitudes are turned; covariances do not change.
+    np.testing.assert_allclose(
+        sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2), wanted @ wanted.swapaxes(1, 2), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        sensitivities[0, :3] @ sensitivities[9, :3].T, wanted[0] @ wanted[9].T, atol=1e-9
+    )
+    np.testing.assert_allclose(rest_m2, 0.0, atol=1e-12)
+
+
+def test_turn_of_the_camera_turns_all_headings_alike() -> None:
+    turn = np.zeros((20, 3, 1))
+    turn[:, 0, 0], turn[:, 1, 0] = -0.01 * GRID.points_m[:, 1], 0.01 * GRID.points_m[:, 0]
+    modes = reduce_modes(GRID, {"red": NodeModes(turn, np.zeros((20, 3, 3)), np.zeros(1))}, 1)
+    sensitivities, _ = modes.at("red", np.full((5, 2), 0.3), np.linspace(-3, 3, 5))
+    np.testing.assert_allclose(np.abs(sensitivities[:, 3, 0]), 0.01, rtol=1e-9)
+
+
+def test_modes_left_out_stay_in_the_covariance() -> None:
+    rng = np.random.default_rng(1)
+    nodes = {
+        name: NodeModes(rng.standard_normal((20, 3, 9)), np.zeros((20, 3, 3)), np.zeros(9)) for name in "ab"
+    }
+    modes = reduce_modes(GRID, nodes, 4)
+    assert modes.count == 4
+    sensitivities, rest_m2 = modes.at("b", GRID.points_m, np.zeros(20))
+    total = sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2) + rest_m2
+    np.testing.assert_allclose(total, nodes["b"].modes_m @ nodes["b"].modes_m.swapaxes(1, 2), atol=1e-9)
+
+
+def test_node_that_a_camera_cannot_see_has_the_nearest_value() -> None:
+    values = np.ones((20, 3, 1))
+    values[GRID.points_m[:, 0] > 0.2] = np.nan
+    values[GRID.points_m[:, 0] < -0.7] = 5.0
+    modes = reduce_modes(GRID, {"red": NodeModes(values, np.zeros((20, 3, 3)), np.zeros(1))}, 1)
+    sensitivities, _ = modes.at("red", np.array([[1.0, 1.0], [40.0, 1.0], [-1.0, 0.5]]), np.zeros(3))
+    np.testing.assert_allclose(np.abs(sensitivities[:, 0, 0]), [1.0, 1.0, 5.0])
+
+
+def test_unknown_camera_has_no_errors() -> None:
+    sensitivities, rest_m2 = BiasModes.none().at("red", np.zeros((2, 3)), np.zeros(2))
+    assert sensitivities.shape == (2, 4, 0)
+    assert not rest_m2.any()
+
+
+@pytest.fixture(scope="module")
+def joint() -> Model:
+    return joint_payload(fit_jointly(make_lab(4, points=20)[0]), {}, 0)
+
+
+def test_joint_modes_are_the_covariance_of_located_markers(joint: Model) -> None:
+    """The part of the calibration in the covariance of real sightings, against the table."""
+    rig = Rig("lab", "DICT_4X4_100", LENGTH_M, marker_height_m=0.1)
+    modes = calibration_modes(joint, rig)
+    assert modes.count == 12
+    rng = np.random.default_rng(5)
+    for camera in joint.cameras:
+        model = restore_joint(camera)
+        places_m = model.origin_m[:2] + rng.uniform(-0.9, 0.9, (20, 2))
+        headings = rng.uniform(-3, 3, 20)
+        corners_px = level_corners(model, places_m, headings)
+        noise = np.broadcast_to(0.012**2 * np.eye(8), (20, 8, 8))
+        located = locate_markers(model, corners_px, noise, np.full(20, 0.1), np.full(20, LENGTH_M))
+        wanted = (located.covariances_m2 - located.noise_m2)[:, :2, :2]
+        sensitivities, rest_m2 = modes.at(camera.camera, located.points_m, located.headings_rad)
+        by_modes = sensitivities[:, :2] @ sensitivities[:, :2].swapaxes(1, 2)
+        total = by_modes + rest_m2[:, :2, :2]
+        sizes = np.trace(wanted, axis1=1, axis2=2)
+        assert np.abs(np.trace(total, axis1=1, axis2=2) / sizes - 1).max() < 0.1
+        assert (np.trace(by_modes, axis1=1, axis2=2) / sizes).min() > 0.7
+
+
+def level_corners(model: JointModel, places_m: Array, headings_rad: Array) -> Array:
+    """Return corners (n, 4, 2) of level markers 10 cm above the floor, by OpenCV's projection."""
+    floor_m, _ = model.floor.heights(places_m, model.amplitudes)
+    corners = []
+    for (x_m, y_m), z_m, heading_rad in zip(places_m, floor_m + 0.1, headings_rad, strict=True):
+        world_m = transform(pose_facing_up(x_m, y_m, z_m, heading_rad), marker_corners(LENGTH_M))
+        camera_m = (world_m - model.origin_m) @ model.camera_from_world.T
+        corners.append(project(camera_m, model.calibration))
+    return np.array(corners)
+
+
+@pytest.mark.parametrize("name", ["poly", "best", "rayplane"])
+def test_modes_of_a_table_model_are_its_covariance(name: str) -> None:
+    rng = np.random.default_rng(3)
+    camera_m = np.column_stack([rng.uniform(-1.2, 1.2, (30, 2)), rng.uniform(1.9, 2.1, 30)])
+    turn = np.diag([1.0, -1.0, -1.0])
+    world_m = camera_m @ turn + np.array([2.0, 2.0, 2.1])
+    measured_m = world_m + rng.normal(0.0, 0.002, world_m.shape)
+    tape_m2 = 0.002**2 * np.eye(3)
+    pairs = {
+        "red": [
+            Pair(str(n), 0, seen, place, 5, tape_m2)
+            for n, (seen, place) in enumerate(zip(camera_m, measured_m, strict=True))
+        ]
+    }
+    model = fit_model(name, pairs, 0)
+    modes = calibration_modes(model, Rig("lab", "DICT_4X4_100", 0.2, marker_height_m=0.1), 19)
+    points_m = np.column_stack([rng.uniform(-0.8, 0.8, (15, 2)), np.full(15, 2.0)])
+    applied = AppliedModel(name, model.cameras[0])
+    heights_m = np.full(15, 0.1)
+    wanted = applied.covariances(points_m, heights_m)
+    assert wanted is not None
+    places_m = applied.predict(points_m, heights_m)
+    sensitivities, rest_m2 = modes.at("red", places_m, np.zeros(15))
+    total = sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2) + rest_m2
+    ratio = np.trace(total, axis1=1, axis2=2) / np.trace(wanted, axis1=1, axis2=2)
+    assert np.abs(ratio - 1).max() < 0.15

@@ -1,0 +1,248 @@
+"""Events of a day in the lab: what the track of a robot does in each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
+from ipsys_log.units import NS_PER_S
+from tests.tracking.driving import (
+    CAMERAS,
+    MS,
+    START_NS,
+    Sighting,
+    circle,
+    errors_m,
+    follow,
+    observe,
+    place_of,
+    sight,
+)
+
+Array = NDArray[np.float64]
+
+
+def settled(poses: list[Pose]) -> list[Pose]:
+    return [pose for pose in poses if pose.time_ns > START_NS + NS_PER_S // 2]
+
+
+@pytest.mark.parametrize("speed_m_s", [0.26, 1.0])
+def test_track_follows_a_bend_with_its_velocity(speed_m_s: float) -> None:
+    def drive(time_ns: int) -> Array:
+        return circle(time_ns, speed_m_s)
+
+    poses = settled(follow(sight(drive, 3.0)))
+    means = np.array([pose.states.means[pose.state] for pose in poses])
+    true = np.array([(drive(pose.time_ns + MS) - drive(pose.time_ns - MS))[:2] for pose in poses]) * 500
+    assert np.percentile(errors_m(poses, drive), 95) < 2.5e-4
+    assert np.percentile(np.linalg.norm(means[:, 4:6] - true, axis=1), 95) < 0.02
+    np.testing.assert_allclose(means[:, 7].mean(), speed_m_s / 0.5, rtol=0.01)
+    assert {pose.cameras for pose in poses} == {tuple(sorted(CAMERAS))}
+
+
+def test_each_instant_of_a_robot_has_one_pose() -> None:
+    together = [replace(one, time_ns=one.time_ns // (33 * MS) * 33 * MS) for one in sight(circle, 1.0)]
+    together = [replace(one, pose=circle(one.time_ns)) for one in together]
+    poses = follow(together)
+    times_ns = [pose.time_ns for pose in poses]
+    assert len(times_ns) == len(set(times_ns))
+    assert set(times_ns) == {one.time_ns for one in together}
+    # The later cameras of an instant are in the next pose.
+    assert poses[0].cameras == ("red",)
+    assert poses[-1].cameras == tuple(sorted(CAMERAS))
+
+
+def last_states(sightings: list[Sighting]) -> Array:
+    tracks = RobotTracks()
+    follow(sightings, tracks=tracks)
+    (pose,) = tracks.coast(max(one.time_ns for one in sightings) + 200 * MS)
+    return np.concatenate([pose.states.means[pose.state], pose.states.covariances[pose.state].ravel()])
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.integers(0, 200), min_size=30, max_size=30))
+def test_late_sightings_give_the_same_track_as_in_time(delays_ms: list[int]) -> None:
+    in_time = sight(circle, 0.4)
+    arrivals = [one.time_ns + delay * MS for one, delay in zip(in_time, delays_ms + [0] * 6, strict=True)]
+    order = sorted(range(len(in_time)), key=lambda row: arrivals[row])
+    np.testing.assert_allclose(
+        last_states([in_time[row] for row in order]), last_states(in_time), rtol=1e-6, atol=1e-12
+    )
+
+
+def test_pose_that_was_given_out_stays_and_later_ones_know_the_late_sighting() -> None:
+    sightings = sight(circle, 1.0)
+    late = sightings.pop(-10)
+    tracks = RobotTracks()
+    before = follow(sightings[:-4], tracks=tracks)
+    kept = [place_of(pose).copy() for pose in before]
+    (own,) = observe(tracks, late)
+    assert own.time_ns == late.time_ns
+    np.testing.assert_array_equal([place_of(pose) for pose in before], kept)
+    after = follow(sightings[-4:], tracks=tracks)[-1]
+    without = follow(sightings)[-1]
+    assert np.abs(place_of(after) - place_of(without)).max() > 1e-9
+    np.testing.assert_allclose(place_of(after), place_of(without), atol=1e-3)
+
+
+def test_sighting_older_than_half_a_second_is_left_out() -> None:
+    sightings = sight(circle, 1.0)
+    tracks = RobotTracks()
+    last = follow(sightings[1:], tracks=tracks)[-1]
+    assert list(observe(tracks, sightings[0])) == []
+    assert last.time_ns - sightings[0].time_ns > NS_PER_S // 2
+
+
+def moved(one: Sighting, by: Array) -> Sighting:
+    return replace(one, pose=one.pose + by)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        np.array([1.5, -0.8, 0.0, 2.0]),  # the id of another marker
+        np.array([0.03, 0.02, 0.01, 0.1]),  # the mirrored pose of the square
+    ],
+)
+def test_fault_of_one_frame_does_not_move_the_track(fault: Array) -> None:
+    sightings = sight(circle, 2.0)
+    faulty = [moved(one, fault) if row == 120 else one for row, one in enumerate(sightings)]
+    poses = follow(faulty)
+    assert sightings[120].time_ns not in {pose.time_ns for pose in poses}
+    assert errors_m(settled(poses), circle).max() < 6e-4
+
+
+def test_robot_put_down_elsewhere_is_tracked_again_at_once() -> None:
+    lifted_ns = START_NS + NS_PER_S
+
+    def drive(time_ns: int) -> Array:
+        far = np.array([1.2, -0.7, 0.0, 0.0]) if time_ns >= lifted_ns else np.zeros(4)
+        return circle(time_ns) + far
+
+    poses = follow(sight(drive, 2.0))
+    after = [pose for pose in poses if pose.time_ns >= lifted_ns]
+    assert after[0].time_ns - lifted_ns < 50 * MS
+    assert errors_m(after, drive).max() < 1e-3
+
+
+def test_robot_lifted_slowly_and_put_down_is_never_lost() -> None:
+    def drive(time_ns: int) -> Array:
+        since_s = (time_ns - START_NS) / NS_PER_S
+        lift = np.clip(min(since_s - 1, 3 - since_s), 0, 0.5)
+        return circle(START_NS) + np.array([0.8 * np.clip(since_s - 1, 0, 2), 0.3 * lift, lift, 0.0])
+
+    poses = follow(sight(drive, 4.0))
+    times_ns = [pose.time_ns for pose in poses]
+    assert max(np.diff(times_ns)) < 100 * MS
+    assert errors_m([poses[-1]], drive)[0] < 1e-3
+
+
+def covered(seconds: float, from_s: float = 1.0) -> Callable[[Sighting], bool]:
+    def is_seen(one: Sighting) -> bool:
+        since_s = (one.time_ns - START_NS) / NS_PER_S
+        return one.robot != "ada" or not from_s <= since_s < from_s + seconds
+
+    return is_seen
+
+
+def with_another(sightings: list[Sighting]) -> list[Sighting]:
+    """Add a robot that stands in the corner: its sightings carry the time on."""
+    still = sight(lambda time_ns: np.array([0.5, 0.5, 0.1, 0.0]), 6.0, robot="bob", seed=9)
+    return sorted([*sightings, *still], key=lambda one: (one.time_ns, one.robot))
+
+
+def test_covered_robot_coasts_with_growing_covariance_and_ends() -> None:
+    sightings = with_another([one for one in sight(circle, 6.0) if covered(3.0)(one)])
+    poses = [pose for pose in follow(sightings) if pose.robot == "ada"]
+    coasting = [pose for pose in poses if pose.coasting_ns is not None]
+    sizes = [np.trace(pose.states.covariances[pose.state, :2, :2]) for pose in coasting]
+    assert (np.diff(sizes) > 0).all()
+    ages_s = np.array([pose.coasting_ns or 0 for pose in coasting]) / NS_PER_S
+    assert 0.1 < ages_s.min() < 0.12
+    assert 0.97 < ages_s.max() <= 1.0
+    # The errors of the prediction agree with its covariance.
+    errors = np.array([(place_of(pose) - circle(pose.time_ns)[:3])[:2] for pose in coasting])
+    spreads = np.array([pose.states.covariances[pose.state, :2, :2] for pose in coasting])
+    squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spreads), errors)
+    assert squares.max() < 9.2
+    back_ns = START_NS + 4 * NS_PER_S
+    after = [pose for pose in poses if pose.time_ns >= back_ns]
+    assert after[0].time_ns - back_ns < 34 * MS
+    assert errors_m(after[3:], circle).max() < 1e-3
+
+
+def test_coasting_time_is_a_setting() -> None:
+    sightings = with_another([one for one in sight(circle, 6.0) if covered(3.0)(one)])
+    poses = follow(sightings, TrackSettings(coast_ns=2 * NS_PER_S))
+    assert max(pose.coasting_ns or 0 for pose in poses) > 1.97 * NS_PER_S
+
+
+def test_one_covered_camera_of_three_leaves_no_gap() -> None:
+    sightings = [one for one in sight(circle, 5.0) if one.camera != "red" or covered(3.0)(one)]
+    poses = settled(follow(sightings))
+    assert errors_m(poses, circle).max() < 6e-4
+    assert all(pose.coasting_ns is None for pose in poses)
+    assert {pose.cameras for pose in poses} == {("black", "white"), tuple(sorted(CAMERAS))}
+
+
+def test_two_robots_that_pass_at_25_cm_keep_their_tracks() -> None:
+    def other(time_ns: int) -> Array:
+        since_s = (time_ns - START_NS) / NS_PER_S
+        return np.array([2.75, 2.3 - 0.26 * since_s, 0.1, -np.pi / 2])
+
+    sightings = sorted(
+        [*sight(circle, 2.0), *sight(other, 2.0, robot="bob", seed=1)],
+        key=lambda one: (one.time_ns, one.robot),
+    )
+    poses = settled(follow(sightings))
+    drives = {"ada": circle, "bob": other}
+    apart_m = min(np.linalg.norm((circle(t.time_ns) - other(t.time_ns))[:2]) for t in poses)
+    assert 0.2 < apart_m < 0.27
+    for robot, drive in drives.items():
+        assert errors_m([pose for pose in poses if pose.robot == robot], drive).max() < 6e-4
+
+
+def test_knocked_camera_is_left_out_beside_another_one() -> None:
+    """One degree at 2.1 m is 37 mm on the floor."""
+    knocked_ns, shift = START_NS + NS_PER_S, np.array([0.037, 0.0, 0.0, 0.0])
+    sightings = [
+        moved(one, shift) if one.camera == "red" and one.time_ns >= knocked_ns else one
+        for one in sight(circle, 3.0)
+    ]
+    poses = settled(follow(sightings))
+    assert errors_m(poses, circle).max() < 6e-4
+    assert {pose.cameras for pose in poses if pose.time_ns > knocked_ns + 200 * MS} == {("black", "white")}
+
+
+def test_knocked_camera_alone_moves_the_track_in_one_step() -> None:
+    knocked_ns, shift = START_NS + NS_PER_S, np.array([0.037, 0.0, 0.0, 0.0])
+    sightings = [
+        moved(one, shift) if one.time_ns >= knocked_ns else one for one in sight(circle, 3.0, ("red",))
+    ]
+    poses = follow(sightings)
+    after = [pose for pose in poses if pose.time_ns > knocked_ns]
+    assert after[0].time_ns - knocked_ns < 120 * MS
+    np.testing.assert_allclose(
+        [place_of(p) - circle(p.time_ns)[:3] for p in after], [shift[:3]] * len(after), atol=1e-3
+    )
+
+
+def test_same_marker_twice_in_a_frame_uses_the_one_on_the_track() -> None:
+    from tests.tracking.driving import arrays
+
+    tracks = RobotTracks()
+    follow(sight(circle, 1.0), tracks=tracks)
+    time_ns = START_NS + NS_PER_S + 50 * MS
+    twice = arrays([circle(time_ns) + np.array([1.0, 0.0, 0.0, 0.0]), circle(time_ns)])
+    poses = tracks.observe(
+        "red", ["ada", "ada"], [time_ns] * 2, twice, np.zeros((2, 3, 3)), [None] * 2, [True] * 2
+    )
+    assert len(poses) == 1
+    assert errors_m(poses, circle)[0] < 1e-3

@@ -106,7 +106,7 @@ MODEL_VERSIONS = {
     "kriging-regression": 1,
     "rayplane": 2,
     "best": 1,
-    "joint": 1,
+    "joint": 2,
 }
 
 

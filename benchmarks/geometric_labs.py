@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from rendered_labs import rendered_lab
 
-from ipsys_log.analysis.floor_error import KnownSightings, Locator, grid_nodes, locate_with_model
+from ipsys_log.analysis.floor_error import (
+    KnownSightings,
+    Locator,
+    compute_errors,
+    grid_nodes,
+    locate_with_model,
+    summarize,
+)
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.poses import transform
@@ -43,16 +51,18 @@ __all__ = [
     "USE_DRIVES",
     "Scene",
     "Session",
-    "driving_robots",
     "fit_session",
-    "held_out_points",
+    "joint_locator",
     "make_session",
     "nodes_of",
+    "shares_by_place",
     "standing_robots",
 ]
 
 Array = NDArray[np.float64]
 
+# Places of held-out points and of a driving robot, each seen by up to three cameras.
+_HELD_OUT, _DRIVEN = 100, 200
 # Standard deviation of a corner of detect, as a weight for corners without noise.
 _USUAL_PX = 0.012
 
@@ -135,32 +145,40 @@ SCENES = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Session:
-    """A session of a lab: its messages, and the pairs of camera points for the models of the table."""
+    """A session of a lab: its ground truth, its messages, and its rig."""
 
     lab: GeometricLab
     messages: Sequence[Message]
     rig: Rig
-    pairs: dict[str, list[Pair]]
+
+    @property
+    def measured_m(self) -> Array:
+        """The true positions of the calibration points, (p, 2)."""
+        return np.array([(pose.x_m, pose.y_m) for poses in self.lab.points for pose in poses])
+
+    @cached_property
+    def pairs(self) -> dict[str, list[Pair]]:
+        """Pairs of camera points and calibration points by camera, for the models of the table."""
+        stage = CameraFrame()
+        points: list[Message] = []
+        for message in self.messages:
+            if isinstance(message.payload, (Rig, CameraCalibration, Markers)):
+                payloads = [one for one in stage(message) if isinstance(one, CameraPoints)]
+                points.extend(replace(message, payload=payload) for payload in payloads)
+        return build_pairs(gather_sightings(points), valid_measurements(self.messages, None))
 
 
 def make_session(scene: Scene, seed: int) -> Session:
-    """Simulate a session of a lab, and convert its markers to camera points."""
+    """Simulate a session of a lab."""
     if scene.rendered:
         lab, messages = rendered_lab(scene.seeded(seed))
     else:
         lab = build_lab(scene.seeded(seed))
         messages = list(simulate_session(lab))
-    stage = CameraFrame()
-    points: list[Message] = []
-    for message in messages:
-        if isinstance(message.payload, (Rig, CameraCalibration, Markers)):
-            payloads = [one for one in stage(message) if isinstance(one, CameraPoints)]
-            points.extend(replace(message, payload=payload) for payload in payloads)
     rig = next(message.payload for message in messages if isinstance(message.payload, Rig))
-    pairs = build_pairs(gather_sightings(points), valid_measurements(messages, None))
-    return Session(lab, messages, rig, pairs)
+    return Session(lab, messages, rig)
 
 
 def nodes_of(lab: GeometricLab) -> list[KnownSightings]:
@@ -229,6 +247,21 @@ def driving_robots(lab: GeometricLab, count: int) -> list[KnownSightings]:
     return [replace(seen, heights_m=np.full_like(seen.heights_m, lab.drive.height_m)) for seen in sightings]
 
 
+def shares_by_place(session: Session, locator: Locator) -> dict[str, dict[str, float]]:
+    """Return the shares inside the regions of the covariances: on the grid, at points, and in a drive."""
+    sightings = {
+        "grid": nodes_of(session.lab),
+        "points": held_out_points(session.lab, _HELD_OUT),
+        "drive": driving_robots(session.lab, _DRIVEN),
+    }
+    shares = {}
+    for name, seen in sightings.items():
+        own = summarize(compute_errors(seen, locator), session.measured_m).shares
+        if own is not None:
+            shares[name] = asdict(own)
+    return shares
+
+
 def standing_robots(
     lab: GeometricLab, nodes: Sequence[KnownSightings], frames: int, every: int
 ) -> list[KnownSightings]:
@@ -270,7 +303,7 @@ def _by_table(name: str) -> Callable[[Session], Locator]:
 
 
 def fit_session(session: Session) -> JointFit:
-    """Return the joint fit of a session: of its points for training, and its drive."""
+    """Return the joint calibration of a session."""
     lab, lenses = session.lab, session.lab.calibrations
     payloads = [message.payload for message in session.messages]
     markers = {
@@ -282,8 +315,9 @@ def fit_session(session: Session) -> JointFit:
     return fit_jointly(gather_observations(session.rig, lenses, markers, measured, nominal))
 
 
-def _joint(session: Session) -> Locator:
-    lab, models = session.lab, build_models(fit_session(session))
+def joint_locator(fit: JointFit, session: Session) -> Locator:
+    """Return the locator of a joint calibration."""
+    models, sigma_m = build_models(fit), session.lab.settings.robot_height_sigma_m
 
     def locator(
         camera: str, corners_px: Array, heights_m: Array, covariances_px2: Array | None = None
@@ -291,11 +325,14 @@ def _joint(session: Session) -> Locator:
         if covariances_px2 is None:
             covariances_px2 = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (len(corners_px), 8, 8))
         lengths_m = np.full(len(corners_px), session.rig.marker_length_m)
-        sigma_m = lab.settings.robot_height_sigma_m
         found = locate_markers(models[camera], corners_px, covariances_px2, heights_m, lengths_m, sigma_m)
         return found.points_m, found.covariances_m2
 
     return locator
+
+
+def _joint(session: Session) -> Locator:
+    return joint_locator(fit_session(session), session)
 
 
 # Calibrations by name, from a session to a locator. They raise FitError if there are too few points.

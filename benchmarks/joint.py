@@ -3,6 +3,7 @@
     python benchmarks/joint.py --labs 20                 # every scene
     python benchmarks/joint.py --labs 5 --lab-scene 16     # scenes with this in their name
     python benchmarks/joint.py --picture floor.png       # also a map of the errors of one lab
+    python benchmarks/joint.py --coverage --labs 200     # are the covariances of joint those of its errors?
 
 Most labs have no images: markers have the noise that detect has in rendered labs (see
 ipsys_log/simulation/corner_noise.py). Some labs are rendered, to confirm this. Each lab has another seed, and
@@ -28,12 +29,12 @@ from geometric_labs import (
     USE_DRIVES,
     Scene,
     Session,
-    driving_robots,
-    held_out_points,
     make_session,
     nodes_of,
+    shares_by_place,
     standing_robots,
 )
+from joint_coverage import COVERAGE_SCENES, coverage_table, measure_coverage
 from results import Report, command
 from rounds import Row
 from threadpoolctl import threadpool_limits
@@ -47,8 +48,6 @@ __all__ = ["measure"]
 _FIRST_SEED = 1000
 _MM = 1000.0
 _STANDING_FRAMES, _EVERY_NODE = 300, 23
-# Places of held-out points and of a driving robot, each seen by up to three cameras.
-_HELD_OUT, _DRIVEN = 100, 200
 # Limits of the median error of joint calibration over flat labs, in mm.
 _WANTED_MM = {
     "75 points": 1.0,
@@ -66,6 +65,9 @@ Figures = dict[str, Any]
 def measure(options: argparse.Namespace) -> Report:
     """Calibrate the labs of every scene with every contender."""
     report = Report("joint")
+    if options.coverage:
+        _add_coverage(report, options)
+        return report
     scenes = [scene for scene in SCENES if options.lab_scene in scene.name]
     if not options.rendered_labs:
         scenes = [scene for scene in scenes if not scene.rendered]
@@ -84,6 +86,17 @@ def measure(options: argparse.Namespace) -> Report:
     if skipped:
         report.remarks.append(f"{skipped} scenes with a drive: no calibration here uses it")
     return report
+
+
+def _add_coverage(report: Report, options: argparse.Namespace) -> None:
+    """Add the statistics of the covariances of joint calibration: a table for each scene."""
+    scenes = [scene for scene in COVERAGE_SCENES if options.lab_scene in scene.name]
+    labs = 1 if options.smoke else options.labs
+    with threadpool_limits(1):
+        for scene in scenes[:1] if options.smoke else scenes:
+            figures = measure_coverage(scene, range(_FIRST_SEED, _FIRST_SEED + labs))
+            report.details[scene.name] = figures
+            report.tables.append(coverage_table(scene.name, figures))
 
 
 def _measure_scene(
@@ -106,17 +119,13 @@ def _measure_scene(
             maps[name] = compute_errors(nodes, locator)
             figures[name].append(_figures(session, nodes, maps[name], locator, fit_s))
         if number == 0 and options.picture and scene is _first(options):
-            draw_floor_map(Path(options.picture), maps, _measured(session), scene.name)
+            draw_floor_map(Path(options.picture), maps, session.measured_m, scene.name)
             report.remarks.append(f"{scene.name}, the first lab: {options.picture}")
     return figures
 
 
 def _first(options: argparse.Namespace) -> Scene:
     return next(scene for scene in SCENES if options.lab_scene in scene.name)
-
-
-def _measured(session: Session) -> np.ndarray:
-    return np.array([(pose.x_m, pose.y_m) for poses in session.lab.points for pose in poses])
 
 
 def _figures(
@@ -126,34 +135,16 @@ def _figures(
     locator: Locator,
     fit_s: float,
 ) -> Figures:
-    error = asdict(summarize(errors, _measured(session)))
+    error = asdict(summarize(errors, session.measured_m))
     shares = error.pop("shares")
     figures = {
         f"{key}m" if key.endswith("_m") else key: value * (_MM if key.endswith("_m") else 1)
         for key, value in error.items()
     }
-    figures["coverage"] = _coverage(session, shares, locator)
+    figures["coverage"] = None if shares is None else shares_by_place(session, locator)
     figures["standing_mm"] = _MM * _repeatability(session, nodes, locator)
     figures["fit_s"] = fit_s
     return figures
-
-
-def _coverage(
-    session: Session, grid: dict[str, float] | None, locator: Locator
-) -> dict[str, dict[str, float]] | None:
-    """Return the shares inside the regions of the covariances, on the grid, at points and in a drive."""
-    if grid is None:
-        return None
-    others = {
-        "points": held_out_points(session.lab, _HELD_OUT),
-        "drive": driving_robots(session.lab, _DRIVEN),
-    }
-    coverage = {"grid": grid}
-    for name, sightings in others.items():
-        shares = summarize(compute_errors(sightings, locator), _measured(session)).shares
-        if shares is not None:
-            coverage[name] = asdict(shares)
-    return coverage
 
 
 def _repeatability(session: Session, nodes: Sequence[KnownSightings], locator: Locator) -> float:
@@ -225,6 +216,7 @@ def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--rendered-labs", type=int, default=3, help="of each scene with images")
     parser.add_argument("--lab-scene", default="", help="only scenes with this in their name")
     parser.add_argument("--models", default="", help=f"of {', '.join(CONTENDERS)}, separated by commas")
+    parser.add_argument("--coverage", action="store_true", help="only the statistics of the covariances")
     parser.add_argument("--picture", help="map of the errors in the first lab of the first scene")
 
 

@@ -66,6 +66,40 @@ def test_accuracy_of_calibrations_is_measured(tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_coverage_of_joint_covariances_is_measured(tmp_path: Path) -> None:
+    output = tmp_path / "results.json"
+    command = [sys.executable, "joint.py", "--coverage", "--smoke", "--lab-scene", "16 points"]
+    done = subprocess.run(
+        [*command, "-o", str(output)], cwd=BENCHMARKS, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert max(map(len, done.stdout.replace(str(output), "").splitlines())) <= 80
+    (labs,) = json.loads(output.read_text(encoding="utf-8"))["details"]["joint"].values()
+    assert [set(lab) for lab in labs] == [{"seed", "grid", "points", "drive", "clocks_s", "sources"}]
+    # The tape readings dominate.
+    assert 0.6 < labs[0]["sources"]["tape"] < 1
+    for place in ("grid", "points", "drive"):
+        assert 0 <= labs[0][place]["inside_68"] <= labs[0][place]["inside_95"] <= 1
+        assert 0 < labs[0][place]["nees"] < 10
+
+
+def test_table_of_coverage_has_means_over_labs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    coverage_table = importlib.import_module("joint_coverage").coverage_table
+    labs = []
+    for inside, error_s in ((0.5, 0.0003), (0.7, -0.0004)):
+        shares = {"inside_68": inside, "inside_95": inside, "nees": inside}
+        clocks_s = [(error_s, 0.0005)]
+        places = {"grid": shares, "points": shares, "drive": shares}
+        labs.append({**places, "clocks_s": clocks_s, "sources": {"tape": inside}})
+    lines = coverage_table("made up", labs).splitlines()
+    assert lines[0] == "made up, 2 labs"
+    assert lines[2].split() == ["grid", "60.0", "±", "10.0", "60.0", "±", "10.0", "0.60", "±", "0.10"]
+    assert lines[-2] == "  sources: tape 60 %"
+    # The ratio is that of sqrt((0.6^2 + 0.8^2) / 2).
+    assert lines[-1] == "  clocks: RMS error 0.354 ms, stated 0.500 ms, ratio 0.71"
+
+
 def test_corners_are_scored_against_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(BENCHMARKS)
     detection, scenes = importlib.import_module("detection"), importlib.import_module("scenes")

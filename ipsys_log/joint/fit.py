@@ -80,9 +80,10 @@ def fit_jointly(
     problem, state = _build(observations, settings, placed)
     if len(problem.trajectories.paths):
         # The wobble of a robot acts on its corners by the poses, so that these come first.
-        problem = problem.reweighted(state, settings.wobble_sigma_rad)
+        tilts = settings.wobble_sigma_rad, settings.wobble_time_s
+        problem = problem.reweighted(state, *tilts)
         state = solve(problem, state, progress, _ROUGH).state
-        problem = problem.reweighted(state, settings.wobble_sigma_rad)
+        problem = problem.reweighted(state, *tilts)
     if not problem.layout.floor.count or not settings.floor_sigma_spread:
         return _solve(observations, settings, problem, state, progress)
     fit = _solve(observations, settings, problem, state, progress, _NEAR)

@@ -70,12 +70,12 @@ class Problem:
         loss[bodies], weights[bodies] = robust_loss(residuals[bodies] ** 2, float(limit_of(1.0)))
         return residuals, loss, weights
 
-    def reweighted(self, state: State, tilt_sigma_rad: float) -> Problem:
+    def reweighted(self, state: State, tilt_sigma_rad: float, tilt_time_s: float) -> Problem:
         """Return the problem with the wobble of moving bodies in the covariances of their corners."""
         return replace(
             self,
             sightings=tuple(
-                factors.reweighted(state, self.layout, self.trajectories, tilt_sigma_rad)
+                factors.reweighted(state, self.layout, self.trajectories, tilt_sigma_rad, tilt_time_s)
                 if factors.kind is Kind.FLOOR
                 else factors
                 for factors in self.sightings

@@ -27,7 +27,9 @@ class JointSettings:
     clock_sigma_s : offset of the clock of a camera.
     row_time_sigma_s : time between two rows, where the rig does not have it.
     point_tilt_sigma_rad : tilt of a stationary marker about either axis.
-    wobble_sigma_rad : tilt of a moving marker about either axis.
+    wobble_sigma_rad, wobble_time_s : tilt of a moving marker about either axis, by the wobble of its robot
+        and the slope of the floor, and the correlation time of this tilt. Sightings within this time share
+        one tilt.
     scale_sigma : relative error of the printed size of a marker.
     robot_height_sigma_m : error of the height at which a robot carries its marker.
     acceleration_sigma, turn_sigma : usual acceleration of a robot, in m/s^2 and rad/s^2. They bridge gaps of
@@ -49,6 +51,7 @@ class JointSettings:
     row_time_sigma_s: float = 30e-6
     point_tilt_sigma_rad: float = 0.005
     wobble_sigma_rad: float = 0.004
+    wobble_time_s: float = 0.5
     scale_sigma: float = 0.003
     robot_height_sigma_m: float = 0.001
     acceleration_sigma: float = 3.0

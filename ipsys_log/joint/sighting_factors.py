@@ -187,12 +187,36 @@ class SightingFactors:
         return Slopes(pixels, by_pose.reshape(count, rows, 6), by_global.reshape(count, rows, -1))
 
     def reweighted(
-        self, state: State, layout: Layout, trajectories: Trajectories, tilt_sigma_rad: float
+        self,
+        state: State,
+        layout: Layout,
+        trajectories: Trajectories,
+        tilt_sigma_rad: float,
+        tilt_time_s: float,
     ) -> SightingFactors:
-        """Return these factors with the wobble of moving bodies as correlated noise of their points."""
+        """Return these factors with the tilts of moving bodies as noise of their points.
+
+        Sightings within the correlation time share one tilt, so an average over them does not reduce it.
+        White noise of a larger variance has the same effect on all unknowns that change slowly: the variance
+        of a tilt, times the sum of its correlations with all other sightings of the path.
+
+        Parameters
+        ----------
+        tilt_sigma_rad, tilt_time_s : standard deviation of the tilt about either axis, and the time t for
+            which the correlation after d seconds is exp(-d^2 / (2 t^2)).
+        """
         by_pose = self.slopes(self.place(state, layout, trajectories), state, layout).by_pose
-        tilts = tilt_sigma_rad * by_pose[:, :, 3:5]
+        tilts = tilt_sigma_rad * np.sqrt(self._sharing(tilt_time_s)) * by_pose[:, :, 3:5]
         return replace(self, whitening=_whitening(self.variances + tilts @ tilts.swapaxes(1, 2)))
+
+    def _sharing(self, tilt_time_s: float) -> float:
+        """Return how many sightings of a path share one tilt: at least 1."""
+        order = np.lexsort((self.sightings.times_s, self.trajectory))
+        intervals_s = np.diff(self.sightings.times_s[order])[np.diff(self.trajectory[order]) == 0]
+        if not len(intervals_s):
+            return 1.0
+        # The sum over a Gaussian correlation function is its integral, divided by the interval.
+        return max(1.0, float(np.sqrt(2 * np.pi) * tilt_time_s / np.median(intervals_s)))
 
     def _points(self, place: Placement, state: State, layout: Layout) -> tuple[Array, Array]:
         """Return the points in camera coordinates, and their arms in world axes, both (n, p, 3) in m."""

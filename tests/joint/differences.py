@@ -73,14 +73,24 @@ def jacobian_of(problem: Problem, state: State, function: Callable[[State], Arra
     return np.stack(columns, axis=1)
 
 
-def minimise(problem: Problem, start: State) -> State:
-    """Return the optimum by scipy's trust-region method, with derivatives by differences."""
+def minimise(problem: Problem, start: State, exact: bool = False) -> State:
+    """Return the optimum by scipy's trust-region method, with derivatives by differences.
+
+    ``exact`` derivatives are central differences: a drive has unknowns that its observations hardly determine.
+    """
     sizes = step_sizes(problem)
 
     def function(step: Array) -> Array:
         return residuals_of(problem, start.moved(problem.layout, *split_step(problem, step * sizes)))
 
     solved = least_squares(
-        function, np.zeros(len(sizes)), "2-point", xtol=1e-12, ftol=1e-14, gtol=1e-12, method="trf"
+        function,
+        np.zeros(len(sizes)),
+        "3-point" if exact else "2-point",
+        xtol=1e-12,
+        ftol=1e-14,
+        gtol=1e-12,
+        x_scale="jac" if exact else 1.0,
+        method="trf",
     )
     return start.moved(problem.layout, *split_step(problem, solved.x * sizes))

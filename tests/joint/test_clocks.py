@@ -13,6 +13,7 @@ from ipsys_log.messages import Markers, Measurement
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from tests.joint.test_drives import COARSE, observe
 
 
 def test_reference_clock_is_of_a_camera_that_saw_the_drive() -> None:
@@ -33,3 +34,18 @@ def test_reference_clock_is_of_a_camera_that_saw_the_drive() -> None:
     clocks_s = [model.clock_s for model in build_models(fit_jointly(observations)).values()]
     # All clocks of this lab agree.
     np.testing.assert_allclose(clocks_s, 0.0, atol=0.0005)
+
+
+def fit_clock(wobble_deg: float) -> tuple[float, float]:
+    """Return the clock offset of the second of two cameras, and its standard deviation, in s."""
+    lab = LabSettings(seed=3, rate_hz=10.0, drive_s=30.0, markers=1, cameras=("red", "white"))
+    # Exact corners: the wobble is the only difference between two labs of the same seed.
+    lab_settings = GeometricSettings(lab=lab, points=8, wobble_deg=wobble_deg, corner_noise=0.0)
+    fit = fit_jointly(observe(build_lab(lab_settings)), COARSE)
+    column = fit.problem.layout.cameras[1].edge + 1
+    return float(fit.state.values[column]), float(np.sqrt(fit.covariance[column, column]))
+
+
+def test_wobble_of_a_robot_does_not_move_its_clocks() -> None:
+    (level_s, sigma_s), (tilted_s, _) = fit_clock(0.0), fit_clock(0.1)
+    assert abs(tilted_s - level_s) < 0.1 * sigma_s

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,8 +16,11 @@ from ipsys_log.joint.model import build_models
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.solver import solve
+from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
+from ipsys_log.simulation.settings import LabSettings
 from tests.joint.differences import jacobian_of, minimise, residuals_of, split_step, step_sizes
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
+from tests.joint.test_drives import observe
 
 COARSE = JointSettings(floor_length_m=2.0)
 
@@ -84,6 +89,29 @@ def test_fit_agrees_with_scipy_from_another_start() -> None:
     for block in fit.problem.layout.cameras:
         here, there = (one.values[block.start + 3 : block.start + 6] for one in (fit.state, other))
         assert np.abs(here - there).max() < 1e-5
+
+
+def floor_maps_m(fit: JointFit, corners_px: Array) -> Array:
+    """Return the positions of the same markers by each camera, (c, n, 2)."""
+    count = len(corners_px)
+    rows = np.tile(1e-6 * np.eye(8), (count, 1, 1)), np.full(count, 0.1), np.full(count, LENGTH_M)
+    models = build_models(fit).values()
+    return np.stack([locate_markers(model, corners_px, *rows).points_m[:, :2] for model in models])
+
+
+@pytest.mark.slow
+def test_fit_of_a_drive_agrees_with_scipy_from_another_start() -> None:
+    lab = LabSettings(seed=3, rate_hz=5.0, drive_s=12.0, markers=1, cameras=("red", "white"))
+    settings = GeometricSettings(lab=lab, points=6, clock_offset_s=0.025, floor_rms_m=0.001)
+    fit = fit_jointly(observe(build_lab(settings)), COARSE)
+    assert len(fit.problem.trajectories.paths)
+    other = minimise(fit.problem, disturb(fit, 5, 0.3), exact=True)
+    centres_px = np.stack(np.meshgrid([600.0, 960.0, 1320.0], [350.0, 540.0, 730.0]), axis=-1).reshape(
+        -1, 1, 2
+    )
+    corners_px = centres_px + 58.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    again = replace(fit, solution=replace(fit.solution, state=other))
+    assert np.abs(floor_maps_m(again, corners_px) - floor_maps_m(fit, corners_px)).max() < 1e-5
 
 
 def test_fit_of_exact_observations_is_exact() -> None:

@@ -45,6 +45,7 @@ from ipsys_log.messages.models import (
 from ipsys_log.messages.rig import (
     CameraCalibration,
     Floor,
+    ReferenceMarker,
     ReferencePoint,
     Rig,
     RigCamera,
@@ -114,6 +115,7 @@ __all__ = [
     "Positions",
     "Quaternion",
     "RawImage",
+    "ReferenceMarker",
     "ReferencePoint",
     "Residual",
     "Rig",

@@ -41,6 +41,8 @@ _FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.1
 _DISPLACEMENT_SHARE = 0.01
 # Prior scales that are tried, in m on the floor.
 _SCALES_M = np.geomspace(1e-5, 1.0, 61)
+# The prior of the estimate is wider than that of the largest evidence: it draws a motion less to zero.
+_WIDER = 2.0
 _LEAST_HEIGHT_M = 0.5
 _STEPS = 5
 # Step of numeric slopes, in rad and in m.
@@ -207,7 +209,7 @@ def _fit(baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[i
         left = (moved_px - predicted_px + before_px).reshape(-1) + slopes @ motion
         rows, aims = np.linalg.solve(spread, slopes) * units, np.linalg.solve(spread, left)
         scale_m, evidence = _best_scale(rows, aims)
-        inner = np.linalg.inv(rows.T @ rows + np.eye(6) / scale_m**2)
+        inner = np.linalg.inv(rows.T @ rows + np.eye(6) / (_WIDER * scale_m) ** 2)
         motion = units * (inner @ (rows.T @ aims))
     residuals = aims - rows @ (motion / units)
     covariance = units[:, None] * inner * units

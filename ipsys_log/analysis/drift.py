@@ -39,8 +39,8 @@ LEAST_SHIFT_M = 0.0012
 _FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.1
 # Errors of the intrinsics and of the baseline poses change a displacement by this share.
 _DISPLACEMENT_SHARE = 0.01
-# Prior scales that are tried, in m on the floor.
-_SCALES_M = np.geomspace(1e-5, 1.0, 61)
+# Prior scales that are tried, in m on the floor. The least keeps the uncertainty of a still camera honest.
+_SCALES_M = np.geomspace(2e-4, 1.0, 38)
 # The prior of the estimate is wider than that of the largest evidence: it draws a motion less to zero.
 _WIDER = 2.0
 _LEAST_HEIGHT_M = 0.5

@@ -158,7 +158,9 @@ class _Search:
             return None
         baseline = self._segments[camera].baseline
         shifts = (_shift_m(baseline, window, camera, one) for one in baseline.corners)
-        if not any(shift is not None and np.linalg.norm(shift) > _EXAMINED * LEAST_SHIFT_M for shift in shifts):
+        if not any(
+            shift is not None and np.linalg.norm(shift) > _EXAMINED * LEAST_SHIFT_M for shift in shifts
+        ):
             return None
         return estimate_motion(baseline, window.corners[camera])
 
@@ -236,9 +238,7 @@ class _Search:
         segment = self._segments[camera]
         own = [w for w in log.windows if camera in w.corners and w.start_ns >= segment.start_ns]
         if own:
-            motion = estimate_motion(
-                self.drift.baselines[camera], average_windows(own[-_AVERAGED:], camera)
-            )
+            motion = estimate_motion(self.drift.baselines[camera], average_windows(own[-_AVERAGED:], camera))
             self.drift.states.append(CameraState(camera, log.name, own[-1].end_ns, motion))
 
 

@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 # A shift of the floor map below this mean is not reported: slow changes of light and temperature reach half
 # of it, and the smallest motion to find is 2 mm.
 LEAST_SHIFT_M = 0.0012
-# Standard deviations of a corner: noise of a frame; slow changes of each corner; slow changes that all corners
-# of a marker share (light); and those that all markers of a camera share (temperature).
+# Standard deviations of a corner: noise of a frame; slow changes of each corner; slow changes that all
+# corners of a marker share (light); and those that all markers of a camera share (temperature).
 _FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.1
 # Errors of the intrinsics and of the baseline poses change a displacement by this share.
 _DISPLACEMENT_SHARE = 0.01
@@ -92,7 +92,7 @@ class Motion:
 
     Attributes
     ----------
-    motion : (6,), turn about the camera's axes in rad and shift in the world in m, with ``covariance`` (6, 6).
+    motion, covariance : (6,) and (6, 6), turn about the camera's axes in rad, and shift in the world in m.
     mean_shift_m, sigma_m : mean length of the shift of the floor map, and its standard deviation.
     markers : ids of the markers behind the estimate.
     inconsistent : ids of markers that contradict the others: they have moved themselves.
@@ -266,7 +266,7 @@ def _best_scale(rows: Array, aims: Array) -> tuple[float, float]:
 def _mean_shift(baseline: Baseline, fit: _Fit) -> tuple[float, float]:
     """Return the mean length of the shift of the floor map and its standard deviation, in m.
 
-    Without a motion, the length has no slope: the standard deviation is then that of an axis of the mean shift.
+    Without a motion, the length has no slope: then the standard deviation is that of an axis of the mean.
     """
     shifts_m = shift_floor_map(baseline.camera, baseline.floor_m, fit.motion)
     slopes = np.stack(

@@ -61,9 +61,7 @@ def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) ->
             joint = restore_joint(camera)
             own = joint.calibration
             lens = replace(lens, distortion_model=own.distortion_model, K=own.K, D=own.D)
-            cameras[camera.camera] = FloorCamera(
-                camera.camera, lens, joint.camera_from_world, joint.origin_m
-            )
+            cameras[camera.camera] = FloorCamera(camera.camera, lens, joint.camera_from_world, joint.origin_m)
             continue
         world_m = np.array([pair.world_m for pair in camera.pairs]).reshape(-1, 3)
         camera_m = np.array([pair.camera_m for pair in camera.pairs]).reshape(-1, 3)
@@ -95,7 +93,7 @@ def floor_grid(camera: FloorCamera, floor: Floor | None) -> Array:
 
 
 def move_camera(camera: FloorCamera, motion: Array) -> FloorCamera:
-    """Return a camera after a motion (6,): a turn about its own axes in rad, and a shift in the world in m."""
+    """Return a camera after a motion (6,): a turn about its axes in rad, and a shift in the world in m."""
     turned = rotation(motion[:3]) @ camera.camera_from_world
     return replace(camera, camera_from_world=turned, origin_m=camera.origin_m + motion[3:])
 

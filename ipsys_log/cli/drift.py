@@ -27,13 +27,16 @@ Baseline = Annotated[
 ModelLog = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option(
-        "--model-from", metavar="LOG", help="The log with the fitted model. Default: the baseline, if it has one."
+        "--model-from",
+        metavar="LOG",
+        help="The log with the fitted model. Default: the baseline, if it has one.",
     ),
 ]
 Fix = Annotated[
     bool,
     typer.Option(
-        "--fix", help="Append the joint model with the new poses of the moved cameras to the last log, as a new run."
+        "--fix",
+        help="Append the joint model with the new poses of the moved cameras to the last log, as a new run.",
     ),
 ]
 Plot = Annotated[
@@ -57,8 +60,8 @@ def drift(
 ) -> None:
     """Show which camera moved, when, and by how much its positions are wrong since then.
 
-    The command compares the corners of reference markers, which are fixed to the floor or to a wall, in logs
-    of weeks. The rig lists them as [[reference_markers]]. A mean shift of the floor map from 2 mm on is found.
+    The command compares reference markers, which are fixed to the floor or to a wall, in logs of weeks. The
+    rig lists them as [[reference_markers]]. It finds a mean shift of the floor map from 2 mm on.
     """
     from ipsys_log.extras import check_installed
     from ipsys_log.report.drift import read_drift
@@ -95,12 +98,10 @@ def _fix(reading: DriftReading) -> str | None:
     ends_ns = [state.time_ns for camera in moved for state in reading.drift.of_camera(camera)]
     steps_ns = [move.after_ns for move in reading.drift.moves if move.camera in moved]
     valid_from_ns = max(steps_ns, default=max(ends_ns))
-    run = append_mended_model(
-        reading.paths[-1], reading.source, reading.paths[0], changes, valid_from_ns
-    )
+    run = append_mended_model(reading.paths[-1], reading.source, reading.paths[0], changes, valid_from_ns)
     say(
-        f"{reading.paths[-1]}: run {run} has the model with the new poses of {', '.join(changes)}; use it with "
-        f"--model-from {reading.paths[-1]} --model joint"
+        f"{reading.paths[-1]}: run {run} has the model with the new poses of {', '.join(changes)}; to use it: "
+        f"ipsys live --model-from {reading.paths[-1]} --model joint"
     )
     return run
 

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, Mat34, TimeNs
 
-__all__ = ["CameraCalibration", "Floor", "ReferenceMarker", "ReferencePoint", "Rig", "RigCamera", "RigMarker", "RigStream"]
+__all__ = [
+    "CameraCalibration",
+    "Floor",
+    "ReferenceMarker",
+    "ReferencePoint",
+    "Rig",
+    "RigCamera",
+    "RigMarker",
+    "RigStream",
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, Move, find_drift
+from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, MarkerMove, Move, find_drift
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Motion
 from ipsys_log.analysis.floor_cameras import FloorCamera, read_floor_cameras
 from ipsys_log.analysis.reference_markers import image_sizes, read_windows
@@ -82,7 +82,11 @@ def read_drift(
     starts_ns = {path: _start_ns(path) for path in dict.fromkeys([*paths, *([baseline] if baseline else [])])}
     first = baseline or min(starts_ns, key=starts_ns.__getitem__)
     order = sorted(starts_ns, key=lambda path: (path != first, starts_ns[path]))
-    remarks = [f"{path}: is older than the baseline; it is left out" for path in order if starts_ns[path] < starts_ns[first]]
+    remarks = [
+        f"{path}: is older than the baseline; it is left out"
+        for path in order
+        if starts_ns[path] < starts_ns[first]
+    ]
     order = [path for path in order if starts_ns[path] >= starts_ns[first]]
     logs, read, lab = [], [], None
     for number, path in enumerate(order):
@@ -130,8 +134,8 @@ def _read_log(path: Path, rig: Rig | None) -> _Log:
         rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
         if not rigs or not rigs[-1].reference_markers:
             raise IpsysError(
-                f"{path}: its rig has no reference markers; fix markers to the floor, add [[reference_markers]] "
-                "with their ids to lab.toml, and give --rig lab.toml for logs of an older rig"
+                f"{path}: its rig has no reference markers; fix markers to the floor, add "
+                "[[reference_markers]] with their ids to lab.toml, and give --rig lab.toml for older logs"
             )
         run = newest_run(session, MARKERS)
         if run is None:
@@ -162,9 +166,7 @@ def _check_same(log: _Log, first: _Log) -> None:
             )
 
 
-def _cameras(
-    paths: Sequence[Path], until_ns: int
-) -> tuple[str, tuple[Path, str], dict[str, FloorCamera]]:
+def _cameras(paths: Sequence[Path], until_ns: int) -> tuple[str, tuple[Path, str], dict[str, FloorCamera]]:
     """Return the name and the source of the first model with camera poses, and its cameras."""
     for path in paths:
         with Session([path]) as session:
@@ -182,15 +184,18 @@ def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
     """Return the result as sentences, each with a mark whether it is good."""
     drift = reading.drift
     lines = [line for move in drift.moves for line in _move_lines(move)]
-    lines += [
-        (f"Reference marker {move.marker_id} was moved at about {format_time(move.time_ns)[:19]} UTC ({move.log}). "
-         "It is used again from its new place.", False)
-        for move in drift.marker_moves
-    ]  # fmt: skip
+    lines += [(_marker_line(move), False) for move in drift.marker_moves]
     if not lines:
         least_mm = LEAST_SHIFT_M * MM_PER_M
         lines = [(f"No camera has moved: the mean shift of each floor map is below {least_mm:.1f} mm.", True)]
     return lines
+
+
+def _marker_line(move: MarkerMove) -> str:
+    return (
+        f"Reference marker {move.marker_id} was moved at about {format_time(move.time_ns)[:19]} UTC "
+        f"({move.log}). It is used again from its new place."
+    )
 
 
 def _move_lines(move: Move) -> list[tuple[str, bool]]:
@@ -282,7 +287,8 @@ def drift_json(reading: DriftReading) -> dict[str, Any]:
             for move in drift.moves
         ],
         "marker_moves": [
-            {"marker": move.marker_id, "log": move.log, "time_ns": move.time_ns} for move in drift.marker_moves
+            {"marker": move.marker_id, "log": move.log, "time_ns": move.time_ns}
+            for move in drift.marker_moves
         ],
         "states": [
             {"camera": s.camera, "log": s.log, "time_ns": s.time_ns}

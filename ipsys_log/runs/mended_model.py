@@ -74,8 +74,8 @@ def append_mended_model(
         foreign = read_channels(before, [topic])
     if not reads_corners(model.name):
         raise IpsysError(
-            f"{log}: its model {model.name} has no camera poses to correct; measure some points again and fit "
-            "it, or use the model joint (ipsys calibrate-lab)"
+            f"{log}: its model {model.name} has no camera poses to correct; measure some points again and "
+            "fit it, or use the model joint (ipsys calibrate-lab)"
         )
     with Session([baseline]) as first:
         reference = read_channels(first, first.topics(MARKERS, newest_run(first, MARKERS)))
@@ -106,4 +106,3 @@ def append_mended_model(
     message = Message(MODEL.topic_of(name), log_time_ns, time_ns, mended)
     append_run(target, replace(record, run=name), log_time_ns, lambda: [message], {})
     return name
-

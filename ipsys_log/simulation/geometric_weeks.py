@@ -146,9 +146,7 @@ def simulate_week(lab: GeometricLab, settings: WeekSettings, week: int) -> Itera
         time_ns = start_ns + NS_PER_S + round(frame * NS_PER_S / settings.rate_hz)
         for number, view in enumerate(views):
             name = lab.cameras[number].name
-            markers = Markers(
-                time_ns, view.markers(frame), lab.settings.lab.width, lab.settings.lab.height
-            )
+            markers = Markers(time_ns, view.markers(frame), lab.settings.lab.width, lab.settings.lab.height)
             log_ns = time_ns + _LATENCY_NS + number
             yield Message(MARKERS.topic_of(MARKERS_RUN, name), log_ns, time_ns, markers, name)
     run = Run(time_ns, MARKERS_RUN, IMPORTED, {"format": "geometric_lab"})

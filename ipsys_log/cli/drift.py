@@ -100,8 +100,8 @@ def _fix(reading: DriftReading) -> str | None:
     valid_from_ns = max(steps_ns, default=max(ends_ns))
     run = append_mended_model(reading.paths[-1], reading.source, reading.paths[0], changes, valid_from_ns)
     say(
-        f"{reading.paths[-1]}: run {run} has the model with the new poses of {', '.join(changes)}; to use it: "
-        f"ipsys live --model-from {reading.paths[-1]} --model joint"
+        f"{reading.paths[-1]}: run {run} has the model with the new poses of {', '.join(changes)}; to use "
+        f"it: ipsys live --model-from {reading.paths[-1]} --model joint"
     )
     return run
 

@@ -112,13 +112,18 @@ class Rig:
     stream: RigStream | None = None
     reference_markers: tuple[ReferenceMarker, ...] = ()
 
+    @property
+    def all_markers(self) -> tuple[RigMarker | ReferenceMarker, ...]:
+        """The markers of the robots, and the reference markers."""
+        return (*self.markers, *self.reference_markers)
+
     def camera(self, name: str) -> RigCamera:
         """Return the entry of a camera; an empty entry for a camera that is not in the rig."""
         return next((camera for camera in self.cameras if camera.name == name), RigCamera(name))
 
     def length_of(self, marker_id: int) -> float:
         """Return the side of a marker's black square, in m."""
-        for marker in (*self.markers, *self.reference_markers):
+        for marker in self.all_markers:
             if marker.id == marker_id and marker.length_m is not None:
                 return marker.length_m
         return self.marker_length_m
@@ -151,8 +156,7 @@ class Rig:
 
     def knows(self, marker_id: int) -> bool:
         """Return whether an id is in use: it is listed, or the rig lists no markers of robots."""
-        listed = (*self.markers, *self.reference_markers)
-        return not self.markers or any(marker.id == marker_id for marker in listed)
+        return not self.markers or any(marker.id == marker_id for marker in self.all_markers)
 
     def is_reference(self, marker_id: int) -> bool:
         """Return whether a marker is fixed to the floor or to a wall."""

@@ -256,13 +256,13 @@ def check_rig(rig: Rig, where: str) -> Rig:
         if marker.robot is not None:
             check_name(marker.robot, f"{where}: robot name")
     _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
-    ids = (marker.id for marker in (*rig.markers, *rig.reference_markers))
+    ids = (marker.id for marker in rig.all_markers)
     _check_unique(ids, f"{where}: two markers have the id")
     _check_unique(
         (marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers have the robot"
     )
     _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
-    markers = (*rig.markers, *rig.reference_markers)
+    markers = rig.all_markers
     lengths = [rig.marker_length_m, *(m.length_m for m in markers if m.length_m is not None)]
     if rig.floor is not None:
         lengths += [rig.floor.width_m, rig.floor.depth_m]

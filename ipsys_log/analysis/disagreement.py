@@ -3,8 +3,8 @@
 For a robot that two cameras see, it is the difference of their positions at one instant. Cameras are seldom
 in step. So the position of one camera is interpolated on a straight line between its sightings before and
 after the instant, at most 0.3 s apart. At 0.26 m/s on a bend with a radius of 0.3 m, a line of 0.1 s is wrong
-by 0.3 mm at most, and a line of 0.3 s by 2.5 mm (v^2 t^2 / 8 r). An error that both cameras share is not in the
-disagreement.
+by 0.3 mm at most, and a line of 0.3 s by 2.5 mm (v^2 t^2 / 8 r). The disagreement does not contain an error
+that both cameras share.
 """
 
 from __future__ import annotations

@@ -47,9 +47,9 @@ _LEAST_HEIGHT_M = 0.5
 _STEPS = 5
 # Step of numeric slopes, in rad and in m.
 _SMALL = 1e-6
-# Twice the gain of the logarithm of the evidence by a motion. It is below this by chance in all but one of
-# 100,000 cases.
-_SURE = 20.0
+# Twice the gain of the logarithm of the evidence by a motion: 6 is strong, 10 is very strong (Kass and
+# Raftery, Bayes factors, JASA 1995).
+_SURE = 8.0
 # Residuals of consistent markers exceed their expectation by less than this many standard deviations.
 _CONSISTENT = 8.0
 # Markers for the split into turn and shift, and their least spread: the second singular value of the

@@ -3,8 +3,8 @@
     python benchmarks/drift.py                    # 20 labs for each size, 100 undisturbed logs
     python benchmarks/drift.py --labs 5 --logs 20
 
-Each lab has other cameras, and one of them is knocked before week 5 of 8, by a random turn and shift of a given
-size on the floor. The cameras warm up by 0.2 px, and the light changes. Poses and intrinsics are known
+Each lab has other cameras, and one of them is knocked before week 5 of 8, by a random turn and shift of a
+given size on the floor. The cameras warm up by 0.2 px, and the light changes. Poses and intrinsics are known
 exactly: an error of the calibration has no effect on a difference. The script prints a table.
 """
 

@@ -222,7 +222,7 @@ def _in_order(positions: CameraPositions, marker_id: int) -> CameraPositions:
 
 
 def _squares(differences_m: Array, covariances_m2: Array) -> Array:
-    known = np.isfinite(covariances_m2).all(axis=(1, 2))
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(covariances_m2).all(axis=(1, 2)))
     known &= np.linalg.det(np.where(known[:, None, None], covariances_m2, np.eye(2))) > 0
     squares = np.full(len(differences_m), np.nan)
     scaled = np.linalg.solve(covariances_m2[known], differences_m[known][..., None])[..., 0]

@@ -45,14 +45,14 @@ def draw_drift(reading: DriftReading, path: Path) -> None:
         moment = datetime.fromtimestamp(move.after_ns / NS_PER_S, UTC)
         axes.axvline(moment, color=styles[move.camera][0], ls=":", lw=1.4)  # type: ignore[arg-type]
         axes.annotate(
-            f"{shorten(move.camera)} moved", (moment, 1.0), (3, -4), xycoords=("data", "axes fraction"),  # type: ignore[arg-type]
+            f"{shorten(move.camera)} moved", (moment, 1.0), (3, -4), xycoords=("data", "axes fraction"),
             textcoords="offset points", va="top", ha="left", rotation=90, fontsize=8,
         )  # fmt: skip
     least_mm = LEAST_SHIFT_M * MM_PER_M
     axes.axhline(least_mm, color=NOTE, lw=1, ls="--", label=f"least reported shift, {least_mm:.1f} mm")
-    locator = AutoDateLocator()
+    locator = AutoDateLocator()  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
-    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     axes.set(ylabel="mean shift of the floor map in mm", ylim=(0, None))
     axes.set_title(
         f"Drift of the cameras since {shorten(reading.paths[0].name)}; bands: 95 %", loc="left", fontsize=11

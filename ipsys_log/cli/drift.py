@@ -61,7 +61,7 @@ def drift(
     """Show which camera moved, when, and by how much its positions are wrong since then.
 
     The command compares reference markers, which are fixed to the floor or to a wall, in logs of weeks. The
-    rig lists them as [[reference_markers]]. It finds a mean shift of the floor map from 2 mm on.
+    rig lists them under reference_markers. It finds a mean shift of the floor map from 2 mm on.
     """
     from ipsys_log.extras import check_installed
     from ipsys_log.report.drift import read_drift

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 LEAST_SHIFT_M = 0.0012
 # Standard deviations of a corner: noise of a frame; slow changes of each corner; slow changes that all
 # corners of a marker share (light); and those that all markers of a camera share (temperature).
-_FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.1
+_FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.06
 # Errors of the intrinsics and of the baseline poses change a displacement by this share.
 _DISPLACEMENT_SHARE = 0.01
 # Prior scales that are tried, in m on the floor. The least keeps the uncertainty of a still camera honest.

@@ -63,13 +63,11 @@ def drift(
     The command compares reference markers, which are fixed to the floor or to a wall, in logs of weeks. The
     rig lists them under reference_markers. It finds a mean shift of the floor map from 2 mm on.
     """
-    from ipsys_log.extras import check_installed
     from ipsys_log.report.drift import read_drift
     from ipsys_log.report.files import check_figure_file
     from ipsys_log.rig.file import load_rig
 
     if plot is not None:
-        check_installed("--plot needs", "matplotlib")
         check_figure_file(plot, "--plot", logs)
     lab = load_rig(rig) if rig is not None else None
     with progress_bar(lambda _: False) as progress:

@@ -17,7 +17,7 @@ from ipsys_log.analysis.disagreement import (
     divide_time,
     read_disagreement,
 )
-from ipsys_log.analysis.overlap_stream import OverlapStream
+from ipsys_log.analysis.overlap_stream import OverlapStream, OverlapSummary
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     IMPORTED,
@@ -139,6 +139,14 @@ def test_log_and_stream_have_the_same_differences(log: Path) -> None:
     middle_m = np.median([(one.x_m, one.y_m) for one in live], axis=0)
     assert middle_m == pytest.approx(np.median(pair.differences_m, axis=0), abs=SAGITTA_M)
     assert middle_m == pytest.approx([0.003, -0.001], abs=SAGITTA_M)
+
+
+def test_display_has_one_line_for_each_pair() -> None:
+    summary = OverlapSummary()
+    rig = Rig("lab", "DICT_4X4_100", 0.2, reference_markers=(ReferenceMarker(90),))
+    for message in [Message("/rig", 0, 0, rig), *messages(STEP_NS // 3)]:
+        summary(message)
+    assert summary.lines() == ["positions of cameras a and b differ by 3.2 mm (median), 3.2 mm (p95)"]
 
 
 def test_info_shows_the_disagreement(log: Path, ipsys: Any) -> None:

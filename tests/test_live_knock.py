@@ -38,7 +38,8 @@ def knocked_frames(frame: bytes) -> list[bytes]:
 @pytest.fixture(scope="module")
 def recorded(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """Return a live recording of one camera with reference markers, and the printed lines."""
-    target, said = tmp_path_factory.mktemp("knock") / "live.mcap", []
+    said: list[str] = []
+    target = tmp_path_factory.mktemp("knock") / "live.mcap"
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
     rig = replace(rig, markers=(), reference_markers=tuple(ReferenceMarker(n) for n in range(8)))

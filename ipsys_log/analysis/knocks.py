@@ -137,15 +137,18 @@ class KnockMonitor:
 
     def _shift_m(self, marker_id: int, history: _History) -> float:
         """Return the motion of a marker in the image in m at its distance; 0 if it is not certain."""
+        newest, oldest = (history.rows[n][1].reshape(4, 2) for n in (-1, 0))
+        sides_px = np.hypot(*(newest[[1, 2, 3, 0]] - newest).T)
+        scale = self._rig.length_of(marker_id) / float(sides_px.max())
+        # Medians take ten times as long, and nearly all frames show a still marker.
+        if scale * float(np.hypot(*(newest - oldest).mean(axis=0))) < _LEAST_MARKER_M / 2:
+            return 0.0
         change = history.change()
         if change is None:
             return 0.0
-        corners = np.median([value for _, value in history.rows], axis=0).reshape(4, 2)
-        side_px = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).max())
         shift_px, spread_px = change[0].reshape(4, 2).mean(axis=0), float(change[1].max())
         length_px = float(np.linalg.norm(shift_px))
-        is_certain = length_px > _SPREADS * spread_px / np.sqrt(_RECENT)
-        return self._rig.length_of(marker_id) * length_px / side_px if is_certain else 0.0
+        return scale * length_px if length_px > _SPREADS * spread_px / np.sqrt(_RECENT) else 0.0
 
     def _is_seen_moving(self, camera: str, marker_id: int) -> bool:
         """Return whether another camera sees the marker move."""

@@ -165,7 +165,7 @@ def _errors_mm(log: Path) -> float:
         0.2,
     )
 
-    def locate(_camera: str, px: Any, heights_m: Any, _covariances: Any = None) -> tuple[Any, None]:
+    def locate(camera: str, corners_px: Any, heights_m: Any, covariances_px2: Any = None) -> tuple[Any, None]:  # noqa: ARG001
         covariances = np.tile(1e-4 * np.eye(8), (len(px), 1, 1))
         return locate_markers(joint, px, covariances, heights_m, np.full(len(px), 0.2)).points_m, None
 

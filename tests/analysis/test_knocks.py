@@ -117,7 +117,7 @@ def test_slow_warming_is_no_knock() -> None:
     assert warnings(frames(warming, 20.0)) == []
 
 
-def test_overlap_names_a_knocked_camera_without_reference_markers() -> None:
+def test_overlap_names_a_knocked_camera_without_references() -> None:
     def turned(camera: str, time_s: float) -> Array:
         return np.array([0.0, 0.0175, 0, 0, 0, 0]) * (camera == "white" and time_s >= AT_S)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, shift_floor_map
 from ipsys_log.analysis.floor_error import compute_errors, grid_nodes
@@ -31,6 +32,8 @@ from ipsys_log.simulation.geometric_weeks import (
 )
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
+
+Array = NDArray[np.float64]
 
 KNOCK = Knock("white", 5, (0.0010, 0.0020, 0.0003), (0.001, 0.0, 0.0))
 WEEKS = WeekSettings(duration_s=3.0, knocks=(KNOCK,))
@@ -165,9 +168,13 @@ def _errors_mm(log: Path) -> float:
         0.2,
     )
 
-    def locate(camera: str, corners_px: Any, heights_m: Any, covariances_px2: Any = None) -> tuple[Any, None]:  # noqa: ARG001
-        covariances = np.tile(1e-4 * np.eye(8), (len(px), 1, 1))
-        return locate_markers(joint, px, covariances, heights_m, np.full(len(px), 0.2)).points_m, None
+    def locate(
+        camera: str, corners_px: Array, heights_m: Array, covariances_px2: Array | None = None
+    ) -> tuple[Array, None]:
+        assert (camera, covariances_px2) == (KNOCK.camera, None)
+        covariances = np.tile(1e-4 * np.eye(8), (len(corners_px), 1, 1))
+        sides_m = np.full(len(corners_px), 0.2)
+        return locate_markers(joint, corners_px, covariances, heights_m, sides_m).points_m, None
 
     (errors,) = compute_errors([nodes], locate)
     return 1000 * float(np.nanmean(np.linalg.norm(errors.errors_m, axis=1)))

@@ -91,7 +91,7 @@ def test_reference_markers_get_no_camera_points() -> None:
     assert seen == [[0], []]
 
 
-def test_simulated_week_is_the_same_again_and_differs_from_the_next() -> None:
+def test_simulated_week_is_repeatable_and_weeks_differ() -> None:
     lab = build_lab(GeometricSettings(lab=LabSettings(seed=3, drive_s=0.0, markers=1), points=1))
     settings = WeekSettings(duration_s=0.3)
     weeks = [[encode(m.payload) for m in simulate_week(lab, settings, week)] for week in (1, 1, 2)]

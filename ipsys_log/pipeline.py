@@ -37,6 +37,7 @@ from pathlib import Path
 from ipsys_log.analysis.latency import Ledger
 from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.frames import SourceError
+from ipsys_log.capture.knock_events import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
@@ -262,7 +263,7 @@ def live(
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
     with (
-        Consumers(consumers, cameras.add_event, sinks) as show,
+        Consumers([KnockEvents(cameras), *consumers], cameras.add_event, sinks) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         Backlog(cameras, log, cameras.now_ns) as frames,

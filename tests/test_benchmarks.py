@@ -228,3 +228,14 @@ def test_live_keeps_what_it_measured_before_a_failure(
     assert [row.values for row in report.rows] == [(6,)]
     assert report.remarks == ["9 cameras: ipsys record ended with 1: camera red_7: refuses the connection"]
     assert report.failed
+
+
+@pytest.mark.slow
+def test_drift_benchmark_finds_a_large_knock() -> None:
+    command = [sys.executable, "drift.py", "--labs", "1", "--logs", "3", "--sizes-mm", "5"]
+    done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == "3 undisturbed logs: 0 false alarms"
+    assert "1 of 1" in lines[-1]
+    assert max(map(len, lines)) <= 80

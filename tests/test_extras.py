@@ -114,6 +114,7 @@ REFUSED = {
         f"{command} --plot x.png": "--plot needs Matplotlib: pip install 'ipsys_log[report]'"
         for command in (
             *("replay lab.mcap", "plan lab.mcap", "align lab.mcap", "latency lab.mcap"),
+            "drift lab.mcap",
             *("calibrate lab.mcap --board 6x4", "calibrate --rig lab.toml --board 6x4"),
         )
     },

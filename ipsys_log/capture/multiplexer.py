@@ -191,10 +191,13 @@ class LiveCameras:
                     saving.confirmed, saving.fault = True, fault
             self._arrived.notify_all()
 
-    def add_event(self, kind: str, text: str) -> None:
-        """Append an event without a camera, and show its text at once; after the end, only show the text."""
+    def add_event(self, kind: str, text: str, camera: str | None = None) -> None:
+        """Append an event, and show its text at once; after the end, only show the text.
+
+        ``camera`` is the camera that the event speaks of.
+        """
         with suppress(SourceError):
-            self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
+            self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text, camera))
         self.say(text)
 
     def now_ns(self) -> int:

@@ -15,6 +15,7 @@ from ipsys_log.cli import (
     calibrate_lab,
     cameras,
     compare,
+    drift,
     export,
     imports,
     inspect,
@@ -38,8 +39,11 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure"),
         *("calibrate-lab", "replay", "live"),
     ),
-    "Accuracy, and the next points to measure": ("evaluate", "plan", "report"),
-    "Inspect a log": (*("info", "runs", "view", "export", "stream", "verify", "diff", "latency", "repair"),),
+    "Accuracy, and the next points to measure": ("evaluate", "plan", "report", "drift"),
+    "Inspect a log": (
+        *("info", "runs", "view", "export", "stream"),
+        *("verify", "diff", "latency", "repair"),
+    ),
     _STAGES: (),
     "Without cameras": ("simulate", "import"),
 }
@@ -114,6 +118,11 @@ ipsys plan calibration.mcap --places 5 --plot next.png
 """,
     "report": """
 ipsys report calibration.mcap                      # calibration.html
+""",
+    "drift": """
+ipsys drift week*.mcap --plot drift.png            # which camera moved?
+ipsys drift week*.mcap --model-from calibration.mcap --rig lab.toml
+ipsys drift week*.mcap --fix                       # correct its pose
 """,
     "info": """
 ipsys info monday.mcap
@@ -197,7 +206,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, inspect, export, stream, compare),
+    *(plan, drift, inspect, export, stream, compare),
 )
 for module in _MODULES:
     module.add_commands(app)

@@ -123,7 +123,7 @@ def _marker_prints(
 
     lab = _lab(rig, length, dictionary)
     wanted = None if ids is None else _parse_ids(ids, lab.dictionary)
-    if wanted is None and not lab.markers:
+    if wanted is None and not (lab.markers or lab.reference_markers):
         raise IpsysError(f"{rig}: has no [[markers]]; give ids, such as --ids 0-9")
     return rig_prints(lab, wanted, length)
 

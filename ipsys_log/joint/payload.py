@@ -12,7 +12,7 @@ from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Pair, Parameter
 
-__all__ = ["JOINT", "joint_payload", "restore_joint"]
+__all__ = ["JOINT", "joint_payload", "restore_joint", "store_joint"]
 
 # The name of the model in commands and logs.
 JOINT = "joint"
@@ -22,14 +22,17 @@ _LENSES = {count: name for name, count in DISTORTION_MODELS.items()}
 
 def joint_payload(fit: JointFit, pairs: Mapping[str, Sequence[Pair]], time_ns: int) -> Model:
     """Return the payload of a joint calibration, with the calibration points that each camera saw."""
-    cameras = []
-    for camera, model in build_models(fit).items():
-        stored = tuple(
-            Parameter(name, array.shape, array.reshape(-1))
-            for name, array in sorted(model.to_arrays().items())
-        )
-        cameras.append(CameraModel(camera, stored, pairs=tuple(pairs.get(camera, ()))))
+    cameras = [
+        CameraModel(camera, store_joint(model), pairs=tuple(pairs.get(camera, ())))
+        for camera, model in build_models(fit).items()
+    ]
     return Model(time_ns, JOINT, tuple(cameras))
+
+
+def store_joint(model: JointModel) -> tuple[Parameter, ...]:
+    """Return the parameters of the payload of a camera's model, sorted by name."""
+    arrays = sorted(model.to_arrays().items())
+    return tuple(Parameter(name, array.shape, array.reshape(-1)) for name, array in arrays)
 
 
 def restore_joint(camera: CameraModel) -> JointModel:

@@ -14,7 +14,7 @@ from ipsys_log.messages.channels import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.messages.events import FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
+from ipsys_log.messages.events import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
 from ipsys_log.messages.images import (
     Color,
     CompressedImage,
@@ -45,6 +45,7 @@ from ipsys_log.messages.models import (
 from ipsys_log.messages.rig import (
     CameraCalibration,
     Floor,
+    ReferenceMarker,
     ReferencePoint,
     Rig,
     RigCamera,
@@ -64,6 +65,7 @@ from ipsys_log.messages.tracks import (
 )
 
 __all__ = [
+    "CAMERA_MOVED",
     "EVENTS_TOPIC",
     "FRAME_SKIPPED",
     "IMPORTED",
@@ -114,6 +116,7 @@ __all__ = [
     "Positions",
     "Quaternion",
     "RawImage",
+    "ReferenceMarker",
     "ReferencePoint",
     "Residual",
     "Rig",

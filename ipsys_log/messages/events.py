@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["FRAME_SKIPPED", "STAMP_UNRELIABLE", "Event", "Latency"]
+__all__ = ["CAMERA_MOVED", "FRAME_SKIPPED", "STAMP_UNRELIABLE", "Event", "Latency"]
 
 # The kind of an event whose timestamp is the log time of a frame that live processing skipped.
 FRAME_SKIPPED = "frame_skipped"
 # The kind of an event for late frames of a camera; these frames have their time of arrival.
 STAMP_UNRELIABLE = "stamp_unreliable"
+# The kind of an event for a camera that was knocked during a live recording.
+CAMERA_MOVED = "camera_moved"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, Mat34, TimeNs
 
-__all__ = ["CameraCalibration", "Floor", "ReferencePoint", "Rig", "RigCamera", "RigMarker", "RigStream"]
+__all__ = [
+    "CameraCalibration",
+    "Floor",
+    "ReferenceMarker",
+    "ReferencePoint",
+    "Rig",
+    "RigCamera",
+    "RigMarker",
+    "RigStream",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +61,14 @@ class ReferencePoint:
 
 
 @dataclass(frozen=True, slots=True)
+class ReferenceMarker:
+    """A marker that is fixed to the floor or to a wall: it shows that a camera has moved."""
+
+    id: int
+    length_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Floor:
     width_m: float
     depth_m: float
@@ -93,6 +110,12 @@ class Rig:
     tape_sigma_m: float | None = None
     marker_height_sigma_m: float | None = None
     stream: RigStream | None = None
+    reference_markers: tuple[ReferenceMarker, ...] = ()
+
+    @property
+    def all_markers(self) -> tuple[RigMarker | ReferenceMarker, ...]:
+        """The markers of the robots, and the reference markers."""
+        return (*self.markers, *self.reference_markers)
 
     def camera(self, name: str) -> RigCamera:
         """Return the entry of a camera; an empty entry for a camera that is not in the rig."""
@@ -100,13 +123,18 @@ class Rig:
 
     def length_of(self, marker_id: int) -> float:
         """Return the side of a marker's black square, in m."""
-        for marker in self.markers:
+        for marker in self.all_markers:
             if marker.id == marker_id and marker.length_m is not None:
                 return marker.length_m
         return self.marker_length_m
 
     def height_of(self, marker_id: int) -> float | None:
-        """Return the height above the floor at which a robot carries a marker, in m; None if unknown."""
+        """Return the height above the floor at which a robot carries a marker, in m; None if unknown.
+
+        No robot carries a reference marker: its height is 0.
+        """
+        if self.is_reference(marker_id):
+            return 0.0
         for marker in self.markers:
             if marker.id == marker_id and marker.height_m is not None:
                 return marker.height_m
@@ -127,8 +155,12 @@ class Rig:
         return f"marker_{marker_id}"
 
     def knows(self, marker_id: int) -> bool:
-        """Return whether an id is in use: it is listed, or the rig lists no markers."""
-        return not self.markers or any(marker.id == marker_id for marker in self.markers)
+        """Return whether an id is in use: it is listed, or the rig lists no markers of robots."""
+        return not self.markers or any(marker.id == marker_id for marker in self.all_markers)
+
+    def is_reference(self, marker_id: int) -> bool:
+        """Return whether a marker is fixed to the floor or to a wall."""
+        return any(marker.id == marker_id for marker in self.reference_markers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

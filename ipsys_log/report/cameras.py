@@ -15,6 +15,7 @@ from rich.text import Text
 
 from ipsys_log.analysis.differences import Comparison
 from ipsys_log.analysis.latency import Percentiles
+from ipsys_log.analysis.overlap_stream import OverlapSummary
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
@@ -62,11 +63,15 @@ class LiveStatus:
         self._before: dict[str, tuple[float, int, int]] = {}
         self._rates: dict[str, tuple[float, float]] = {}
         self._tracks: dict[str, Track] = {}
+        self._overlap = OverlapSummary()
 
     def __call__(self, message: Message | None) -> None:
         """Handle one recorded message."""
         self._monitor(message)
-        if message is not None and isinstance(message.payload, Tracks):
+        if message is None:
+            return
+        self._overlap(message)
+        if isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
 
     def show(self) -> Group:
@@ -77,6 +82,7 @@ class LiveStatus:
         parts: list[Table | Text] = [cameras_table(self._states, self._monitor.checks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
+        parts += [Text(line) for line in self._overlap.lines()]
         # As Text: rich would read brackets in a plain string as its markup.
         parts += [Text(line, style="yellow") for line in self._warnings()]
         parts.append(self._disk(now_s - self._begin_s))
@@ -106,7 +112,7 @@ class LiveStatus:
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
             missed = f", {state.missed} lost before arrival" if state.missed else ""
             lines.append(f"camera {name}: {state.frames} frames{dropped}{missed}")
-        return lines + self._warnings()
+        return lines + self._overlap.lines() + self._warnings()
 
     def _rate(self, name: str, state: CameraState, now_s: float) -> tuple[float, float]:
         before_s, frames, size = self._before.get(name, (self._begin_s, 0, 0))

@@ -10,20 +10,24 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
 from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
+from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.plain_text import plain_text
+from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.survey.from_log import FinishedLog
-from ipsys_log.units import NS_PER_S, format_bytes, format_time
+from ipsys_log.units import MM_PER_M, NS_PER_S, format_bytes, format_time
 
 __all__ = [
     "contents_json",
     "contents_tables",
     "intervals_json",
     "intervals_table",
+    "overlap_json",
     "runs_json",
     "runs_table",
     "states_json",
@@ -105,8 +109,25 @@ def contents_json(session: Session) -> dict[str, Any]:
             for camera, topic in session.images.items()
         },
         "channels": {topic: _channel(session, topic) for topic in topics},
+        "overlap": overlap_json(session),
         "runs": runs_json(session),
     }
+
+
+def overlap_json(session: Session) -> list[dict[str, Any]]:
+    """Return the disagreement of pairs of cameras in the newest run with positions, as plain data in m."""
+    run = newest_run(session, POSITIONS)
+    return [
+        {
+            "run": run,
+            "cameras": list(pair.cameras),
+            "count": len(pair.times_ns),
+            "median_m": pair.median_m,
+            "p95_m": pair.p95_m,
+            "within_95": pair.within_95,
+        }
+        for pair in (read_disagreement(session, run, reference_ids(session)) if run else ())
+    ]
 
 
 def _lens(session: Session, camera: str) -> dict[str, Any] | None:
@@ -186,6 +207,7 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s" if found["start"] else "no messages"
     files.caption_justify = "left"
     tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
+    tables += [_overlap_table(found["overlap"])] if found["overlap"] else []
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 
 
@@ -197,6 +219,17 @@ def _cameras_table(found: dict[str, Any]) -> Table:
         if lens is not None:
             text = Text(plain_text(f"{lens['width']} x {lens['height']} px, {lens['model']}"))
         table.add_row(camera, str(channel["messages"]), _rate(channel), text)
+    return table
+
+
+def _overlap_table(rows: list[dict[str, Any]]) -> Table:
+    """Return a table of the difference of positions of the same robot and instant, by two cameras."""
+    numbers = ("count", "median mm", "p95 mm", "in 95 % region")
+    table = _table(f"Disagreement of cameras, run {rows[0]['run']}", "cameras", *numbers, right=numbers)
+    for row in rows:
+        within = "-" if row["within_95"] is None else f"{100 * row['within_95']:.0f} %"
+        lengths_mm = (f"{row[key] * MM_PER_M:.1f}" for key in ("median_m", "p95_m"))
+        table.add_row(" and ".join(row["cameras"]), str(row["count"]), *lengths_mm, within)
     return table
 
 

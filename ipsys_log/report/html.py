@@ -9,17 +9,20 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, SUBSETS
+from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.messages.channels import EVALUATION
+from ipsys_log.messages.channels import EVALUATION, POSITIONS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
+from ipsys_log.report.overlap_figure import overlap_pictures
 from ipsys_log.runs.graph import stages_until, writer_of, writes
+from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
 
@@ -57,6 +60,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **_text_values(findings),
         flat=html_sections.flat_rows(_measured(session, findings)),
         **_figure_values(findings),
+        **_overlap(session, findings),
         **_provenance(session, findings),
     )
 
@@ -96,6 +100,16 @@ def _figure_values(findings: Findings) -> dict[str, Any]:
         "published_pictures": html_figures.published_pictures(findings),
         "joint_pictures": html_figures.joint_pictures(findings),
         "coverage_picture": html_figures.coverage_picture(findings),
+    }
+
+
+def _overlap(session: Session, findings: Findings) -> dict[str, Any]:
+    """Return the disagreement of the cameras in the newest run with positions; empty without an overlap."""
+    run = newest_run(session, POSITIONS)
+    pairs = read_disagreement(session, run, reference_ids(session)) if run else []
+    return {
+        "overlap": {"run": run, "rows": html_sections.overlap_rows(pairs)} if pairs else None,
+        "overlap_pictures": overlap_pictures(pairs, findings.rig) if pairs else [],
     }
 
 

@@ -35,6 +35,8 @@ __all__ = [
     "joint_pictures",
     "learning_pictures",
     "models_pictures",
+    "new_figure",
+    "picture",
     "published_pictures",
     "residual_pictures",
 ]
@@ -45,14 +47,16 @@ _SPACE = {True: "3D", False: "2D"}
 Picture = dict[str, Any]
 
 
-def _picture(figure: Figure, caption: str) -> Picture:
+def picture(figure: Figure, caption: str) -> Picture:
+    """Return a figure with its caption and its size on the page."""
     width_in, height_in = figure.get_size_inches()
     # The size in pixels reserves the space of a figure while the page loads.
     size = {"width": round(96 * width_in), "height": round(96 * height_in)}
     return {"uri": svg_data_uri(figure), "caption": caption, **size}
 
 
-def _figure(height_in: float) -> tuple[Figure, Axes]:
+def new_figure(height_in: float) -> tuple[Figure, Axes]:
+    """Return a figure as wide as a phone, with its axes."""
     figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
     axes = figure.add_subplot()
     axes.tick_params(labelsize=8)
@@ -68,7 +72,7 @@ def models_pictures(findings: Findings) -> list[Picture]:
     pictures = []
     ranked = findings.ranked()
     for in_space in _spaces(findings):
-        figure, axes = _figure(1.4 + 0.27 * len(ranked))
+        figure, axes = new_figure(1.4 + 0.27 * len(ranked))
         draw_models(axes, ranked, in_space)
         handles = [Line2D([], [], color="black", marker="o", ms=5, lw=2), Line2D([], [], **HELD_OUT)]  # type: ignore[arg-type]
         figure.legend(
@@ -77,7 +81,7 @@ def models_pictures(findings: Findings) -> list[Picture]:
         )  # fmt: skip
         note = models_note(ranked)
         caption = f"Mean {_SPACE[in_space]} error of each model" + (f" ({note})" if note else "")
-        pictures.append(_picture(figure, caption))
+        pictures.append(picture(figure, caption))
     return pictures
 
 
@@ -89,7 +93,7 @@ def residual_pictures(findings: Findings) -> list[Picture]:
     pictures = []
     scale = residual_scale(findings, accuracies)
     for accuracy in accuracies:
-        figure, axes = _figure(5.6)
+        figure, axes = new_figure(5.6)
         arrows = draw_residuals(axes, findings, accuracy, scale)
         bar = figure.colorbar(
             arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30
@@ -101,7 +105,7 @@ def residual_pictures(findings: Findings) -> list[Picture]:
             "point to the estimated position; arrows are enlarged. Dashed: area of the calibration points "
             "of a camera"
         )
-        pictures.append(_picture(figure, caption))
+        pictures.append(picture(figure, caption))
     return pictures
 
 
@@ -134,7 +138,7 @@ def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
     """Return one figure per caption, all with the same scale."""
     limits = limits_cm(panels.values())
     return [
-        _picture(curves_picture(curves, _WIDTH_IN, limits), caption)
+        picture(curves_picture(curves, _WIDTH_IN, limits), caption)
         for caption, curves in panels.items()
         if curves
     ]
@@ -181,8 +185,8 @@ def coverage_picture(findings: Findings) -> Picture | None:
     """Return a map of the floor outside of the fitted points of all cameras; None without fitted points."""
     if not findings.training_m():
         return None
-    figure, axes = _figure(5.2)
+    figure, axes = new_figure(5.2)
     draw_coverage(axes, findings)
-    return _picture(
+    return picture(
         figure, "Calibration points of the models. Hatched: floor outside the area of these points"
     )

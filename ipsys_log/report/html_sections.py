@@ -10,13 +10,14 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.analysis.disagreement import PairDisagreement
 from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import GROUPS, Choice, label, uses_height
 from ipsys_log.report.findings import Findings, overall_row, overall_row_with_excluded
 from ipsys_log.report.points_figure import hull_m
-from ipsys_log.units import CM_PER_M
+from ipsys_log.units import CM_PER_M, MM_PER_M
 
 __all__ = [
     "advice_rows",
@@ -27,6 +28,7 @@ __all__ = [
     "headline",
     "in_order",
     "model_rows",
+    "overlap_rows",
     "suspects",
 ]
 
@@ -181,6 +183,8 @@ def _errors(accuracy: Accuracy, row: CameraEvaluation | None) -> dict[str, str] 
 
 # A share contradicts the covariance if it differs from the expected share by more standard deviations.
 _SURE = 1.96
+# Neighbouring differences have the same error, so a share somewhat below 95 % is no contradiction.
+_EXPLAINED = 0.90
 # Number of sample points on each side of the floor.
 _GRID = 200
 
@@ -265,6 +269,27 @@ def calibration(findings: Findings) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def overlap_rows(pairs: Sequence[PairDisagreement]) -> list[dict[str, str]]:
+    """Return a row for each pair of cameras: their disagreement in the overlap, in mm."""
+    return [
+        {
+            "cameras": " and ".join(pair.cameras),
+            "count": str(len(pair.times_ns)),
+            "median": f"{pair.median_m * MM_PER_M:.1f}",
+            "p95": f"{pair.p95_m * MM_PER_M:.1f}",
+            "within": _percent(pair.within_95),
+            "verdict": _overlap_verdict(pair.within_95),
+        }
+        for pair in pairs
+    ]
+
+
+def _overlap_verdict(within_95: float | None) -> str:
+    if within_95 is None:
+        return "–"
+    return "consistent" if within_95 >= _EXPLAINED else "larger than the covariances explain"
 
 
 def _percent(share: float | None) -> str:

@@ -66,12 +66,12 @@ def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | Non
     ids : ids of the dictionary to print instead of the ids of the rig.
     length_m : side length of all markers, instead of the lengths of the rig.
     """
-    listed = {marker.id: marker for marker in rig.markers}
+    names = {marker.id: marker.robot for marker in rig.markers}
+    names |= {marker.id: "reference" for marker in rig.reference_markers}
     prints = []
-    for marker_id in list(listed) if ids is None else ids:
-        marker = listed.get(marker_id)
-        side_m = length_m or (marker.length_m if marker else None) or rig.marker_length_m
-        prints.append(marker_print(rig.dictionary, marker_id, side_m, marker.robot if marker else None))
+    for marker_id in list(names) if ids is None else ids:
+        side_m = length_m or rig.length_of(marker_id)
+        prints.append(marker_print(rig.dictionary, marker_id, side_m, names.get(marker_id)))
     return prints
 
 

@@ -75,7 +75,7 @@ def check_units(rig: Rig, where: str) -> None:
         then = " or ".join(likely) or f"{kind.low:g} to {kind.high:g}"
         raise IpsysError(f"{where}: {item}{key} = {value:g} is too {_far(value, kind)}; write {then}")
     size = dictionary_size(rig.dictionary)
-    for marker in rig.markers:
+    for marker in rig.all_markers:
         if size is not None and marker.id >= size:
             raise IpsysError(
                 f"{where}: marker id {marker.id}: {rig.dictionary} has only the ids 0 to {size - 1}; correct "
@@ -104,7 +104,7 @@ def _given(rig: Rig) -> Iterator[tuple[str, str, float]]:
     """Yield the values with a plausible range: the item of the rig, the key, and the value."""
     items: list[tuple[str, object]] = [
         ("", rig),
-        *((f"marker {marker.id}: ", marker) for marker in rig.markers),
+        *((f"marker {marker.id}: ", marker) for marker in rig.all_markers),
     ]
     items += [("[floor] ", rig.floor)]
     items += [(f"reference point {point.name}: ", point) for point in rig.reference_points]

@@ -14,7 +14,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker, RigStream
+from ipsys_log.messages import (
+    Floor,
+    ReferenceMarker,
+    ReferencePoint,
+    Rig,
+    RigCamera,
+    RigMarker,
+    RigStream,
+)
 from ipsys_log.rig.checks import check_units
 
 __all__ = [
@@ -59,7 +67,12 @@ _PASSWORDS = (
 )
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
-_ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": ReferencePoint}
+_ITEMS = {
+    "markers": RigMarker,
+    "cameras": RigCamera,
+    "reference_points": ReferencePoint,
+    "reference_markers": ReferenceMarker,
+}
 
 
 def check_name(name: str, what: str) -> str:
@@ -243,12 +256,14 @@ def check_rig(rig: Rig, where: str) -> Rig:
         if marker.robot is not None:
             check_name(marker.robot, f"{where}: robot name")
     _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
-    _check_unique((marker.id for marker in rig.markers), f"{where}: two markers have the id")
+    ids = (marker.id for marker in rig.all_markers)
+    _check_unique(ids, f"{where}: two markers have the id")
     _check_unique(
         (marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers have the robot"
     )
     _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
-    lengths = [rig.marker_length_m, *(m.length_m for m in rig.markers if m.length_m is not None)]
+    markers = rig.all_markers
+    lengths = [rig.marker_length_m, *(m.length_m for m in markers if m.length_m is not None)]
     if rig.floor is not None:
         lengths += [rig.floor.width_m, rig.floor.depth_m]
     for length in lengths:
@@ -259,7 +274,7 @@ def check_rig(rig: Rig, where: str) -> Rig:
     _check_heights(rig, where)
     if rig.stream is not None:
         _check_stream(rig.stream, rig, f"{where}: [stream]")
-    for item in (rig, rig.floor, *rig.markers, *rig.cameras, *rig.reference_points):
+    for item in (rig, rig.floor, *markers, *rig.cameras, *rig.reference_points):
         _check_numbers(item, where)
     return rig
 

@@ -35,6 +35,7 @@ class Purpose(IntEnum):
     WOBBLE = 15
     GEOMETRY = 16
     PRINTS = 17
+    WEEKS = 18
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

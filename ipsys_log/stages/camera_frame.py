@@ -74,7 +74,8 @@ class CameraFrame:
         if frame.markers:
             rig, lens = self._settings(camera)
             seen: list[_Seen] = []
-            for sighting in _through_lens(frame.markers, rig, lens):
+            robots = [marker for marker in frame.markers if not rig.is_reference(marker.id)]
+            for sighting in _through_lens(robots, rig, lens) if robots else ():
                 fault = self._fault(sighting, camera)
                 if fault is None:
                     seen.append(sighting)
@@ -230,12 +231,17 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     )
 
 
+def _rig_part(rig: Rig, _method: str) -> object:
+    lengths = {(marker.id, rig.length_of(marker.id)) for marker in rig.markers}
+    return rig.marker_length_m, lengths, {marker.id for marker in rig.reference_markers}
+
+
 STAGE = Stage(
     name="camera-frame",
     versions={"camera-frame": 1, PERIMETER: 1, "pose": 1},
     reads=(RIG, CALIBRATIONS, MARKERS),
     writes=(CAMERA_POINTS, RUN_EVENTS),
     plan=_plan,
-    rig_part=lambda rig, method: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
+    rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("method", PERIMETER),
 )

@@ -319,7 +319,8 @@ def _why_stock(camera: str) -> str:
 
 def _rig_part(rig: Rig, _method: str) -> object:
     shutters = {(camera.name, camera.row_time_ns, camera.edge_offset_px) for camera in rig.cameras}
-    return rig.dictionary, {m.id for m in rig.markers}, {shutter for shutter in shutters if any(shutter[1:])}
+    ids = {m.id for m in rig.markers}, {m.id for m in rig.reference_markers if rig.markers}
+    return rig.dictionary, ids, {shutter for shutter in shutters if any(shutter[1:])}
 
 
 STAGE = Stage(

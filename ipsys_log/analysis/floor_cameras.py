@@ -1,0 +1,122 @@
+"""Calibrated cameras above the floor, from any fitted model, and the motion of such a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import FitError
+from ipsys_log.geometry.lenses import in_image
+from ipsys_log.geometry.poses import rotation
+from ipsys_log.messages import CameraCalibration, Floor, Model
+from ipsys_log.models.rigid import rigid_transform
+from ipsys_log.models.table import reads_corners
+
+__all__ = ["FloorCamera", "floor_grid", "move_camera", "read_floor_cameras", "shift_floor_map"]
+
+Array = NDArray[np.float64]
+
+_STEP_M = 0.25
+# Without a floor in the rig, the map reaches this multiple of the camera's height to each side.
+_REACH = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorCamera:
+    """A camera with its intrinsics ``lens``, its rotation ``camera_from_world`` (3, 3) and its position."""
+
+    name: str
+    lens: CameraCalibration
+    camera_from_world: Array
+    origin_m: Array
+
+    def transform(self, points_m: Array) -> Array:
+        """Return world points (n, 3) in camera coordinates."""
+        return np.asarray((points_m - self.origin_m) @ self.camera_from_world.T)
+
+
+def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) -> dict[str, FloorCamera]:
+    """Return the cameras of a fitted model that have intrinsics and a pose, by name.
+
+    The joint model has the pose and its own intrinsics. For all other models, the pose is the rigid transform
+    (eq. 6 to 12 of the paper) from the world points to the camera points of the calibration points.
+
+    Parameters
+    ----------
+    model : a fitted model.
+    lenses : intrinsics by camera; they also give the size of the images.
+    """
+    cameras = {}
+    for camera in model.cameras:
+        lens = lenses.get(camera.camera)
+        if lens is None:
+            continue
+        if reads_corners(model.name):
+            # Late: scipy takes 1 s, and most commands need no joint model.
+            from ipsys_log.joint.payload import restore_joint
+
+            joint = restore_joint(camera)
+            own = joint.calibration
+            lens = replace(lens, distortion_model=own.distortion_model, K=own.K, D=own.D)
+            cameras[camera.camera] = FloorCamera(camera.camera, lens, joint.camera_from_world, joint.origin_m)
+            continue
+        world_m = np.array([pair.world_m for pair in camera.pairs]).reshape(-1, 3)
+        camera_m = np.array([pair.camera_m for pair in camera.pairs]).reshape(-1, 3)
+        try:
+            turn, shift_m = rigid_transform(world_m, camera_m)
+        except FitError:
+            continue
+        cameras[camera.camera] = FloorCamera(camera.camera, lens, turn, -turn.T @ shift_m)
+    return cameras
+
+
+def floor_grid(camera: FloorCamera, floor: Floor | None) -> Array:
+    """Return the points (n, 3) of a grid of 0.25 m on the floor that a camera sees.
+
+    Parameters
+    ----------
+    camera : the camera.
+    floor : size of the floor; None: a square below the camera.
+    """
+    if floor is not None:
+        low, high = np.zeros(2), np.array([floor.width_m, floor.depth_m])
+    else:
+        reach_m = _REACH * abs(float(camera.origin_m[2]))
+        low, high = camera.origin_m[:2] - reach_m, camera.origin_m[:2] + reach_m
+    axes = [np.arange(start + _STEP_M / 2, end, _STEP_M) for start, end in zip(low, high, strict=True)]
+    flat_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    points_m = np.column_stack([flat_m, np.zeros(len(flat_m))])
+    return np.asarray(points_m[in_image(camera.transform(points_m), camera.lens)])
+
+
+def move_camera(camera: FloorCamera, motion: Array) -> FloorCamera:
+    """Return a camera after a motion (6,): a turn about its axes in rad, and a shift in the world in m."""
+    turned = rotation(motion[:3]) @ camera.camera_from_world
+    return replace(camera, camera_from_world=turned, origin_m=camera.origin_m + motion[3:])
+
+
+def shift_floor_map(camera: FloorCamera, points_m: Array, motion: Array) -> Array:
+    """Return the errors (n, 2) of positions on the floor, in m, if a camera moves and its model does not.
+
+    The moved camera sees a point on another ray. The model of the camera before the motion meets this ray
+    with the floor. The intrinsics have no effect.
+
+    Parameters
+    ----------
+    camera : the camera before the motion.
+    points_m : (n, 3), true points at any height; the positions have the same height.
+    motion : (6,), as for :func:`move_camera`.
+
+    Examples
+    --------
+    >>> lens = CameraCalibration(0, "red", 0, 0, "kannala_brandt", np.zeros(4), np.eye(3))
+    >>> camera = FloorCamera("red", lens, np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 2.0]))
+    >>> shift_floor_map(camera, np.zeros((1, 3)), np.array([0, 0, 0, 0.01, 0, 0])).round(6).tolist()
+    [[-0.01, 0.0]]
+    """
+    rays = move_camera(camera, motion).transform(points_m) @ camera.camera_from_world
+    along = (points_m[:, 2] - camera.origin_m[2]) / rays[:, 2]
+    return np.asarray(camera.origin_m[:2] + along[:, None] * rays[:, :2] - points_m[:, :2])

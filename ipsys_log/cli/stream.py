@@ -9,7 +9,23 @@ import typer
 
 from ipsys_log.cli.console import say
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
-from ipsys_log.cli.stream_options import Key, Mavlink, Robots, StreamHost, Udp, Vrpn, VrpnPort, choose_streams
+from ipsys_log.cli.stream_options import (
+    Foxglove,
+    FoxglovePort,
+    Images,
+    Key,
+    Mavlink,
+    RerunPage,
+    Robots,
+    Ros2,
+    Ros2Domain,
+    Ros2Port,
+    StreamHost,
+    Udp,
+    Vrpn,
+    VrpnPort,
+    choose_streams,
+)
 
 __all__ = ["add_commands"]
 
@@ -61,6 +77,13 @@ def stream(
     vrpn: Vrpn = False,
     vrpn_port: VrpnPort = None,
     mavlink: Mavlink = None,
+    ros2: Ros2 = False,
+    ros2_port: Ros2Port = None,
+    ros2_domain: Ros2Domain = None,
+    foxglove: Foxglove = False,
+    foxglove_port: FoxglovePort = None,
+    rerun: RerunPage = False,
+    images: Images = False,
     host: StreamHost = None,
     robot: Robots = None,
     rig: RigFile = None,
@@ -95,6 +118,13 @@ def stream(
         is_vrpn=vrpn,
         vrpn=vrpn_port,
         mavlink=mavlink,
+        is_ros2=ros2,
+        ros2=ros2_port,
+        ros2_domain=ros2_domain,
+        is_foxglove=foxglove,
+        foxglove=foxglove_port,
+        rerun=rerun,
+        images=images,
         host=host,
         udp=udp,
         key=key,

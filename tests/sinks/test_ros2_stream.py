@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import struct
 import time
@@ -203,7 +204,9 @@ def test_no_message_comes_in_or_passes_through() -> None:
     """Nodes find each other and connect directly; a client that knows only the router reaches nobody."""
     with streaming() as (stream, _):
         received: list[str] = []
-        inner = stream._session.declare_subscriber("**", lambda sample: received.append(str(sample.key_expr)))
+        inner = stream._session.declare_subscriber(
+            "**", lambda sample: received.append(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+        )
         with closing(open_node(stream.port, "client")) as one, closing(open_node(stream.port)) as two:
             heard: list[str] = []
             two.declare_subscriber("0/cmd_vel/**", lambda sample: heard.append("two"))
@@ -242,8 +245,6 @@ def test_second_stream_uses_the_router_that_answers() -> None:
 
 
 def test_only_this_machine_can_connect_without_a_host() -> None:
-    import os
-
     before = set(exposed(os.getpid()))
     with streaming() as (stream, _):
         assert stream.describe() == f"ROS 2 domain 0, as the router on port {stream.port}: only this machine"

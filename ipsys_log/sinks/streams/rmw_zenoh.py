@@ -28,6 +28,7 @@ _GID_BYTES = 16
 _HEARTBEAT_S = 0.5
 # More sessions are refused; a lab has fewer nodes.
 _MOST_SESSIONS = 64
+_OPEN_TIMEOUT_MS = 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +128,7 @@ def configure(domain: int, port: int, host: str | None = None, is_router: bool =
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_sessions": _MOST_SESSIONS,
+        "transport/unicast/open_timeout": _OPEN_TIMEOUT_MS,
         # A slow subscriber must not delay the sender.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "access_control": _access(domain),

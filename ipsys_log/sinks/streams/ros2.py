@@ -14,14 +14,13 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams import ros2_messages as ros2
-from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, refuse_bind
+from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["PORT", "Ros2Stream"]
+__all__ = ["Ros2Stream"]
 
-PORT = 7447
 _NODE = "ipsys"
 _MOST_DOMAIN = 232
 _MOST_ROBOTS = 256
@@ -191,7 +190,8 @@ def _answers(port: int) -> bool:
 def _open_session(domain: int, port: int, host: str | None, is_router: bool) -> zenoh.Session:
     """Open the session, as the router or as a client of the router on the port."""
     if is_router:
-        _check_bind(host or LOOPBACK, port)
+        # The errors of Zenoh name no reason.
+        listen(host or LOOPBACK, port, "--ros2", 1).close()
     try:
         session = zenoh.open(configure(domain, port, host, is_router))
     except zenoh.ZError as error:
@@ -203,14 +203,6 @@ def _open_session(domain: int, port: int, host: str | None, is_router: bool) -> 
         session.close()  # type: ignore[no-untyped-call]
         raise IpsysError(f"--ros2: another ipsys is on port {port} already; end it, or give another port")
     return session
-
-
-def _check_bind(host: str, port: int) -> None:
-    """Check that the router can listen: the errors of Zenoh name no reason."""
-    try:
-        socket.create_server((host, port)).close()
-    except OSError as error:
-        raise refuse_bind(error, host, port, "--ros2") from error
 
 
 def _has_other(session: zenoh.Session) -> bool:

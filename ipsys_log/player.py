@@ -70,7 +70,9 @@ class Player:
                     (session, viewed_topics(session, chosen, settings.images)) for session, chosen in logs
                 ]
                 self._first = [
-                    row for (session, _), rig in zip(logs, rigs) for row in read_first(session, rig)
+                    row
+                    for (session, _), rig in zip(logs, rigs, strict=True)
+                    for row in read_first(session, rig)
                 ]
             page = self._stack.enter_context(closing(_open_page())) if settings.rerun else None
             playback = self._playback = _open_playback(logs, options, clock)

@@ -177,7 +177,6 @@ def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSetti
     IpsysError
         There is no stream for an option, or the rig has no such robot.
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import check_robots
     from ipsys_log.sinks.streams.settings import PORTS, settings_of_rig
 

@@ -18,7 +18,7 @@ STORE = get_typestore(Stores.LATEST)
 
 
 def open_node(port: int, mode: str = "peer") -> Any:
-    """Open a session with the settings of rmw_zenoh_cpp: a peer without multicast, connected to the router."""
+    """Open a session as rmw_zenoh_cpp does: a peer without multicast, connected to the router."""
     config = zenoh.Config()
     settings = {"mode": mode, "connect/endpoints": [f"tcp/localhost:{port}"]}
     settings |= {"scouting/multicast/enabled": False, "listen/endpoints": ["tcp/localhost:0"]}

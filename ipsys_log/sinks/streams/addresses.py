@@ -50,7 +50,7 @@ def is_loopback(address: str) -> bool:
 
 
 def is_own_host(host: str, names: Collection[str]) -> bool:
-    """Return whether the header ``Host`` of a request names this machine: an IP address, or one of some names.
+    """Return whether the header ``Host`` of a request is an IP address or one of the names of this machine.
 
     A page of a foreign site may name a host of its own that leads to this machine (DNS rebinding).
 

@@ -47,7 +47,7 @@ class Qos:
     is_latched: bool = False
 
     def __str__(self) -> str:
-        """Return the text in a token: reliability, durability, history and depth, and others; empty: default."""
+        """Return the text in a token: reliability, durability, history and depth; empty: default."""
         reliability, durability = "" if self.is_reliable else "2", "1" if self.is_latched else ""
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
 
@@ -96,7 +96,7 @@ def _type_name(ros_type: str) -> str:
 
 
 def gid(token: str) -> bytes:
-    """Return the identifier of a publisher, 16 bytes: the hash of its token (XXH3, both halves little-endian)."""
+    """Return the identifier of a publisher, 16 bytes: the XXH3 hash of its token, little-endian."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(_GID_BYTES, "little")
 
 

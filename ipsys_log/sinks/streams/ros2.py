@@ -17,7 +17,6 @@ from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
-from ipsys_log.units import NS_PER_S
 
 __all__ = ["Ros2Stream"]
 

@@ -41,7 +41,9 @@ _LIMIT_S = 60.0
 def streaming(**options: Any) -> Iterator[tuple[FoxgloveStream, list[tuple[str, str]]]]:
     events: list[tuple[str, str]] = []
     warn = lambda kind, text: events.append((kind, text))  # noqa: E731
-    stream = FoxgloveStream(0, options.pop("host", None), SECRET, 7, warn, **options)
+    stream = FoxgloveStream(
+        0, options.pop("host", None), SECRET, 7, options.pop("topics", [TOPIC]), warn, **options
+    )
     with closing(stream):
         yield stream, events
 
@@ -86,7 +88,6 @@ def test_client_of_foxglove_gets_poses(node_home: Path, subprotocol: str) -> Non
         command = ["node", script, str(node_home), address, subprotocol, "4", "https://app.foxglove.dev"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as client:
             wait_for(lambda: stream.client_count)
-            stream.consume(iter([tracks(0)]))  # announces the topic
             wait_for(lambda: any(one.subscriptions.number_of(1) is not None for one in stream._clients))
             stream.consume(iter([tracks(n) for n in range(1, 5)]))
             text, _ = client.communicate(timeout=_LIMIT_S)
@@ -147,9 +148,9 @@ def test_later_client_gets_the_rig_and_images_only_if_asked() -> None:
         assert not isinstance(image.payload, stream.payloads)
         stream.consume(iter([rig, None]))
         with opened(stream) as client:
-            subscribed(client, 1)
+            subscribed(client, 2)
             data = client.recv(_LIMIT_S)
-            assert (data[:5], b"lab" in bytes(data)) == (struct.pack("<BI", 1, 101), True)
+            assert (data[:5], b"lab" in bytes(data)) == (struct.pack("<BI", 1, 102), True)
     with streaming(with_images=True) as (stream, _):
         assert isinstance(image.payload, stream.payloads)
 
@@ -160,7 +161,6 @@ def test_session_of_a_replay_begins_at_its_time() -> None:
         subscribed(client)
         wait_for(lambda: stream.client_count)
         stream.consume(iter([tracks(0), begin]))
-        assert json.loads(client.recv(_LIMIT_S))["op"] == "advertise"
         times = [client.recv(_LIMIT_S) for _ in range(2)]
     assert times == [struct.pack("<BQ", 2, START_NS), struct.pack("<BQ", 2, START_NS - 5)]
 
@@ -275,12 +275,13 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
     """The stalled client reads nothing; its socket and its queue fill up."""
     long = Message("/events", START_NS, START_NS, Event(START_NS, "camera_lost", "x" * (1 << 20)))
     with streaming() as (stream, events), opened(stream) as stalled, opened(stream) as good:
-        stream.consume(iter([long]))
+        stream.consume(iter([long]))  # announces its topic
         stalled.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         for client in (stalled, good):
             client.recv(_LIMIT_S)
-            client.send('{"op":"subscribe","subscriptions":[{"id":1,"channelId":1}]}')
-        wait_for(lambda: all(one.subscriptions.number_of(1) for one in stream._clients))
+            client.recv(_LIMIT_S)
+            client.send('{"op":"subscribe","subscriptions":[{"id":1,"channelId":2}]}')
+        wait_for(lambda: all(one.subscriptions.number_of(2) for one in stream._clients))
         received = 0
         while not events:
             stream.consume(iter([long]))
@@ -292,5 +293,5 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
 
 def test_port_in_use_is_named() -> None:
     with streaming() as (stream, _), pytest.raises(IpsysError) as error:
-        FoxgloveStream(stream.port, None, SECRET, 1, lambda kind, text: None)
+        FoxgloveStream(stream.port, None, SECRET, 1, (), lambda kind, text: None)
     assert f"--foxglove: port {stream.port} is in use, perhaps by another ipsys" in str(error.value)

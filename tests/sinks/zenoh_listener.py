@@ -20,7 +20,7 @@ STORE = get_typestore(Stores.LATEST)
 def open_node(port: int, mode: str = "peer") -> Any:
     """Open a session as rmw_zenoh_cpp does: a peer without multicast, connected to the router."""
     config = zenoh.Config()
-    settings = {"mode": mode, "connect/endpoints": [f"tcp/localhost:{port}"]}
+    settings: dict[str, Any] = {"mode": mode, "connect/endpoints": [f"tcp/localhost:{port}"]}
     settings |= {"scouting/multicast/enabled": False, "listen/endpoints": ["tcp/localhost:0"]}
     if mode == "client":
         settings["listen/endpoints"] = []

@@ -11,7 +11,7 @@ import hmac
 import http
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from urllib.parse import parse_qs, urlsplit
 
@@ -21,7 +21,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from ipsys_log.log.codec import PAYLOADS, encode
-from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo
+from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo, Tracks
 from ipsys_log.messages.channels import IMAGES
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, is_own_host, listen
@@ -62,6 +62,7 @@ class FoxgloveStream:
     host : the address of this machine to listen on; None: only this machine.
     secret : the token in the address.
     session : the number of the session.
+    topics : the topics of the tracks, announced before the first message.
     with_images : send images, too.
     is_replayed : the times are those of a recording; clients get them as the time of the server.
 
@@ -77,6 +78,7 @@ class FoxgloveStream:
         host: str | None,
         secret: str,
         session: int,
+        topics: Collection[str],
         warn: Warn,
         with_images: bool = False,
         is_replayed: bool = False,
@@ -93,6 +95,8 @@ class FoxgloveStream:
         self._channels: dict[str, Advertised] = {}
         self._latched: dict[str, tuple[int, bytes]] = {}
         self._clients: set[Client] = set()
+        for topic in topics:
+            self._advertise(topic, Tracks)
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)

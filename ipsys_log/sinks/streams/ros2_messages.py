@@ -159,7 +159,7 @@ def encode_diagnostics(
 
 
 def _status(robot: str, pose: StreamPose | None, session: int, now_ns: int, stale_s: float) -> Any:
-    status = _STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
+    status: Any = _STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
     values = {"session": str(session)}
     level, text = status.STALE, "no camera has seen the robot"
     if pose is not None:

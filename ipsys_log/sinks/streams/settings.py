@@ -142,7 +142,7 @@ def open_streams(
         for other in chain(
             _autopilots(settings, poses, now_ns, warn),
             _ros2_nodes(settings, poses(), now_ns, warn, sent_m, is_replayed),
-            _foxglove_servers(settings, number, warn, is_replayed),
+            _foxglove_servers(settings, number, topics, warn, is_replayed),
         ):
             streams.append(stack.enter_context(closing(other)))
         yield streams
@@ -182,7 +182,7 @@ def _ros2_nodes(
 
 
 def _foxglove_servers(
-    settings: StreamSettings, session: int, warn: Warn, is_replayed: bool
+    settings: StreamSettings, session: int, topics: Collection[str], warn: Warn, is_replayed: bool
 ) -> Iterator[Stream]:
     """Yield the server for Foxglove, if there is one; its library is optional, and loaded only here."""
     if settings.foxglove is not None:
@@ -190,7 +190,7 @@ def _foxglove_servers(
         from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 
         where = (settings.foxglove, settings.host, settings.secret)
-        yield FoxgloveStream(*where, session, warn, settings.images, is_replayed)
+        yield FoxgloveStream(*where, session, topics, warn, settings.images, is_replayed)
 
 
 def check_streams(settings: StreamSettings) -> list[str]:

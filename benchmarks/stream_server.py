@@ -18,7 +18,7 @@ import numpy as np
 from ipsys_log.log.dataset import Session
 from ipsys_log.rig.file import rig_toml
 
-__all__ = ["Served", "loops_of", "serve"]
+__all__ = ["Served", "free_ports", "loops_of", "serve"]
 
 _TURN_S = 0.05
 _FORMAT = ("-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=ffmpeg", "-listen", "1")
@@ -60,7 +60,7 @@ def serve(lab: Path, loops: Mapping[str, Path], count: int, folder: Path, limit_
     served = Served(folder / "lab.toml")
     with ExitStack() as stack:
         programs = {}
-        for number, port in enumerate(_free_ports(count)):
+        for number, port in enumerate(free_ports(count)):
             base = sorted(loops)[number % len(loops)]
             name = base if number < len(loops) else f"{base}_{number}"
             address = f"http://127.0.0.1:{port}/{name}"
@@ -79,7 +79,7 @@ def serve(lab: Path, loops: Mapping[str, Path], count: int, folder: Path, limit_
         yield served
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
     """Return ports that are not in use now, all different."""
     with ExitStack() as stack:
         probes = [stack.enter_context(socket.socket()) for _ in range(count)]

@@ -388,11 +388,14 @@ def live(
         for line in check_streams(streamed):
             say(line)
         topic = TRACKS.topic_of(model_run(wanted_models(request)[0]))
-        robots = [marker.robot for marker in lab.markers if marker.robot]
         with (
             LiveCameras(wanted, open_source, Clock(), say) as attached,
             open_streams(
-                streamed, {topic}, attached.clock.now_ns, attached.add_event, robots=robots
+                streamed,
+                {topic},
+                attached.clock.now_ns,
+                attached.add_event,
+                heights_m=lab.robot_heights_m(),
             ) as streams,
         ):
             sizes_px = {name: state.size_px for name, state in attached.states.items()}
@@ -417,6 +420,10 @@ def play(
     key: StrPath | None = None,
     vrpn: int | None = None,
     mavlink: Sequence[str] = (),
+    ros2: int | None = None,
+    ros2_domain: int = 0,
+    foxglove: int | None = None,
+    images: bool = False,
     host: str | None = None,
     robots: Sequence[str] = (),
     clock: Clock | None = None,
@@ -437,6 +444,10 @@ def play(
     key : the file with the key that signs the datagrams.
     vrpn : the port of a VRPN server, usually 3883; None: no server.
     mavlink : autopilots, such as ``ada=192.168.1.30:14550``.
+    ros2 : the port of the Zenoh router of ROS 2, usually 7447; None: no messages to ROS 2.
+    ros2_domain : the domain ID of ROS 2.
+    foxglove : the port of a server for Foxglove, usually 8765; None: no server.
+    images : Foxglove gets images, too.
     host : the address of this machine that other computers can reach; None: only this machine.
     robots : only these robots.
     clock : the clock of the playback; None: the system's.
@@ -462,5 +473,16 @@ def play(
 
     options = PlaybackOptions(rate, loop, start_paused, start_offset_s, restamp)
     path = None if key is None else Path(key)
-    settings = StreamSettings(host, tuple(udp), path, vrpn, tuple(mavlink), robots=tuple(robots))
+    settings = StreamSettings(
+        host,
+        tuple(udp),
+        path,
+        vrpn,
+        tuple(mavlink),
+        robots=tuple(robots),
+        ros2=ros2,
+        ros2_domain=ros2_domain,
+        foxglove=foxglove,
+        images=images,
+    )
     return Player([Path(path) for path in paths], run, topics, options, settings, clock, say)

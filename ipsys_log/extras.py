@@ -27,6 +27,10 @@ LIBRARIES = {
     "starlette": Library("Starlette", "web"),
     "uvicorn": Library("Uvicorn", "web"),
     "pymavlink": Library("pymavlink", "mavlink"),
+    "zenoh": Library("Zenoh", "ros2"),
+    "rosbags": Library("rosbags", "ros2"),
+    "xxhash": Library("xxhash", "ros2"),
+    "websockets": Library("websockets", "foxglove"),
 }
 
 

@@ -5,22 +5,28 @@ from __future__ import annotations
 import heapq
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message
+from ipsys_log.messages import Message, Rig
 from ipsys_log.rig.file import check_robots
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
-from ipsys_log.sinks.played_topics import PlayedTopics, choose_topics
+from ipsys_log.sinks.played_topics import PlayedTopics, choose_topics, read_first, viewed_topics
 from ipsys_log.sinks.selection import rig_in_force
-from ipsys_log.sinks.sink import LiveSinks
+from ipsys_log.sinks.sink import LiveSinks, Sink
 from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
 from ipsys_log.tracker import LiveTracks, Tracker
+
+if TYPE_CHECKING:
+    from ipsys_log.sinks.rerun.page import ViewerPage
 
 __all__ = ["Player"]
 
@@ -51,23 +57,37 @@ class Player:
         if not paths:
             raise IpsysError("no log is given; name at least one")
         self._say, self._ended, self._stack = say, threading.Event(), ExitStack()
+        self._first: list[Message] = []
         try:
             # Each log by itself: two logs may have runs of one name.
             sessions = [self._stack.enter_context(Session([path])) for path in paths]
             logs = [(session, choose_topics(session, run, topics)) for session in sessions]
-            settings = settings or StreamSettings()
-            robots = [robot for session, chosen in logs for robot in _robots(session, chosen, settings)]
+            settings, options = settings or StreamSettings(), options or PlaybackOptions()
+            rigs = [_rig_of(session, chosen, settings) for session, chosen in logs]
+            robots = {name: m for rig in rigs if rig for name, m in rig.robot_heights_m().items()}
+            if settings.has_viewer:
+                logs = [
+                    (session, viewed_topics(session, chosen, settings.images)) for session, chosen in logs
+                ]
+                self._first = [
+                    row
+                    for (session, _), rig in zip(logs, rigs, strict=True)
+                    for row in read_first(session, rig)
+                ]
+            page = self._stack.enter_context(closing(_open_page())) if settings.rerun else None
             playback = self._playback = _open_playback(logs, options, clock)
             tracks = {chosen.tracks for _, chosen in logs}
+            number, is_replayed = playback.session, not options.restamp
             self._streams: Sequence[Stream] = self._stack.enter_context(
-                open_streams(settings, tracks, playback.now_ns, self._warn, playback.session, robots)
+                open_streams(settings, tracks, playback.now_ns, self._warn, number, robots, is_replayed)
             )
         except BaseException:
             self._stack.close()
             raise
         self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
-        lines = [stream.describe() for stream in self._streams]
-        if lines and not robots:
+        self._viewers = [] if page is None else [_viewer(*logs[0], rigs[0], page, say)]
+        lines = [opened.describe() for opened in (*self._streams, *([] if page is None else [page]))]
+        if settings and not robots:
             lines.append("the rig names no robots; the streams name them marker_<id>")
         self.lines = tuple(lines)
         self._tracker = Tracker(self._play)
@@ -151,8 +171,8 @@ class Player:
     def _play(self, tracker: Tracker) -> list[Outcome]:
         try:
             tracker.begin(self._playback.stop)
-            with LiveSinks([*self._streams, tracker], self._warn) as show:
-                for message in self._playback:
+            with LiveSinks([*self._streams, *self._viewers, tracker], self._warn) as show:
+                for message in chain(self._first, self._playback):
                     show(message)
             show.check()
         finally:
@@ -163,13 +183,29 @@ class Player:
         self._say(text)
 
 
-def _robots(session: Session, chosen: PlayedTopics, settings: StreamSettings) -> list[str]:
-    """Return the robots of a log's rig; check that it has those of the settings."""
+def _rig_of(session: Session, chosen: PlayedTopics, settings: StreamSettings) -> Rig | None:
+    """Return the rig of a log; check that it has the robots of the settings."""
     rig = rig_in_force(session, [] if chosen.run is None else [chosen.run])
-    if rig is None:
-        return []
-    check_robots(rig, settings.named_robots, str(session))
-    return [marker.robot for marker in rig.markers if marker.robot]
+    if rig is not None:
+        check_robots(rig, settings.named_robots, str(session))
+    return rig
+
+
+def _open_page() -> ViewerPage:
+    """Open the viewer in a browser; its library is optional, and loaded only here."""
+    check_installed("--rerun needs", "rerun")
+    from ipsys_log.sinks.rerun.page import ViewerPage
+
+    return ViewerPage()
+
+
+def _viewer(
+    session: Session, chosen: PlayedTopics, rig: Rig | None, page: ViewerPage, say: Callable[[str], None]
+) -> Sink:
+    from ipsys_log.sinks.rerun.live import LiveView
+
+    cameras = [name for name, topic in session.images.items() if topic in chosen.topics]
+    return LiveView(rig, cameras, chosen.run, say, page.show, page.name)
 
 
 def _open_playback(

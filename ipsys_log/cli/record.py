@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Message
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.sinks.streams.settings import StreamSettings
 
 __all__ = ["add_commands"]
 
@@ -145,8 +148,9 @@ def live(
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.streams.settings import check_streams, open_streams
 
-    if view:
-        check_installed("--view needs", "rerun")
+    for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
+        if is_wanted:
+            check_installed(f"{option} needs", "rerun")
     lab = prepare_lab(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
     models = tuple(dict.fromkeys(model or ()))
@@ -156,7 +160,7 @@ def live(
     streamed = choose_streams(lab.rig, rig.parent, **streams)
     for line in check_streams(streamed):
         say(line)
-    robots = [marker.robot for marker in lab.rig.markers if marker.robot]
+    robots = lab.rig.robot_heights_m()
     if streamed and not robots:
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
         remarks.print(text, style="yellow", markup=False)
@@ -164,11 +168,13 @@ def live(
     with (
         open_cameras(lab, output, seconds) as (cameras, settings, status),
         open_streams(
-            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, robots=robots
-        ) as sinks,
+            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, heights_m=robots
+        ) as senders,
+        _page_viewer(settings, cameras, shown_run, streamed) as pages,
     ):
         viewer = [_viewer(settings, cameras, shown_run)] if view else []
-        pipeline.live(cameras, settings, output, request, None, [status], force, [*viewer, *sinks])
+        sinks = [*viewer, *pages, *senders]
+        pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
 
 
 def _first_run(request: Request) -> str:
@@ -184,3 +190,20 @@ def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView
     from ipsys_log.sinks.rerun.live import LiveView
 
     return LiveView(settings[0].payload, cameras.states, run, say)
+
+
+@contextmanager
+def _page_viewer(
+    settings: list[Message], cameras: LiveCameras, run: str, streamed: StreamSettings
+) -> Iterator[list[LiveView]]:
+    """Show the recording on a page for a browser of this machine, if the user asked for it."""
+    if not streamed.rerun:
+        yield []
+        return
+    from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.sinks.rerun.page import ViewerPage
+
+    shown = cameras.states if streamed.images else ()
+    with closing(ViewerPage()) as page:
+        say(page.describe())
+        yield [LiveView(settings[0].payload, shown, run, say, page.show, page.name)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -70,6 +70,66 @@ Mavlink = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+Ros2 = Annotated[
+    bool,
+    typer.Option(
+        "--ros2",
+        help="Publish positions to nodes of ROS 2 with rmw_zenoh, without ROS on this machine: /tf, and a "
+        "pose and odometry for each robot.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Ros2Port = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--ros2-port",
+        metavar="PORT",
+        min=1,
+        max=65535,
+        help="Use the Zenoh router on this port instead of 7447; if none answers, be it.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Ros2Domain = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--ros2-domain",
+        metavar="ID",
+        help="Publish to this domain ID of ROS 2. Default: 0.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Foxglove = Annotated[
+    bool,
+    typer.Option(
+        "--foxglove",
+        help="Serve positions to Foxglove on port 8765. The printed address has a new secret at each start.",
+        rich_help_panel=_PANEL,
+    ),
+]
+FoxglovePort = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--foxglove-port",
+        metavar="PORT",
+        min=1,
+        max=65535,
+        help="Serve Foxglove on another port.",
+        rich_help_panel=_PANEL,
+    ),
+]
+RerunPage = Annotated[
+    bool,
+    typer.Option(
+        "--rerun",
+        help="Show positions in Rerun, in a browser of this machine.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Images = Annotated[
+    bool,
+    typer.Option("--images", help="Show images, too, in Foxglove and in Rerun.", rich_help_panel=_PANEL),
+]
 StreamHost = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
@@ -98,6 +158,13 @@ _OPTIONS: dict[str, tuple[Any, Any, str]] = {
     "vrpn": (Vrpn, False, "is_vrpn"),
     "vrpn_port": (VrpnPort, None, "vrpn"),
     "mavlink": (Mavlink, None, "mavlink"),
+    "ros2": (Ros2, False, "is_ros2"),
+    "ros2_port": (Ros2Port, None, "ros2"),
+    "ros2_domain": (Ros2Domain, None, "ros2_domain"),
+    "foxglove": (Foxglove, False, "is_foxglove"),
+    "foxglove_port": (FoxglovePort, None, "foxglove"),
+    "rerun": (RerunPage, False, "rerun"),
+    "images": (Images, False, "images"),
     "host": (StreamHost, None, "host"),
     "robot": (Robots, None, "robots"),
 }
@@ -133,28 +200,41 @@ def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSetti
     ----------
     rig : the rig of a file, never of a log: a log opens no socket.
     folder : the folder of the rig file.
-    options : fields of `StreamSettings`, and ``is_vrpn`` for the usual port; None and empty lists are
-        missing.
+    options : fields of `StreamSettings`, and ``is_vrpn``, ``is_ros2`` and ``is_foxglove`` for the usual
+        port; None, False and empty lists are missing.
 
     Raises
     ------
     IpsysError
         There is no stream for an option, or the rig has no such robot.
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import check_robots
-    from ipsys_log.sinks.streams.settings import settings_of_rig
-    from ipsys_log.sinks.streams.vrpn import PORT
+    from ipsys_log.sinks.streams.settings import PORTS, settings_of_rig
 
-    if options.pop("is_vrpn", False):
-        options["vrpn"] = options.get("vrpn") or PORT
+    for name, port in PORTS.items():
+        if options.pop(f"is_{name}", False):
+            options[name] = options.get(name) or port
     given: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in options.items() if value
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in options.items()
+        if value is not None and value is not False and value != []
     }
     settings = replace(settings_of_rig(None if rig is None else rig.stream, folder), **given)
-    if given and not settings:
-        name = {"robots": "robot"}.get(next(iter(given)), next(iter(given)))
-        raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
+    _check_effect(given, settings)
     if rig is not None:
         check_robots(rig, settings.named_robots, "--robot")
     return settings
+
+
+def _check_effect(given: Collection[str], settings: StreamSettings) -> None:
+    """Check that each option belongs to a stream."""
+    from ipsys_log.errors import IpsysError
+
+    names = {"robots": "robot", "ros2_domain": "ros2-domain"}
+    if given and not settings:
+        name = names.get(next(iter(given)), next(iter(given)))
+        raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
+    if "ros2_domain" in given and settings.ros2 is None:
+        raise IpsysError("--ros2-domain: has no effect without ROS 2; add --ros2")
+    if "images" in given and not settings.has_viewer:
+        raise IpsysError("--images: has no effect without a viewer; add --foxglove or --rerun")

@@ -82,7 +82,8 @@ class RigStream:
     are destinations, as ``HOST:PORT``. ``key`` names the file with the key of their signature. ``vrpn`` is
     the port of the VRPN server. ``mavlink`` are autopilots, as ``ROBOT=HOST:PORT``; ``north_rad`` is the
     direction of north, from the x axis of the lab to its y axis. ``robots`` are the streamed robots; empty:
-    all. A position that is older than ``stale_s`` is marked or withheld.
+    all. A position that is older than ``stale_s`` is marked or withheld. ``ros2`` is the port of the Zenoh
+    router of ROS 2, ``ros2_domain`` the domain ID; ``foxglove`` is the port of the Foxglove server.
     """
 
     host: str | None = None
@@ -93,6 +94,9 @@ class RigStream:
     stale_s: float | None = None
     mavlink: tuple[str, ...] = ()
     north_rad: float | None = None
+    ros2: int | None = None
+    ros2_domain: int | None = None
+    foxglove: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +157,10 @@ class Rig:
             if marker.id == marker_id and marker.robot is not None:
                 return marker.robot
         return f"marker_{marker_id}"
+
+    def robot_heights_m(self) -> dict[str, float | None]:
+        """Return the robots that the rig names, with the heights of their markers in m (None: unknown)."""
+        return {marker.robot: self.height_of(marker.id) for marker in self.markers if marker.robot}
 
     def knows(self, marker_id: int) -> bool:
         """Return whether an id is in use: it is listed, or the rig lists no markers of robots."""

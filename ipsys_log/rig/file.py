@@ -331,8 +331,10 @@ def _check_heights(rig: Rig, where: str) -> None:
 
 
 def _check_stream(stream: RigStream, rig: Rig, where: str) -> None:
-    if stream.vrpn is not None and not 0 < stream.vrpn <= _LARGEST_PORT:
-        raise IpsysError(f"{where}: vrpn is {stream.vrpn}; give a port from 1024 to {_LARGEST_PORT}")
+    for key in ("vrpn", "ros2", "foxglove"):
+        port = getattr(stream, key)
+        if port is not None and not 0 < port <= _LARGEST_PORT:
+            raise IpsysError(f"{where}: {key} is {port}; give a port from 1024 to {_LARGEST_PORT}")
     if stream.stale_s is not None and not stream.stale_s > 0:
         raise IpsysError(f"{where}: stale_s is {stream.stale_s:g}; give a time in s above 0")
     if stream.north_rad is not None and not abs(stream.north_rad) <= 2 * math.pi:

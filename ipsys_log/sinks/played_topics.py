@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
+from ipsys_log.messages import Message, Rig
+from ipsys_log.messages.channels import CALIBRATIONS, MEASUREMENTS, POSES, RIG_TOPIC, TRACKS, TRUTH
 from ipsys_log.runs.provenance import newest_run
 
-__all__ = ["PlayedTopics", "choose_topics"]
+__all__ = ["PlayedTopics", "choose_topics", "read_first", "viewed_topics"]
 
 
 class PlayedTopics(NamedTuple):
@@ -54,6 +55,20 @@ def choose_topics(session: Session, run: str | None = None, names: Sequence[str]
     if len(of_tracks) != 1:
         raise IpsysError(f"--topics: name one topic with tracks: {', '.join(sorted(tracks))}")
     return PlayedTopics(tuple(dict.fromkeys(names)), of_tracks[0], tracks[of_tracks[0]])
+
+
+def viewed_topics(session: Session, chosen: PlayedTopics, with_images: bool) -> PlayedTopics:
+    """Add the topics that only a viewer shows: the poses of the run, and images."""
+    poses = [] if chosen.run is None else session.topics(POSES, chosen.run)
+    images = session.images.values() if with_images else ()
+    return chosen._replace(topics=tuple(dict.fromkeys([*chosen.topics, *poses, *images])))
+
+
+def read_first(session: Session, rig: Rig | None) -> Iterator[Message]:
+    """Yield the rig in force and the camera intrinsics: a viewer needs them at any start of a playback."""
+    yield from session.messages(session.topics(CALIBRATIONS))
+    if rig is not None:
+        yield Message(RIG_TOPIC, session.start_ns, session.start_ns, rig)
 
 
 def _command(session: Session) -> str:

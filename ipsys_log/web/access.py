@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hmac
-import ipaddress
 from collections.abc import Iterator
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ipsys_log.sinks.streams.addresses import is_own_host
 
 __all__ = ["HEADER", "Guard"]
 
@@ -59,7 +60,7 @@ class Guard:
     def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if not self._is_ours(host):
+        if not is_own_host(host, self._names):
             return _refuse("this is not an address of this machine")
         if self._token is not None:
             token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
@@ -72,14 +73,6 @@ class Guard:
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
                 return _refuse("only the measuring page may write")
         return None
-
-    def _is_ours(self, host: str) -> bool:
-        name = host.rpartition(":")[0] if ":" in host and not host.endswith("]") else host
-        try:
-            ipaddress.ip_address(name.strip("[]"))
-        except ValueError:
-            return name.lower() in self._names
-        return True
 
     def _fits(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(), (self._token or "").encode())

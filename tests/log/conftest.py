@@ -1,6 +1,5 @@
 """Small logs, and independent readers for comparison."""
 
-import fcntl
 import subprocess
 import zlib
 from collections.abc import Callable
@@ -14,10 +13,10 @@ from mcap.stream_reader import StreamReader
 from ipsys_log.log.contents import RawMessage, Schema
 from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.writer import LogWriter
+from tests.node_packages import install
 
 IMAGE = Schema("foxglove.CompressedImage", "protobuf", b"image definition")
 POINT = Schema("ipsys.v1.Position", "protobuf", b"point definition")
-ROOT = Path(__file__).parents[2]
 
 Row = tuple[str, int, int, bytes]
 
@@ -86,11 +85,7 @@ def log(tmp_path: Path, rows: list[Row]) -> Path:
 @pytest.fixture(scope="session")
 def read_with_node() -> Callable[[Path], tuple[int, int, int]]:
     """Return a function that reads a log with @mcap/core: count and CRC-32 indexed, count streaming."""
-    home = ROOT / ".cache" / "node"
-    home.mkdir(parents=True, exist_ok=True)
-    with (home / "lock").open("w") as lock:  # two test processes must not install at the same time
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        _install(home)
+    home = install("node", "@mcap/core", "@mcap/support")
 
     def read(path: Path) -> tuple[int, int, int]:
         script = [str(Path(__file__).with_name("read_all.mjs")), str(home), str(path)]
@@ -100,28 +95,6 @@ def read_with_node() -> Callable[[Path], tuple[int, int, int]]:
         return count, crc, streamed
 
     return read
-
-
-def _install(home: Path) -> None:
-    if (home / "complete").exists():
-        return
-    command = [
-        "npm",
-        "install",
-        "--no-audit",
-        "--no-fund",
-        "--prefix",
-        str(home),
-        "@mcap/core",
-        "@mcap/support",
-    ]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
-    except (FileNotFoundError, subprocess.TimeoutExpired) as error:
-        pytest.skip(f"@mcap/core cannot be installed: {error}")
-    if done.returncode:
-        pytest.skip(f"@mcap/core cannot be installed: {done.stderr.strip().splitlines()[:2]}")
-    (home / "complete").touch()
 
 
 def crc_of(rows: list[Row]) -> int:

@@ -26,19 +26,26 @@ from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
 from ipsys_log.sinks.rerun.scene import draw_places, draw_rig, layout
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 
-__all__ = ["check_screen", "show_in_viewer", "viewer_command", "write_recording"]
+__all__ = [
+    "check_screen",
+    "last_line",
+    "show_in_viewer",
+    "stop_viewer",
+    "viewer_command",
+    "write_recording",
+]
 
 _INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open it on a machine with a screen"
 
 
-def viewer_command() -> list[str]:
+def viewer_command(port: int | None = None) -> list[str]:
     """Return the command of the viewer; it shows the recording from its standard input.
 
     The viewer also accepts connections, by default on all interfaces; this command limits it to this machine.
     With a fixed port, an open viewer would get the recording, even if it listens on all interfaces. So the
-    command selects a free port.
+    command selects a free port, unless a port is given.
     """
-    return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto", "-"]
+    return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port or "auto"), "-"]
 
 
 def check_screen(environment: Mapping[str, str]) -> None:
@@ -82,14 +89,14 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
             # The window was closed before the end, or it never opened: the exit code shows the case.
             _abandon(viewer.stdin)
         except BaseException:
-            _stop(viewer)
+            stop_viewer(viewer)
             _abandon(viewer.stdin)
             raise
         if viewer.wait() != 0:
-            raise IpsysError(f"the viewer cannot be shown ({_last_line(complaints)}); {_INSTEAD}")
+            raise IpsysError(f"the viewer cannot be shown ({last_line(complaints)}); {_INSTEAD}")
 
 
-def _stop(viewer: subprocess.Popen[bytes]) -> None:
+def stop_viewer(viewer: subprocess.Popen[bytes]) -> None:
     """End the viewer; its process is Python, which passes on an interrupt but not a termination."""
     if sys.platform == "win32":
         viewer.terminate()
@@ -105,7 +112,8 @@ def _abandon(pipe: IO[bytes]) -> None:
         return
 
 
-def _last_line(complaints: IO[bytes]) -> str:
+def last_line(complaints: IO[bytes]) -> str:
+    """Return the last line of an error output, without colours."""
     complaints.seek(0)
     text = re.sub(r"\x1b\[[0-9;]*m", "", complaints.read().decode(errors="replace"))
     lines = [line.strip() for line in text.splitlines() if line.strip()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from ipsys_log.errors import IpsysError
@@ -14,6 +15,8 @@ __all__ = [
     "Destination",
     "find_destination",
     "is_loopback",
+    "is_own_host",
+    "listen",
     "local_address",
     "open_datagrams",
     "refuse_bind",
@@ -44,6 +47,39 @@ class Destination:
 def is_loopback(address: str) -> bool:
     """Return whether only this machine can reach an address."""
     return ipaddress.ip_address(address).is_loopback
+
+
+def is_own_host(host: str, names: Collection[str]) -> bool:
+    """Return whether the header ``Host`` of a request is an IP address or one of the names of this machine.
+
+    A page of a foreign site may name a host of its own that leads to this machine (DNS rebinding).
+
+    Examples
+    --------
+    >>> is_own_host("[::1]:8000", []), is_own_host("evil.example:8000", ["localhost"])
+    (True, False)
+    """
+    name = host.rpartition(":")[0] if ":" in host and not host.endswith("]") else host
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return name.lower() in names
+    return True
+
+
+def listen(host: str, port: int, option: str, backlog: int) -> socket.socket:
+    """Return a listening socket of TCP.
+
+    Raises
+    ------
+    IpsysError
+        The port is in use or not allowed, or the host is not this machine.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=backlog)
+    except OSError as error:
+        raise refuse_bind(error, host, port, option) from error
 
 
 def find_destination(text: str, option: str) -> Destination:

@@ -107,6 +107,16 @@ class PoseSource:
         self._session, self._sequence, self._stale_s = session, 0, stale_s
         self._recent: dict[str, _Recent] = {}
 
+    @property
+    def session(self) -> int:
+        """The number of the session."""
+        return self._session
+
+    @property
+    def stale_s(self) -> float:
+        """The age from which a pose is stale, in s."""
+        return self._stale_s
+
     def read(self, message: Message) -> Iterator[StreamPose]:
         """Yield the poses of a message; a new session forgets all earlier poses."""
         if isinstance(message.payload, NewSession):

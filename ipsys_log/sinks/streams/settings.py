@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+import secrets
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import chain
 from math import pi
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 from ipsys_log.extras import check_installed
@@ -14,9 +17,13 @@ from ipsys_log.messages import RigStream
 from ipsys_log.sinks.sink import SelectiveSink, Warn
 from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
 from ipsys_log.sinks.streams.udp import UdpStream, read_key
-from ipsys_log.sinks.streams.vrpn import VrpnStream
+from ipsys_log.sinks.streams.vrpn import PORT, VrpnStream
 
-__all__ = ["Stream", "StreamSettings", "check_streams", "open_streams", "settings_of_rig"]
+__all__ = ["PORTS", "Stream", "StreamSettings", "check_streams", "open_streams", "settings_of_rig"]
+
+# The usual port of each server.
+PORTS = {"vrpn": PORT, "ros2": 7447, "foxglove": 8765}
+_SECRET_BYTES = 12
 
 
 class Stream(SelectiveSink, Protocol):
@@ -31,7 +38,15 @@ class Stream(SelectiveSink, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StreamSettings:
-    """The streams to open, as in `RigStream`; ``key`` is the path of the key file."""
+    """The streams to open, as in `RigStream`.
+
+    Attributes
+    ----------
+    key : the path of the key file.
+    images : Foxglove and Rerun show images, too.
+    rerun : show positions in Rerun, in a browser of this machine.
+    secret : the token in the address for Foxglove, new in each program.
+    """
 
     host: str | None = None
     udp: tuple[str, ...] = ()
@@ -41,6 +56,12 @@ class StreamSettings:
     north_rad: float = pi / 2
     robots: tuple[str, ...] = ()
     stale_s: float = STALE_S
+    ros2: int | None = None
+    ros2_domain: int = 0
+    foxglove: int | None = None
+    images: bool = False
+    rerun: bool = False
+    secret: str = field(default_factory=lambda: secrets.token_urlsafe(_SECRET_BYTES))
 
     @property
     def named_robots(self) -> tuple[str, ...]:
@@ -48,7 +69,13 @@ class StreamSettings:
         return (*self.robots, *(text.partition("=")[0] for text in self.mavlink))
 
     def __bool__(self) -> bool:
-        return bool(self.udp or self.mavlink) or self.vrpn is not None
+        servers = (self.vrpn, self.ros2, self.foxglove)
+        return bool(self.udp or self.mavlink or self.rerun) or any(port is not None for port in servers)
+
+    @property
+    def has_viewer(self) -> bool:
+        """True if a person watches: a viewer shows more than positions."""
+        return self.rerun or self.foxglove is not None
 
 
 def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
@@ -64,6 +91,9 @@ def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
         pi / 2 if stream.north_rad is None else stream.north_rad,
         stream.robots,
         STALE_S if stream.stale_s is None else stream.stale_s,
+        stream.ros2,
+        stream.ros2_domain or 0,
+        stream.foxglove,
     )
 
 
@@ -74,8 +104,9 @@ def open_streams(
     now_ns: Callable[[], int],
     warn: Warn,
     session: int | None = None,
-    robots: Sequence[str] = (),
-) -> Iterator[Sequence[Stream]]:
+    heights_m: Mapping[str, float | None] = MappingProxyType({}),
+    is_replayed: bool = False,
+) -> Iterator[list[Stream]]:
     """Open streams; their sockets are closed after the block.
 
     Parameters
@@ -84,7 +115,9 @@ def open_streams(
     now_ns : the clock of the ages.
     warn : makes an event for lost messages.
     session : the number of the first session; None: from the clock.
-    robots : all robots of the rig, announced before they are seen.
+    heights_m : all robots of the rig, announced before they are seen, with the heights of their markers
+        (None: unknown).
+    is_replayed : the times are those of a recording.
 
     Raises
     ------
@@ -93,27 +126,31 @@ def open_streams(
     """
     number = first_session(now_ns()) if session is None else session
 
-    def poses(named: Sequence[str] = settings.robots) -> PoseSource:
+    def poses(named: Collection[str] = settings.robots) -> PoseSource:
         return PoseSource(topics, now_ns, number, named, settings.stale_s)
 
     key = None if settings.key is None else read_key(settings.key)
+    sent_m = {name: m for name, m in heights_m.items() if not settings.robots or name in settings.robots}
     with ExitStack() as stack:
         streams: list[Stream] = []
         for target in dict.fromkeys(settings.udp):
             stream = UdpStream(target, settings.host, poses(), warn, key)
             streams.append(stack.enter_context(closing(stream)))
         if settings.vrpn is not None:
-            named = [robot for robot in robots if not settings.robots or robot in settings.robots]
-            server = VrpnStream(settings.vrpn, settings.host, poses(), warn, named)
+            server = VrpnStream(settings.vrpn, settings.host, poses(), warn, list(sent_m))
             streams.append(stack.enter_context(closing(server)))
-        for autopilot in _autopilots(settings, poses, now_ns, warn):
-            streams.append(stack.enter_context(closing(autopilot)))
+        for other in chain(
+            _autopilots(settings, poses, now_ns, warn),
+            _ros2_nodes(settings, poses(), now_ns, warn, sent_m, is_replayed),
+            _foxglove_servers(settings, number, topics, warn, is_replayed),
+        ):
+            streams.append(stack.enter_context(closing(other)))
         yield streams
 
 
 def _autopilots(
     settings: StreamSettings,
-    poses: Callable[[Sequence[str]], PoseSource],
+    poses: Callable[[Collection[str]], PoseSource],
     now_ns: Callable[[], int],
     warn: Warn,
 ) -> Iterator[Stream]:
@@ -125,6 +162,35 @@ def _autopilots(
         for endpoint in [parse_endpoint(text) for text in dict.fromkeys(settings.mavlink)]:
             source = poses([endpoint.robot])
             yield MavlinkStream(endpoint, settings.host, source, now_ns, warn, settings.north_rad)
+
+
+def _ros2_nodes(
+    settings: StreamSettings,
+    poses: PoseSource,
+    now_ns: Callable[[], int],
+    warn: Warn,
+    heights_m: Mapping[str, float | None],
+    is_replayed: bool,
+) -> Iterator[Stream]:
+    """Yield the stream to ROS 2, if there is one; its libraries are optional, and loaded only here."""
+    if settings.ros2 is not None:
+        check_installed("--ros2 needs", "zenoh", "rosbags", "xxhash")
+        from ipsys_log.sinks.streams.ros2 import Ros2Stream
+
+        where = (settings.ros2, settings.ros2_domain, settings.host)
+        yield Ros2Stream(*where, poses, now_ns, warn, heights_m, is_replayed)
+
+
+def _foxglove_servers(
+    settings: StreamSettings, session: int, topics: Collection[str], warn: Warn, is_replayed: bool
+) -> Iterator[Stream]:
+    """Yield the server for Foxglove, if there is one; its library is optional, and loaded only here."""
+    if settings.foxglove is not None:
+        check_installed("--foxglove needs", "websockets")
+        from ipsys_log.sinks.streams.foxglove import FoxgloveStream
+
+        where = (settings.foxglove, settings.host, settings.secret)
+        yield FoxgloveStream(*where, session, topics, warn, settings.images, is_replayed)
 
 
 def check_streams(settings: StreamSettings) -> list[str]:

@@ -1,0 +1,243 @@
+"""Foxglove stream: a WebSocket server that shows the messages of a recording or a replay in Foxglove.
+
+The server of ``foxglove-sdk`` accepts every Origin and Host. In front of it, a check could not prevent that a
+page in a browser reaches its port. So this server speaks the protocol itself and checks each connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import http
+import logging
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from ipsys_log.log.codec import PAYLOADS, encode
+from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo, Tracks
+from ipsys_log.messages.channels import IMAGES
+from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, is_own_host, listen
+from ipsys_log.sinks.streams.foxglove_client import Client
+from ipsys_log.sinks.streams.foxglove_messages import (
+    SUBPROTOCOLS,
+    Advertised,
+    pack_time,
+    write_advertise,
+    write_server_info,
+)
+from ipsys_log.sinks.streams.poses import NewSession
+
+__all__ = ["FoxgloveStream"]
+
+_BACKLOG = 16
+_MOST_CLIENTS = 32
+_LARGEST_MESSAGE = 1 << 16  # bytes, of a client
+_MOST_REFUSALS = 10  # events; others could fill the log
+_MOST_CHANNELS = 1000
+# The app in a browser, and the desktop app; a page of a file has the origin "null" in a browser.
+_ORIGINS = frozenset({"https://app.foxglove.dev", "https://app.foxglove.com", "file://"})
+# A later subscriber gets the last message of these types.
+_LATCHED = (Rig, CameraCalibration)
+# The server prints nothing, because the recorder uses the terminal.
+_LOGGER = logging.Logger("foxglove")
+_LOGGER.addHandler(logging.NullHandler())
+
+
+class FoxgloveStream:
+    """A :class:`~ipsys_log.sinks.sink.Sink` that sends messages to Foxglove. It carries out no command.
+
+    A connection needs the secret in its address, a Host of this machine, and the Origin of Foxglove or none.
+
+    Parameters
+    ----------
+    port : the port; 0 means any free port.
+    host : the address of this machine to listen on; None: only this machine.
+    secret : the token in the address.
+    session : the number of the session.
+    topics : the topics of the tracks, announced before the first message.
+    with_images : send images, too.
+    is_replayed : the times are those of a recording; clients get them as the time of the server.
+
+    Raises
+    ------
+    IpsysError
+        The port is in use or not allowed, or the host is not this machine.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        host: str | None,
+        secret: str,
+        session: int,
+        topics: Collection[str],
+        warn: Warn,
+        with_images: bool = False,
+        is_replayed: bool = False,
+    ) -> None:
+        images = (*IMAGES.payloads, SkippedVideo)
+        shown = {payload for payload in PAYLOADS.values() if with_images or payload not in images}
+        self.payloads: tuple[type, ...] = (*shown, NewSession, *(images if with_images else ()))
+        self._host, self._secret, self._session = host or LOOPBACK, secret, session
+        self._warn, self._is_replayed, self._time_ns = warn, is_replayed, -1
+        self._listening = listen(self._host, port, "--foxglove", _BACKLOG)
+        self.port: int = self._listening.getsockname()[1]
+        self.name = f"Foxglove port {self.port}"
+        self._drops, self._refusals = DropReport(self.name, warn), 0
+        self._channels: dict[str, Advertised] = {}
+        self._latched: dict[str, tuple[int, bytes]] = {}
+        self._clients: set[Client] = set()
+        for topic in topics:
+            self._advertise(topic, Tracks)
+        self._loop = asyncio.new_event_loop()
+        self._ended = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
+        self._thread.start()
+
+    def describe(self) -> str:
+        """Return one line about the receivers of the messages, with the address to open in Foxglove."""
+        is_own = is_loopback(self._host)
+        who = (
+            "only this machine" if is_own else f"every computer that reaches {self._host} and has the secret"
+        )
+        name = f"[{self._host}]" if ":" in self._host else self._host
+        return f"Foxglove: {who}; open ws://{name}:{self.port}/?token={self._secret}"
+
+    @property
+    def client_count(self) -> int:
+        """The number of clients."""
+        return len(self._clients)
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        """Send the messages until they end."""
+        for message in messages:
+            if message is None:
+                continue
+            if isinstance(message.payload, NewSession):
+                self._call(self._begin, message.payload.number, message.publish_time_ns)
+            else:
+                data = encode(message.payload)
+                self._call(self._send, message.topic, type(message.payload), message.publish_time_ns, data)
+        self._drops.finish()
+
+    def close(self) -> None:
+        """Disconnect the clients and close the socket."""
+        self._call(self._ended.set)
+        self._thread.join()
+        self._listening.close()
+
+    def _call(self, function: Callable[..., object], *arguments: object) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._serve())
+
+    async def _serve(self) -> None:
+        self._listening.setblocking(False)
+        async with serve(
+            self._handle,
+            sock=self._listening,
+            process_request=self._check,
+            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+            max_size=_LARGEST_MESSAGE,
+            compression=None,
+            server_header=None,
+            close_timeout=1,
+            logger=_LOGGER,
+        ) as server:
+            await self._ended.wait()
+            self._abort(server)
+
+    @staticmethod
+    def _abort(server: Server) -> None:
+        """End all connections now: a stalled client would delay the end."""
+        for connection in server.connections:
+            connection.transport.abort()
+
+    def _check(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse a connection before the handshake, unless it comes from a client with the secret."""
+        address = connection.remote_address
+        name = f"{address[0]}:{address[1]}"
+        headers = request.headers
+        if not any(is_own_host(host, ("localhost",)) for host in headers.get_all("Host")):
+            return self._refuse(connection, name, "names another host")
+        origins = headers.get_all("Origin")
+        if any(origin not in _ORIGINS for origin in origins):
+            return self._refuse(connection, name, "comes from a page that is not Foxglove")
+        token = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if not hmac.compare_digest(token.encode(), self._secret.encode()):
+            return self._refuse(
+                connection, name, "has not the secret; use the full address that ipsys printed"
+            )
+        if len(self._clients) >= _MOST_CLIENTS:
+            return self._refuse(connection, name, f"is too much: there are {_MOST_CLIENTS} clients already")
+        return None
+
+    def _refuse(self, connection: ServerConnection, client: str, reason: str) -> Response:
+        self._refusals += 1
+        if self._refusals <= _MOST_REFUSALS:
+            self._warn("stream_client", f"{self.name}: client {client} is refused: it {reason}")
+        return connection.respond(http.HTTPStatus.FORBIDDEN, f"refused: the connection {reason}\n")
+
+    async def _handle(self, connection: ServerConnection) -> None:
+        client = Client(connection, self._drops)
+        client.put(write_server_info("ipsys", self._session, self._is_replayed))
+        client.put(write_advertise(list(self._channels.values())))
+        self._clients.add(client)
+        sending = asyncio.create_task(client.send())
+        try:
+            async for text in connection:
+                self._subscribe(client, text)
+        except (ConnectionClosed, ValueError, OSError):
+            pass  # a client that vanishes, or sends something else
+        finally:
+            self._clients.discard(client)
+            sending.cancel()
+
+    def _subscribe(self, client: Client, text: str | bytes) -> None:
+        """Read a message of a client; a new subscriber gets the last message of latched types."""
+        if isinstance(text, bytes):
+            raise ValueError("a client cannot publish")
+        topics = {channel.number: channel.topic for channel in self._channels.values()}
+        for number in client.subscriptions.read(text):
+            if number in topics and topics[number] in self._latched:
+                client.put_message(number, *self._latched[topics[number]], is_image=False)
+
+    def _send(self, topic: str, payload: type, time_ns: int, data: bytes) -> None:
+        channel = self._channels.get(topic) or self._advertise(topic, payload)
+        if channel is None:
+            return
+        self._send_time(time_ns)
+        if payload in _LATCHED:
+            self._latched[topic] = time_ns, data
+        for client in self._clients:
+            client.put_message(channel.number, time_ns, data, payload in IMAGES.payloads)
+
+    def _advertise(self, topic: str, payload: type) -> Advertised | None:
+        if len(self._channels) >= _MOST_CHANNELS:
+            return None
+        channel = self._channels[topic] = Advertised(len(self._channels) + 1, topic, payload)
+        for client in self._clients:
+            client.put(write_advertise([channel]))
+        return channel
+
+    def _begin(self, session: int, time_ns: int) -> None:
+        """Begin a session: a time that goes back makes Foxglove forget earlier messages."""
+        self._session = session
+        self._send_time(time_ns)
+
+    def _send_time(self, time_ns: int) -> None:
+        if self._is_replayed and time_ns != self._time_ns:
+            self._time_ns = time_ns
+            for client in self._clients:
+                client.put(pack_time(time_ns))

@@ -35,6 +35,8 @@ class Purpose(IntEnum):
     WOBBLE = 15
     GEOMETRY = 16
     PRINTS = 17
+    WHEELS = 18
+    RELAY = 19
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

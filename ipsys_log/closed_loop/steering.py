@@ -42,6 +42,7 @@ class Steering:
         self._start_ns, self._number = start_ns, 0
         self._period_ns = round(NS_PER_S / run.tick_hz)
         self._states: dict[str, tuple[str | None, int | None]] = {}
+        self._begun: set[str] = set()
 
     @property
     def next_ns(self) -> int:
@@ -94,11 +95,15 @@ class Steering:
         if before == state:
             return
         at = f"{self.time_s(time_ns):5.1f} s  {robot}"
-        if command.state == STOPPED and before is not None:
-            self._say(f"{at}: stopped, it gets no positions")
-        elif before is not None and before[0] == STOPPED:
+        if command.state == STOPPED:
+            # Before its first position, a robot is stopped too.
+            if robot in self._begun:
+                self._say(f"{at}: stopped, it gets no positions")
+            return
+        if before is not None and before[0] == STOPPED and robot in self._begun:
             self._say(f"{at}: goes on")
-        elif command.state == HOLDING:
+        self._begun.add(robot)
+        if command.state == HOLDING:
             self._say(f"{at}: at waypoint {command.waypoint}")
         elif command.state == FINISHED:
             self._say(f"{at}: finished")

@@ -45,11 +45,14 @@ class Controller:
         held_s = 0.0 if self.since_s is None else now_s - self.since_s
         if held_s > HOLD_S and not is_last:
             self.number, self.since_s = self.number + 1, None
-        state = "driving" if self.since_s is None else "finished" if is_last and held_s > HOLD_S else "holding"
+        state = (
+            "driving" if self.since_s is None else "finished" if is_last and held_s > HOLD_S else "holding"
+        )
         return self.wheels, state
 
     def follow(self, pose, now_s):
-        x_m, y_m = (w - p for w, p in zip(self.waypoints[self.number], (pose.x_m, pose.y_m)))
+        goal_x_m, goal_y_m = self.waypoints[self.number]
+        x_m, y_m = goal_x_m - pose.x_m, goal_y_m - pose.y_m
         left_m = hypot(x_m, y_m)
         if left_m < (ARRIVED_M if self.since_s is None else LEFT_M):
             self.since_s = now_s if self.since_s is None else self.since_s

@@ -83,7 +83,9 @@ class VrpnPositions:
                 length, seconds, micros, sender, kind, _ = self.HEADER.unpack_from(self.data)
                 if len(self.data) < length + -length % 8:
                     break
-                self.read(self.data[self.HEADER.size : length], seconds * 10**9 + micros * 1000, sender, kind, now_s)
+                self.read(
+                    self.data[self.HEADER.size : length], seconds * 10**9 + micros * 1000, sender, kind, now_s
+                )
                 self.data = self.data[length + -length % 8 :]
 
     def read(self, content, time_ns, sender, kind, now_s):

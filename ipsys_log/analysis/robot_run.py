@@ -61,13 +61,14 @@ class WaypointResult:
 class Stop:
     """A robot without positions: the time of its stop, and the age of its last position then.
 
-    ``moved_m`` is the true distance that it moved from half a second after the stop to the end of the stop;
-    None without a ground truth.
+    ``braking_m`` is the true distance that it moved from its last position to half a second after the stop,
+    and ``moved_m`` the distance after that; None without a ground truth.
     """
 
     start_ns: int
     end_ns: int
     age_s: float | None
+    braking_m: float | None
     moved_m: float | None
 
 
@@ -95,7 +96,7 @@ class RobotResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotRunResult:
-    """The results of a robot run; ``nearest_m`` is the smallest distance between the centres of two robots."""
+    """The results of a robot run; ``nearest_m`` is the smallest distance of two robots, between centres."""
 
     start_ns: int
     end_ns: int
@@ -162,7 +163,9 @@ def _robot(
         for number, place in enumerate(path.waypoints, 1)
         if (result := _waypoint(number, place, commands, true, errors)) is not None
     ]
-    whole = {run: error_statistics(rows[:, 1], independent=False) for run, rows in errors.items() if len(rows)}
+    whole = {
+        run: error_statistics(rows[:, 1], independent=False) for run, rows in errors.items() if len(rows)
+    }
     rows = [(c.position_time, c.x_m, c.y_m) for c in commands if c.position_time is not None]
     received = dict.fromkeys(rows)
     return RobotResult(
@@ -250,14 +253,24 @@ def _stops(commands: Sequence[WheelCommand], true: Sightings | None) -> list[Sto
         if is_stopped:
             rows = list(group)
             first, last = rows[0], rows[-1]
-            age_s = None if first.position_time is None else (first.timestamp - first.position_time) / NS_PER_S
-            moved_m = None
-            if true is not None:
-                within = _within(true.times_ns, first.timestamp + _STANDS_NS, last.timestamp)
-                steps_m = np.linalg.norm(np.diff(true.points_m[within, :2], axis=0), axis=1)
-                moved_m = float(steps_m.sum())
-            stops.append(Stop(first.timestamp, last.timestamp, age_s, moved_m))
+            seen_ns = first.timestamp if first.position_time is None else first.position_time
+            stands_ns = first.timestamp + _STANDS_NS
+            stops.append(
+                Stop(
+                    first.timestamp,
+                    last.timestamp,
+                    None if first.position_time is None else (first.timestamp - seen_ns) / NS_PER_S,
+                    None if true is None else _length_m(true, seen_ns, stands_ns),
+                    None if true is None else _length_m(true, stands_ns, last.timestamp),
+                )
+            )
     return stops
+
+
+def _length_m(true: Sightings, start_ns: int, end_ns: int) -> float:
+    """Return the length of a true path between two times."""
+    points_m = true.points_m[_within(true.times_ns, start_ns, end_ns), :2]
+    return float(np.linalg.norm(np.diff(points_m, axis=0), axis=1).sum())
 
 
 def _nearest_m(paths: Sequence[Sightings]) -> float | None:

@@ -47,7 +47,9 @@ class _Stopped(Exception):  # noqa: N818
 class _Images:
     """The images of a film, rendered by a separate thread in the order of their use."""
 
-    def __init__(self, name: str, make_film: Callable[[Check], Film], timing: FrameTiming, clock: Clock) -> None:
+    def __init__(
+        self, name: str, make_film: Callable[[Check], Film], timing: FrameTiming, clock: Clock
+    ) -> None:
         self._film: Film | None = None
         self._drawn: dict[int, bytes] = {}
         self._fault: BaseException | None = None

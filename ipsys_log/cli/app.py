@@ -15,6 +15,7 @@ from ipsys_log.cli import (
     calibrate_lab,
     cameras,
     compare,
+    drive,
     imports,
     inspect,
     markers,
@@ -40,7 +41,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
     "Accuracy, and the next points to measure": ("evaluate", "plan", "report"),
     "Inspect a log": ("info", "runs", "view", "stream", "verify", "diff", "latency", "repair"),
     _STAGES: (),
-    "Without cameras": ("simulate", "import"),
+    "Without cameras": ("simulate", "drive", "import"),
 }
 
 
@@ -135,6 +136,12 @@ ipsys latency monday.mcap --plot latency.pdf
     "repair": """
 ipsys repair monday.mcap
 """,
+    "drive": """
+ipsys drive --model-from cal.mcap -o run.mcap      # robot run of the paper
+ipsys drive --model-from cal.mcap -o run.mcap --model poly --model best
+ipsys drive --model-from cal.mcap -o three.mcap --robots 3 --lockstep
+ipsys drive --model-from cal.mcap -o run.mcap --loss 0.05 --fail white=20:5
+""",
     "simulate": """
 ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4
 """,
@@ -190,7 +197,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, inspect, stream, compare),
+    *(plan, inspect, stream, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

@@ -116,7 +116,14 @@ def _command(
 
 def _start_relay(run: RobotRun, number: int, port: int, target: int, stack: ExitStack) -> RelayLink:
     command = [sys.executable, "-m", "ipsys_log.closed_loop.relay", "--port", str(port), "--to", str(target)]
-    command += ["--loss", str(run.loss), "--delay-s", str(run.delay_s), "--seed", str(run.seed + 1000 * number)]
+    command += [
+        "--loss",
+        str(run.loss),
+        "--delay-s",
+        str(run.delay_s),
+        "--seed",
+        str(run.seed + 1000 * number),
+    ]
     process = _start([*command, *["--lockstep"] * run.lockstep], stack, subprocess.PIPE)
     assert process.stdout is not None
     stack.callback(process.stdout.close)
@@ -127,9 +134,7 @@ def _start_relay(run: RobotRun, number: int, port: int, target: int, stack: Exit
     return link
 
 
-def _start(
-    command: Sequence[str], stack: ExitStack, output: int | None = None
-) -> subprocess.Popen[bytes]:
+def _start(command: Sequence[str], stack: ExitStack, output: int | None = None) -> subprocess.Popen[bytes]:
     try:
         # A group of its own: Ctrl-C in the terminal ends the simulator, and this ends its programs.
         process = subprocess.Popen(command, stdout=output, process_group=0, env=_environment())

@@ -25,7 +25,7 @@ from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.simulation.robot_lab import RobotLab, robot_rig
 from ipsys_log.sinks.sink import Consumer
-from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
+from ipsys_log.sinks.streams.settings import Stream, open_streams
 from ipsys_log.stages.fit import model_run
 
 __all__ = ["ROBOT_RUN", "drive_robots"]

@@ -105,8 +105,8 @@ class RobotRun:
         """
         if not self.program.is_file():
             raise IpsysError(
-                f"--program {self.program}: does not exist; name the program of the robots, such as {PROGRAM} "
-                "of the source of ipsys"
+                f"--program {self.program}: does not exist; name the program of the robots, such as "
+                f"{PROGRAM} in the source of ipsys"
             )
         if self.over not in ("udp", "vrpn"):
             raise IpsysError(f"--over {self.over}: is no stream of robots; use udp or vrpn")
@@ -119,7 +119,8 @@ class RobotRun:
         for failure in self.failures:
             if failure.camera not in self.lab.cameras:
                 raise IpsysError(
-                    f"--fail {failure.camera}: the lab has no such camera; it has {', '.join(self.lab.cameras)}"
+                    f"--fail {failure.camera}: the lab has no camera of this name; it has "
+                    f"{', '.join(self.lab.cameras)}"
                 )
         self._check_waypoints()
 
@@ -183,8 +184,8 @@ class RobotRun:
                         wanted = wanted or probe.getsockname()[1]
                 except OSError as error:
                     raise IpsysError(
-                        f"--port {self.port}: port {wanted} is in use, perhaps by another run; end it, or give "
-                        "another port"
+                        f"--port {self.port}: port {wanted} is in use, perhaps by another run; end it, or "
+                        "give another port"
                     ) from error
                 ports.append(int(wanted))
             return ports

@@ -75,7 +75,10 @@ def stop_line(robot: str, stop: Stop, start_ns: int) -> str:
     text = f"{robot}: stopped from {begin_s:.1f} to {end_s:.1f} s"
     if stop.age_s is not None:
         text += f", {stop.age_s:.2f} s after its last position"
-    return text if stop.moved_m is None else f"{text}; it then moved by {CM_PER_M * stop.moved_m:.1f} cm"
+    if stop.braking_m is None or stop.moved_m is None:
+        return text
+    braking_cm, moved_cm = CM_PER_M * stop.braking_m, CM_PER_M * stop.moved_m
+    return f"{text}; it moved {braking_cm:.1f} cm since then, {moved_cm:.1f} cm after its stop"
 
 
 def _three(errors: ErrorStatistics | None) -> str:
@@ -117,6 +120,7 @@ def _robot_json(robot: RobotResult, start_ns: int) -> dict[str, Any]:
                 "start_s": (stop.start_ns - start_ns) / NS_PER_S,
                 "end_s": (stop.end_ns - start_ns) / NS_PER_S,
                 "age_s": stop.age_s,
+                "braking_m": stop.braking_m,
                 "moved_m": stop.moved_m,
             }
             for stop in robot.stops

@@ -79,7 +79,9 @@ def _panels(result: RobotRunResult, robot: RobotResult) -> list[_Panel]:
     def at(number: int) -> _Panel:
         point = reached.get(number)
         time_ns = result.end_ns if point is None else (point.start_ns + point.end_ns) // 2
-        return _Panel(f"at P{number} ({robot.path[number - 1].x_m:g}, {robot.path[number - 1].y_m:g})", time_ns)
+        return _Panel(
+            f"at P{number} ({robot.path[number - 1].x_m:g}, {robot.path[number - 1].y_m:g})", time_ns
+        )
 
     def between(number: int) -> _Panel:
         first, second = reached.get(number), reached.get(number + 1)

@@ -27,8 +27,8 @@ class Chassis:
     fastest_m_s : largest speed of a wheel on the floor.
     track_m : distance between the wheels.
     lag_s : time constant of the motors.
-    slip, slip_sigma, slip_time_s : mean share of the speed that a wheel loses, its standard deviation, and the
-        time in which it changes.
+    slip, slip_sigma, slip_time_s : mean share of the speed that a wheel loses, its standard deviation, and
+        the time in which it changes.
     noise : standard deviation of the speed in each step, as a share of the speed.
     watchdog_s : the wheels stop if there is no command for this time.
     """

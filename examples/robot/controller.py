@@ -1,4 +1,4 @@
-"""The controller of the robot, in 60 lines: replace it by your own."""
+"""The controller of the robot, with two PID controllers: replace it by your own."""
 
 from math import atan2, cos, hypot, pi, remainder
 

@@ -65,6 +65,7 @@ class VrpnPositions:
         while len(self.data) < len(self.GREETING):
             self.data += self.more()
         self.data = self.data[len(self.GREETING) :]
+        self.parse(0.0)
         while b"vrpn_Tracker Pos_Quat" not in self.types.values():  # then the server knows this client
             self.receive(1.0, 0.0)
 
@@ -79,14 +80,17 @@ class VrpnPositions:
         while select.select([self.socket], [], [], wait_s)[0]:
             wait_s = 0.0
             self.data += self.more()
-            while len(self.data) >= self.HEADER.size:
-                length, seconds, micros, sender, kind, _ = self.HEADER.unpack_from(self.data)
-                if len(self.data) < length + -length % 8:
-                    break
-                self.read(
-                    self.data[self.HEADER.size : length], seconds * 10**9 + micros * 1000, sender, kind, now_s
-                )
-                self.data = self.data[length + -length % 8 :]
+            self.parse(now_s)
+
+    def parse(self, now_s):
+        while len(self.data) >= self.HEADER.size:
+            length, seconds, micros, sender, kind, _ = self.HEADER.unpack_from(self.data)
+            padded = length + -length % 8
+            if len(self.data) < padded:
+                break
+            time_ns = seconds * 10**9 + micros * 1000
+            self.read(self.data[self.HEADER.size : length], time_ns, sender, kind, now_s)
+            self.data = self.data[padded:]
 
     def read(self, content, time_ns, sender, kind, now_s):
         if kind in (-1, -2):  # the name of a robot, or of a type of messages

@@ -14,7 +14,8 @@ LAYERS = (
     ("errors", "interrupts"), ("units", "plain_text", "extras"), ("messages",), ("geometry", "rig"),
     ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("stages",), ("runs",),
     ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",),
-    ("tracker",), ("player",), ("closed_loop",), ("api",), ("report",), ("web",), ("cli",), ("__main__", "__init__"),
+    ("tracker",), ("player",), ("closed_loop",), ("api",), ("report",), ("web",), ("cli",),
+    ("__main__", "__init__"),
 )  # fmt: skip
 LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -12,6 +12,7 @@ The table has one row for each waypoint: medians, 95th percentiles and maxima ov
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -58,7 +59,8 @@ def measure(options: argparse.Namespace) -> Report:
         folder = Path(name)
         calibrated = folder / "cal.mcap"
         models = _MODELS[:1] if options.smoke else _MODELS
-        replay([drawn(_SMALL if options.smoke else _LAB)], Request(models=models), output=calibrated)
+        shutil.copy(drawn(_SMALL if options.smoke else _LAB), calibrated)
+        replay([calibrated], Request(models=models))
         for case in cases[:1] if options.smoke else cases:
             robots = []
             for seed in range(1 if options.smoke else options.seeds):

@@ -250,22 +250,26 @@ def read_lab(log: Path, lab: LabSettings) -> LabSettings:
     Raises
     ------
     IpsysError
-        The log is not of this lab: its camera intrinsics differ.
+        The log is not of this lab: its camera intrinsics are missing or differ.
     """
     with Session([log]) as session:
         lenses: dict[str, CameraCalibration] = {
             name: session.payloads([topic])[-1] for name, topic in session.calibrations.items()
         }
-    first = next(iter(lenses.values()), None)
-    if first is not None:
-        lab = replace(lab, width=first.width, height=first.height)
-        if all(
-            camera.name in lenses
-            and np.array_equal(lenses[camera.name].K, camera.lens.K)
-            and np.array_equal(lenses[camera.name].D, camera.lens.D)
-            for camera in mount_cameras(lab)
-        ):
-            return lab
+    if not lenses:
+        raise IpsysError(
+            f"--model-from {log}: has no camera intrinsics; give the log of the simulated lab, with its "
+            "model in it: ipsys replay LOG, without -o"
+        )
+    first = next(iter(lenses.values()))
+    lab = replace(lab, width=first.width, height=first.height)
+    if all(
+        camera.name in lenses
+        and np.array_equal(lenses[camera.name].K, camera.lens.K)
+        and np.array_equal(lenses[camera.name].D, camera.lens.D)
+        for camera in mount_cameras(lab)
+    ):
+        return lab
     raise IpsysError(
         f"--model-from {log}: is not a log of the simulated lab with seed {lab.seed}; make one with: ipsys "
         f"simulate -o cal.mcap --seed {lab.seed}; ipsys replay cal.mcap"

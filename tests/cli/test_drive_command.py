@@ -39,21 +39,30 @@ REFUSED = {
 
 @pytest.mark.parametrize("options", REFUSED, ids=" ".join)
 def test_wrong_option_is_refused(
-    options: tuple[str, ...], calibration: Path, ipsys: Ipsys, tmp_path: Path
+    options: tuple[str, ...], replayed_log: Path, ipsys: Ipsys, tmp_path: Path
 ) -> None:
     program = () if "--program" in options else ("--program", PROGRAM)
     target = tmp_path / "run.mcap"
-    done = ipsys("drive", "--model-from", calibration, "-o", target, "--port", "0", *program, *options)
+    done = ipsys("drive", "--model-from", replayed_log, "-o", target, "--port", "0", *program, *options)
     assert (done.code, done.err) == (1, f"ipsys: {REFUSED[options]}\n")
     assert not target.exists()
 
 
-def test_log_of_another_lab_is_refused(calibration: Path, ipsys: Ipsys, tmp_path: Path) -> None:
-    options = ("--model-from", calibration, "-o", tmp_path / "run.mcap", "--lab-seed", "3")
+def test_log_of_another_lab_is_refused(replayed_log: Path, ipsys: Ipsys, tmp_path: Path) -> None:
+    options = ("--model-from", replayed_log, "-o", tmp_path / "run.mcap", "--lab-seed", "3")
     done = ipsys("drive", *options, "--program", PROGRAM)
     expected = (
-        f"ipsys: --model-from {calibration}: is not a log of the simulated lab with seed 3; make one with: "
+        f"ipsys: --model-from {replayed_log}: is not a log of the simulated lab with seed 3; make one with: "
         "ipsys simulate -o cal.mcap --seed 3; ipsys replay cal.mcap\n"
+    )
+    assert (done.code, done.err) == (1, expected)
+
+
+def test_log_without_intrinsics_is_refused(calibration: Path, ipsys: Ipsys, tmp_path: Path) -> None:
+    done = ipsys("drive", "--model-from", calibration, "-o", tmp_path / "run.mcap", "--program", PROGRAM)
+    expected = (
+        f"ipsys: --model-from {calibration}: has no camera intrinsics; give the log of the simulated lab, "
+        "with its model in it: ipsys replay LOG, without -o\n"
     )
     assert (done.code, done.err) == (1, expected)
 
@@ -66,11 +75,11 @@ def test_log_without_model_is_refused(lab_log: Path, ipsys: Ipsys, tmp_path: Pat
     assert done.err.count("\n") == 1
 
 
-def test_port_in_use_is_refused(calibration: Path, ipsys: Ipsys, tmp_path: Path) -> None:
+def test_port_in_use_is_refused(replayed_log: Path, ipsys: Ipsys, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        options = ("--model-from", calibration, "-o", tmp_path / "run.mcap", "--port", port)
+        options = ("--model-from", replayed_log, "-o", tmp_path / "run.mcap", "--port", port)
         done = ipsys("drive", *options, "--program", PROGRAM)
     expected = (
         f"ipsys: --port {port}: port {port} is in use, perhaps by another run; end it, or give another port\n"
@@ -78,10 +87,10 @@ def test_port_in_use_is_refused(calibration: Path, ipsys: Ipsys, tmp_path: Path)
     assert (done.code, done.err) == (1, expected)
 
 
-def test_program_that_ends_is_named(calibration: Path, ipsys: Ipsys, tmp_path: Path) -> None:
+def test_program_that_ends_is_named(replayed_log: Path, ipsys: Ipsys, tmp_path: Path) -> None:
     program = tmp_path / "robot.py"
     program.write_text("raise SystemExit(3)")
-    options = ("--model-from", calibration, "-o", tmp_path / "run.mcap", "--port", "0", "--lockstep")
+    options = ("--model-from", replayed_log, "-o", tmp_path / "run.mcap", "--port", "0", "--lockstep")
     done = ipsys("drive", *options, "--program", program)
     expected = f"robot_0: its program {program} has ended with exit code 3; its messages are above\n"
     assert (done.code, done.err.splitlines(keepends=True)[-1]) == (1, f"ipsys: {expected}")

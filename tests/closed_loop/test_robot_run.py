@@ -25,22 +25,22 @@ pytestmark = pytest.mark.slow
 SHORT = "robot_0=2,2.2 2.3,2.2"
 
 
-def settings_of(calibration: Path, *paths: str, robots: int = 1, rate_hz: float = 4.0) -> RobotRun:
-    lab = read_lab(calibration, LabSettings(markers=robots, rate_hz=rate_hz))
+def settings_of(replayed_log: Path, *paths: str, robots: int = 1, rate_hz: float = 4.0) -> RobotRun:
+    lab = read_lab(replayed_log, LabSettings(markers=robots, rate_hz=rate_hz))
     return RobotRun(
         lab, choose_paths(robots, paths), ROOT / PROGRAM, lockstep=True, port=0, tick_hz=10.0, longest_s=120
     )
 
 
 @pytest.fixture(scope="module")
-def faulty_log(calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def faulty_log(replayed_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The path of the paper, with 5 % lost datagrams, 100 ms of delay, and a camera that fails for 5 s."""
     run = replace(
-        settings_of(calibration), loss=0.05, delay_s=0.1, failures=(CameraFailure("white", 22.0, 5.0),)
+        settings_of(replayed_log), loss=0.05, delay_s=0.1, failures=(CameraFailure("white", 22.0, 5.0),)
     )
 
     def write(folder: Path) -> None:
-        drive_robots(run, folder / "run.mcap", Request(models=("poly",), model_from=calibration))
+        drive_robots(run, folder / "run.mcap", Request(models=("poly",), model_from=replayed_log))
 
     return make_once(tmp_path_factory, "robot_run", write) / "run.mcap"
 
@@ -119,34 +119,34 @@ def test_report_draws_the_drive(faulty_log: Path, ipsys: Ipsys, tmp_path: Path) 
 
 
 @pytest.fixture
-def short_run(calibration: Path, tmp_path: Path) -> Callable[[RobotRun, str], Path]:
+def short_run(replayed_log: Path, tmp_path: Path) -> Callable[[RobotRun, str], Path]:
     def drive(run: RobotRun, name: str) -> Path:
-        drive_robots(run, tmp_path / name, Request(models=("poly",), model_from=calibration))
+        drive_robots(run, tmp_path / name, Request(models=("poly",), model_from=replayed_log))
         return tmp_path / name
 
     return drive
 
 
-def test_equal_seeds_give_equal_bytes(calibration: Path, short_run: Callable[[RobotRun, str], Path]) -> None:
-    run = replace(settings_of(calibration, SHORT), loss=0.1)
+def test_equal_seeds_give_equal_bytes(replayed_log: Path, short_run: Callable[[RobotRun, str], Path]) -> None:
+    run = replace(settings_of(replayed_log, SHORT), loss=0.1)
     first, second = short_run(run, "first.mcap"), short_run(run, "second.mcap")
     assert first.read_bytes() == second.read_bytes()
     assert short_run(replace(run, seed=1), "other.mcap").read_bytes() != first.read_bytes()
 
 
 def test_robot_drives_with_positions_of_vrpn(
-    calibration: Path, short_run: Callable[[RobotRun, str], Path]
+    replayed_log: Path, short_run: Callable[[RobotRun, str], Path]
 ) -> None:
-    log = short_run(replace(settings_of(calibration, SHORT), over="vrpn"), "vrpn.mcap")
+    log = short_run(replace(settings_of(replayed_log, SHORT), over="vrpn"), "vrpn.mcap")
     (robot,) = result_of(log).robots
     assert robot.is_finished
     assert max(point.control_m for point in robot.reached) < 0.02
 
 
 def test_three_robots_keep_their_distance(
-    calibration: Path, short_run: Callable[[RobotRun, str], Path]
+    replayed_log: Path, short_run: Callable[[RobotRun, str], Path]
 ) -> None:
-    result = result_of(short_run(settings_of(calibration, robots=3), "three.mcap"))
+    result = result_of(short_run(settings_of(replayed_log, robots=3), "three.mcap"))
     assert [(robot.is_finished, len(robot.reached)) for robot in result.robots] == [(True, 4)] * 3
     assert max(point.control_m for robot in result.robots for point in robot.reached) < 0.02
     assert result.nearest_m is not None
@@ -154,10 +154,10 @@ def test_three_robots_keep_their_distance(
 
 
 def test_real_time_run_records_frames_and_commands(
-    calibration: Path, short_run: Callable[[RobotRun, str], Path]
+    replayed_log: Path, short_run: Callable[[RobotRun, str], Path]
 ) -> None:
     """A busy machine may not reach a waypoint; the log is complete anyway."""
-    run = replace(settings_of(calibration, SHORT, rate_hz=2.0), lockstep=False, longest_s=4.0)
+    run = replace(settings_of(replayed_log, SHORT, rate_hz=2.0), lockstep=False, longest_s=4.0)
     with Session([short_run(run, "live.mcap")]) as session:
         counts = {name: sum(map(session.count, session.topics(name))) for name in (IMAGES, TRUTH, COMMANDS)}
         times_ns = [message.publish_time_ns for message in session.messages(session.topics(TRUTH))]

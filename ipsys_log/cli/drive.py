@@ -11,9 +11,11 @@ import typer
 from ipsys_log.cli.console import console, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
 from ipsys_log.cli.options import AsJson, Force, NewLog
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
 
 if TYPE_CHECKING:
     from ipsys_log.closed_loop.settings import RobotRun
+    from ipsys_log.runs.options import Request
 
 __all__ = ["add_commands"]
 
@@ -44,6 +46,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(drive)
 
 
+@runs_until_stopped
 def drive(
     output: NewLog,
     model_from: Annotated[
@@ -85,6 +88,7 @@ def drive(
 
     This is the robot experiment of the paper (sect. 4.3). Images are drawn, recorded, processed and streamed
     as by live. The log has the commands of the robots and the ground truth, too."""
+    allow_interrupt("stopped before the drive began; no log was written")
     from ipsys_log.closed_loop.settings import RobotRun, choose_paths, parse_failure, read_lab
     from ipsys_log.runs.options import Request
     from ipsys_log.simulation.settings import LabSettings
@@ -107,14 +111,14 @@ def drive(
     _drive(run, output, request, force, as_json)
 
 
-def _drive(run: RobotRun, output: Path, request: object, force: bool, as_json: bool) -> None:
+def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: bool) -> None:
     from ipsys_log.analysis.robot_run import read_robot_run
     from ipsys_log.closed_loop.run import drive_robots
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.robot_run import robot_run_json, robot_run_tables
 
     say(f"{', '.join(run.paths)}: {run.describe()}; Ctrl-C to end")
-    drive_robots(run, output, request, force, say)
+    drive_robots(run, output, request, force, say, stop_on_signal)
     with Session([output]) as session:
         result = read_robot_run(session)
     if as_json:

@@ -14,6 +14,7 @@ from ipsys_log.capture.frames import Clock, Say
 from ipsys_log.capture.simulated import FrameTiming
 from ipsys_log.closed_loop.settings import RobotRun
 from ipsys_log.closed_loop.steering import Steering
+from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
     COMMANDS_TOPIC,
     EVENTS_TOPIC,
@@ -21,6 +22,7 @@ from ipsys_log.messages import (
     CompressedImage,
     Event,
     Message,
+    WheelCommand,
     image_topic,
 )
 from ipsys_log.simulation.lab import EPOCH_NS
@@ -115,6 +117,7 @@ class LockstepCameras:
         self.states = {name: CameraState(format="jpeg", up=True) for name in run.lab.cameras}
         self.received_ns: dict[int, int] = {}
         self.steering: Steering
+        self.fault: IpsysError | None = None
         self._run, self._lab, self._sync, self._clock = run, lab, sync, clock
         self._events: deque[Event] = deque()
         self._lost_ns: dict[str, int] = {}
@@ -147,7 +150,7 @@ class LockstepCameras:
             frame += 1
             time_ns = round(frame * timing.period_ns)
             yield from self._ticks_until(time_ns + timing.behind_ns)
-            if self._is_over(time_ns):
+            if self._ending or self._is_over(time_ns):
                 return
             self._clock.time_ns = time_ns + timing.behind_ns
             self._lab.advance(self._clock.time_ns)
@@ -162,11 +165,19 @@ class LockstepCameras:
     def _ticks_until(self, time_ns: int) -> Iterator[Message]:
         while self.steering.next_ns <= time_ns and not self._ending:
             self._clock.time_ns = self.steering.next_ns
-            for command in self.steering.tick_and_wait(self._sync.sent):
+            for command in self._commands():
                 yield self._message(COMMANDS_TOPIC, command, command.timestamp)
             while self._events:
                 event = self._events.popleft()
                 yield self._message(EVENTS_TOPIC, event, event.timestamp)
+
+    def _commands(self) -> list[WheelCommand]:
+        """Return the commands of the next tick; end the run if a robot has a fault."""
+        try:
+            return self.steering.tick_and_wait(self._sync.sent)
+        except IpsysError as fault:  # the log is complete up to here
+            self.fault, self._ending = fault, True
+            return []
 
     def _is_over(self, time_ns: int) -> bool:
         return self.steering.is_finished() or self.steering.time_s(time_ns) > self._run.longest_s

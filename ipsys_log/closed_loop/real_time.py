@@ -65,6 +65,7 @@ class RobotCameras:
                     raise SourceError(f"camera {name}: simulated failure")
                 yield None
                 continue
+            was_lost = False
             self._note(frame, time_ns, clock.now_ns())
             yield Frame(self._lab.draw(number, frame, time_ns), "jpeg", time_ns)
 

@@ -36,7 +36,12 @@ Say = Callable[[str], None]
 
 
 def drive_robots(
-    run: RobotRun, target: Path, request: Request, overwrite: bool = False, say: Say = lambda text: None
+    run: RobotRun,
+    target: Path,
+    request: Request,
+    overwrite: bool = False,
+    say: Say = lambda text: None,
+    begin: Callable[[Callable[[], None]], None] = lambda stop: None,
 ) -> list[Outcome]:
     """Let robots drive through their waypoints in the simulated lab; write everything into one log.
 
@@ -50,6 +55,7 @@ def drive_robots(
     request : models, and the log that they come from.
     overwrite : replace an existing log.
     say : called with lines about the robots and cameras.
+    begin : called before the drive with a function that ends it in order.
 
     Returns
     -------
@@ -61,7 +67,7 @@ def drive_robots(
         A setting is impossible, a port is in use, or the program of a robot has ended.
     """
     run.check()
-    parts = _Parts(run, target, request, overwrite, say)
+    parts = _Parts(run, target, request, overwrite, say, begin)
     parts.check_start()
     return _drive_lockstep(parts) if run.lockstep else _drive_live(parts)
 
@@ -75,6 +81,7 @@ class _Parts:
     request: Request
     overwrite: bool
     say: Say
+    begin: Callable[[Callable[[], None]], None]
 
     @property
     def rig(self) -> Rig:
@@ -130,6 +137,7 @@ class _Parts:
         consumers: Sequence[Consumer] = (),
     ) -> list[Outcome]:
         settings = self.settings(lab, cameras.now_ns)
+        self.begin(cameras.stop)
         return pipeline.live(
             cameras, settings, self.target, self.request, None, consumers, self.overwrite, streams
         )
@@ -143,7 +151,10 @@ def _drive_lockstep(parts: _Parts) -> list[Outcome]:
     cameras = LockstepCameras(parts.run, lab, clock, sync, parts.say)
     with parts.connect(cameras) as (streams, wheels, programs):
         cameras.steering = Steering(parts.run, lab, wheels, programs, clock.now_ns(), parts.say)
-        return parts.live(cameras, lab, streams, [sync])
+        outcomes = parts.live(cameras, lab, streams, [sync])
+        if cameras.fault is not None:
+            raise cameras.fault
+        return outcomes
 
 
 def _drive_live(parts: _Parts) -> list[Outcome]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.log.dataset import Session
 from tests.conftest import ROOT, Ipsys
 
 PROGRAM = ROOT / "examples/robot/robot.py"
@@ -94,3 +95,27 @@ def test_program_that_ends_is_named(replayed_log: Path, ipsys: Ipsys, tmp_path: 
     done = ipsys("drive", *options, "--program", program)
     expected = f"robot_0: its program {program} has ended with exit code 3; its messages are above\n"
     assert (done.code, done.err.splitlines(keepends=True)[-1]) == (1, f"ipsys: {expected}")
+
+
+@pytest.mark.slow
+def test_program_that_ends_later_keeps_the_log(replayed_log: Path, ipsys: Ipsys, tmp_path: Path) -> None:
+    program, target = tmp_path / "robot.py", tmp_path / "run.mcap"
+    # It answers eight ticks and ends.
+    program.write_text(
+        "import json, socket, sys\n"
+        "robot, wheels = sys.argv[2], sys.argv[6].split(':')\n"
+        "link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n"
+        "link.connect((wheels[0], int(wheels[1])))\n"
+        "link.send(json.dumps({'robot': robot}).encode())\n"
+        "for _ in range(8):\n"
+        "    tick = json.loads(link.recv(2048))['tick']\n"
+        "    command = {'robot': robot, 'tick': tick, 'left_m_s': 0.1, 'right_m_s': 0.1}\n"
+        "    link.send(json.dumps(command).encode())\n"
+    )
+    options = ("--model-from", replayed_log, "-o", target, "--port", "0", "--lockstep")
+    done = ipsys("drive", *options, "--program", program)
+    expected = f"robot_0: its program {program} has ended with exit code 0; its messages are above\n"
+    assert (done.code, done.err.splitlines(keepends=True)[-1]) == (1, f"ipsys: {expected}")
+    with Session([target]) as session:
+        assert [command.left_m_s for command in session.payloads(["/robots/commands"])] == [0.1] * 8
+    assert ipsys("verify", target).code == 0

@@ -12,6 +12,7 @@ import pytest
 from ipsys_log.analysis.robot_run import RobotRunResult, read_robot_run
 from ipsys_log.closed_loop.run import ROBOT_RUN, drive_robots
 from ipsys_log.closed_loop.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab
+from ipsys_log.exchange.data_frames import read_table
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, RobotPath, WheelCommand
 from ipsys_log.messages.channels import COMMANDS, EVENTS, IMAGES, PATHS, TRACKS, TRUTH
@@ -101,6 +102,14 @@ def test_log_has_everything(faulty_log: Path) -> None:
     used = {command.position_time for command in commands if command.position_time is not None}
     assert used < set(tracks)
     assert 0.85 * len(set(tracks)) < len(used)
+
+
+def test_commands_are_a_table(faulty_log: Path) -> None:
+    with Session([faulty_log]) as session:
+        table = read_table(session, "commands", [None])
+        commands: list[WheelCommand] = session.payloads(session.topics(COMMANDS))
+    assert table["left_m_s"].tolist() == [command.left_m_s for command in commands]
+    assert set(table["state"]) == {"driving", "holding", "stopped", "finished"}
 
 
 def test_replay_gives_the_same_bytes(faulty_log: Path, ipsys: Ipsys) -> None:

@@ -107,6 +107,7 @@ def drive(
         port,
         longest_s=seconds,
     )
+    run.check()
     request = Request(models=tuple(dict.fromkeys(model or ())), model_from=model_from)
     _drive(run, output, request, force, as_json)
 

@@ -101,7 +101,7 @@ class RobotRun:
         Raises
         ------
         IpsysError
-            A setting is impossible.
+            A setting is impossible, or a port is in use.
         """
         if not self.program.is_file():
             raise IpsysError(
@@ -123,6 +123,7 @@ class RobotRun:
                     f"{', '.join(self.lab.cameras)}"
                 )
         self._check_waypoints()
+        self.ports()
 
     def _check_waypoints(self) -> None:
         cameras = mount_cameras(self.lab)

@@ -106,7 +106,7 @@ def test_log_has_everything(faulty_log: Path) -> None:
 
 def test_commands_are_a_table(faulty_log: Path) -> None:
     with Session([faulty_log]) as session:
-        table = read_table(session, "commands", [None])
+        table = read_table(session, "commands", [None], None, None)
         commands: list[WheelCommand] = session.payloads(session.topics(COMMANDS))
     assert table["left_m_s"].tolist() == [command.left_m_s for command in commands]
     assert set(table["state"]) == {"driving", "holding", "stopped", "finished"}

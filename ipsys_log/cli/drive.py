@@ -118,7 +118,6 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.robot_run import robot_run_json, robot_run_tables
 
-    say(f"{', '.join(run.paths)}: {run.describe()}; Ctrl-C to end")
     drive_robots(run, output, request, force, say, stop_on_signal)
     with Session([output]) as session:
         result = read_robot_run(session)

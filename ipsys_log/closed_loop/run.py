@@ -69,6 +69,7 @@ def drive_robots(
     run.check()
     parts = _Parts(run, target, request, overwrite, say, begin)
     parts.check_start()
+    say(f"{', '.join(run.paths)}: {run.describe()}")
     return _drive_lockstep(parts) if run.lockstep else _drive_live(parts)
 
 

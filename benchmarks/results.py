@@ -27,6 +27,7 @@ BENCHMARKS = {
     "log_read": "reading, beside mcap",
     "table": "a channel as a table, beside decoding its messages",
     "startup": "ipsys --help and ipsys info",
+    "robot_run": "control error and true error of robots at waypoints, without and with faults",
     "joint": "error over the floor of calibrations, in simulated labs",
     "tracks": "error of the tracks of driving robots, in simulated labs",
 }

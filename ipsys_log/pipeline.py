@@ -41,7 +41,7 @@ from ipsys_log.capture.knock_events import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
-from ipsys_log.capture.recorder import Recording, Source, open_recording, write_each
+from ipsys_log.capture.recorder import CameraSource, Recording, Source, open_recording, write_each
 from ipsys_log.errors import FitError, IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
@@ -227,7 +227,7 @@ def measure(
 
 
 def live(
-    cameras: LiveCameras,
+    cameras: CameraSource,
     settings: Sequence[Message],
     target: Path,
     request: Request,
@@ -243,10 +243,12 @@ def live(
 
     Parameters
     ----------
+    cameras : live cameras, or simulated ones with a simulated clock.
     settings : written first: rig and camera intrinsics.
     request : corners, method and, for stages that read a model, ``model_from``.
     until : the last stage, such as detect or camera-frame; None: all causal stages.
-    consumers : each gets every frame that the stages have processed, and their results, after the write.
+    consumers : each gets every frame that the stages have processed, and their results, after the write; and
+        None if no frame waits.
     sinks : the same, each in its own thread; a slow sink loses messages, images first.
 
     Returns
@@ -273,8 +275,7 @@ def live(
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in frames:
-                if message is not TICK:
-                    show(message)
+                show(None if message is TICK else message)
     if fault is not None:
         raise IpsysError(
             f"{fault}; {target} has all frames; to process them: ipsys replay {target}"
@@ -310,6 +311,7 @@ def _put_through(
     try:
         for message in _through(stages, frames, ledger):
             if message is TICK:
+                show(None)
                 continue
             if run_of_topic(message.topic) is not None:  # all other messages are written already
                 log.put(message)

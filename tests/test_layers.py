@@ -31,6 +31,7 @@ LAYERS = (
     ("survey",),
     ("tracker",),
     ("player",),
+    ("closed_loop",),
     ("sampled_track",),
     ("opened_log",),
     ("api",),

@@ -19,6 +19,7 @@ from ipsys_log.capture.disk import (
     describe_disk_full,
     reserve,
 )
+from ipsys_log.capture.frames import Clock, Say
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.journal import DISK, roll_back
@@ -39,6 +40,7 @@ from ipsys_log.messages import (
 from ipsys_log.runs.output import write_message
 
 __all__ = [
+    "CameraSource",
     "Recording",
     "Source",
     "Target",
@@ -66,6 +68,24 @@ class Source(Protocol):
     def confirm(self, message: Message, fault: OSError | None) -> None: ...
 
     def add_event(self, kind: str, text: str) -> None: ...
+
+
+class CameraSource(Source, Protocol):
+    """The cameras of a live run: their states, their clock, and the arrival times of frames by log time."""
+
+    @property
+    def states(self) -> Mapping[str, object]: ...
+
+    @property
+    def clock(self) -> Clock: ...
+
+    @property
+    def received_ns(self) -> Mapping[int, int]: ...
+
+    @property
+    def say(self) -> Say: ...
+
+    def now_ns(self) -> int: ...
 
 
 class Target(Protocol):

@@ -24,7 +24,7 @@ from ipsys_log.simulation.pixel_shares import exposure_interval
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["SimulatedCamera", "intrinsics_of", "open_simulated", "parse_source", "show_board"]
+__all__ = ["FrameTiming", "SimulatedCamera", "intrinsics_of", "open_simulated", "parse_source", "show_board"]
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000
@@ -47,7 +47,9 @@ class _Stopped(Exception):  # noqa: N818
 class _Images:
     """The images of a film, rendered by a separate thread in the order of their use."""
 
-    def __init__(self, name: str, make_film: Callable[[Check], Film], timing: _Timing, clock: Clock) -> None:
+    def __init__(
+        self, name: str, make_film: Callable[[Check], Film], timing: FrameTiming, clock: Clock
+    ) -> None:
         self._film: Film | None = None
         self._drawn: dict[int, bytes] = {}
         self._fault: BaseException | None = None
@@ -116,7 +118,7 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
     report_refused_settings(camera, ActualSettings(lab.width, lab.height, lab.rate_hz), say)
     shown = "the simulated lab" if simulated.board is None else f"{simulated.board} in the simulated lab"
     say(f"camera {camera.name}: shows {shown}, {lab.width} x {lab.height} px, {lab.rate_hz:g} frames/s")
-    timing = _Timing.of(lab, camera.stamp)
+    timing = FrameTiming.of(lab, camera.stamp)
 
     def make_film(check: Check) -> Film:
         if simulated.board is None:
@@ -215,7 +217,7 @@ def intrinsics_of(camera: RigCamera) -> CameraCalibration:
     return replace(mount_cameras(lab)[number].lens, frame_id=camera.name)
 
 
-class _Timing(NamedTuple):
+class FrameTiming(NamedTuple):
     """The times at which frames are exposed, stamped and delivered."""
 
     # A float is not precise enough for times since 1970.
@@ -224,7 +226,7 @@ class _Timing(NamedTuple):
     behind_ns: int
 
     @classmethod
-    def of(cls, lab: LabSettings, stamp: str | None) -> _Timing:
+    def of(cls, lab: LabSettings, stamp: str | None) -> FrameTiming:
         # A driver stamps the start of the first row's exposure, or the end of the last row's exposure.
         start_s, end_s = exposure_interval(0, lab.height - 1, lab)
         stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)
@@ -235,7 +237,7 @@ class _Timing(NamedTuple):
         return math.floor((now_ns - self.behind_ns) / self.period_ns)
 
 
-def _play(images: _Images, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
+def _play(images: _Images, timing: FrameTiming, clock: Clock) -> Iterator[Frame | None]:
     frame = 0
     while True:
         # A late reader misses frames.

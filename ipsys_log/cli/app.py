@@ -16,6 +16,7 @@ from ipsys_log.cli import (
     cameras,
     compare,
     drift,
+    drive,
     export,
     imports,
     inspect,
@@ -45,7 +46,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("verify", "diff", "latency", "repair"),
     ),
     _STAGES: (),
-    "Without cameras": ("simulate", "import"),
+    "Without cameras": ("simulate", "drive", "import"),
 }
 
 
@@ -151,6 +152,12 @@ ipsys latency monday.mcap --plot latency.pdf
     "repair": """
 ipsys repair monday.mcap
 """,
+    "drive": """
+ipsys drive --model-from cal.mcap -o run.mcap      # robot run of the paper
+ipsys drive --model-from cal.mcap -o run.mcap --model poly --model best
+ipsys drive --model-from cal.mcap -o three.mcap --robots 3 --lockstep
+ipsys drive --model-from cal.mcap -o run.mcap --loss 0.05 --fail white=20:5
+""",
     "simulate": """
 ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4
 """,
@@ -206,7 +213,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, drift, inspect, export, stream, compare),
+    *(plan, drift, inspect, export, stream, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

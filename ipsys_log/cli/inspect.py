@@ -32,7 +32,10 @@ _HTML = (
     ],
     None,
 )
-_HELP = f"Write an HTML page with the accuracy of a log's models. The page needs no network.{MORE}"
+_HELP = (
+    "Write an HTML page with the accuracy of a log's models. The page needs no network. For a log of ipsys "
+    f"drive: its errors, and figure 12 of the paper.{MORE}"
+)
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -146,10 +149,30 @@ def _report(logs: list[Path], output: Path | None, html: Path | None, **given: A
     from ipsys_log.report.files import check_file, write_files
 
     check_installed("report needs", "matplotlib", "jinja2")
-    from ipsys_log.report.html import render_report
-
     target = html or (output or logs[-1]).with_suffix(".html")
     check_file(target, "--html", [*logs, *([output] if output else [])])
+    if _report_robots(logs, target):
+        return
+    from ipsys_log.report.html import render_report
+
     with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
         write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
     console.print(f"{target} written: open it in a browser", markup=False)
+
+
+def _report_robots(logs: list[Path], target: Path) -> bool:
+    """Write the page and the figure of a robot run; return False if the logs have none."""
+    from ipsys_log.analysis.robot_run import has_robot_run
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.report.files import check_file, write_files
+    from ipsys_log.report.robot_run import render_robot_run
+
+    with Session(logs) as session:
+        if not has_robot_run(session):
+            return False
+        picture = target.with_suffix(".png")
+        check_file(picture, "--html", logs)
+        page, panels = render_robot_run(session)
+    write_files(target.parent, {target.name: page.encode(), picture.name: panels})
+    console.print(f"{target} and {picture} written", markup=False)
+    return True

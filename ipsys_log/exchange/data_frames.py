@@ -15,9 +15,20 @@ from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import Column, Columns, read_columns
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraPoints, Event, Latency, Markers, Measurement, Message, Positions, Tracks
+from ipsys_log.messages import (
+    CameraPoints,
+    Event,
+    Latency,
+    Markers,
+    Measurement,
+    Message,
+    Positions,
+    Tracks,
+    WheelCommand,
+)
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
+    COMMANDS,
     EVENTS,
     LATENCY,
     MARKERS,
@@ -71,7 +82,7 @@ _ITEMS = {
     "smoothed_tracks": _Table(SMOOTHED_TRACKS, Tracks, _TRACK),
     "truth": _Table(TRUTH, Tracks, ("robot", *_POINT)),
 }
-TABLES = (*_ITEMS, "measurements", "events", "latency")
+TABLES = (*_ITEMS, "measurements", "events", "latency", "commands")
 
 
 def import_pandas() -> Any:
@@ -300,10 +311,17 @@ def _latency(message: Message) -> dict[str, Any]:
     return {name: getattr(latency, name) for name in names}
 
 
+def _command(message: Message) -> dict[str, Any]:
+    command: WheelCommand = message.payload
+    names = ("robot", "left_m_s", "right_m_s", "state", "waypoint", "x_m", "y_m", "position_time")
+    return {name: getattr(command, name) for name in names}
+
+
 _ROWS: Mapping[str, tuple[Channel, Callable[[Message], dict[str, Any]]]] = {
     "measurements": (MEASUREMENTS, _measurement),
     "events": (EVENTS, _event),
     "latency": (LATENCY, _latency),
+    "commands": (COMMANDS, _command),
 }
 _COLUMNS = {
     "measurements": [
@@ -312,4 +330,8 @@ _COLUMNS = {
     ],
     "events": ["time", "log_time_ns", "kind", "camera", "marker_id", "text"],
     "latency": ["time", "log_time_ns", "camera", "received", "detected", "located", "fused", "published"],
+    "commands": [
+        *("time", "log_time_ns", "robot", "left_m_s", "right_m_s", "state", "waypoint"),
+        *("x_m", "y_m", "position_time"),
+    ],
 }

@@ -52,8 +52,10 @@ PAYLOADS: dict[str, type] = {
             messages.Model,
             messages.Positions,
             messages.Rig,
+            messages.RobotPath,
             messages.Run,
             messages.Tracks,
+            messages.WheelCommand,
         )
     },
 }

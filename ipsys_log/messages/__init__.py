@@ -6,13 +6,24 @@ missing value is ``None`` or empty, never 0 and never NaN.
 """
 
 from ipsys_log.messages.channels import (
+    COMMANDS_TOPIC,
     EVENTS_TOPIC,
     LATENCY_TOPIC,
     MEASUREMENTS_TOPIC,
+    PATHS_TOPIC,
     RIG_TOPIC,
     TRUTH_TOPIC,
     calibration_topic,
     image_topic,
+)
+from ipsys_log.messages.commands import (
+    DRIVING,
+    FINISHED,
+    HOLDING,
+    STOPPED,
+    RobotPath,
+    Waypoint,
+    WheelCommand,
 )
 from ipsys_log.messages.events import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
 from ipsys_log.messages.images import (
@@ -66,13 +77,19 @@ from ipsys_log.messages.tracks import (
 
 __all__ = [
     "CAMERA_MOVED",
+    "COMMANDS_TOPIC",
+    "DRIVING",
     "EVENTS_TOPIC",
+    "FINISHED",
     "FRAME_SKIPPED",
+    "HOLDING",
     "IMPORTED",
     "LATENCY_TOPIC",
     "MEASUREMENTS_TOPIC",
+    "PATHS_TOPIC",
     "RIG_TOPIC",
     "STAMP_UNRELIABLE",
+    "STOPPED",
     "TRUTH_TOPIC",
     "CameraCalibration",
     "CameraEvaluation",
@@ -123,6 +140,7 @@ __all__ = [
     "RigCamera",
     "RigMarker",
     "RigStream",
+    "RobotPath",
     "Run",
     "SkippedVideo",
     "Suspect",
@@ -132,6 +150,8 @@ __all__ = [
     "Tracks",
     "Vec3",
     "Vector3",
+    "Waypoint",
+    "WheelCommand",
     "WorldPoint",
     "calibration_topic",
     "image_topic",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from ipsys_log.messages.commands import RobotPath, WheelCommand
 from ipsys_log.messages.events import Event, Latency
 from ipsys_log.messages.images import (
     CompressedImage,
@@ -25,6 +26,8 @@ __all__ = [
     "CALIBRATIONS",
     "CAMERA_POINTS",
     "CHANNELS",
+    "COMMANDS",
+    "COMMANDS_TOPIC",
     "EVALUATION",
     "EVENTS",
     "EVENTS_TOPIC",
@@ -35,6 +38,8 @@ __all__ = [
     "MEASUREMENTS",
     "MEASUREMENTS_TOPIC",
     "MODEL",
+    "PATHS",
+    "PATHS_TOPIC",
     "POSES",
     "POSITIONS",
     "RECORD",
@@ -101,6 +106,8 @@ MEASUREMENTS = Channel(name="measurements", topic="/measurements", payloads=(Mea
 EVENTS = Channel(name="events", topic="/events", payloads=(Event,), by_schema=True)
 LATENCY = Channel(name="latency", topic="/latency", payloads=(Latency,), by_schema=True)
 TRUTH = Channel(name="truth", topic="/truth/tracks", payloads=(Tracks,), by_schema=True)
+PATHS = Channel(name="paths", topic="/robots/paths", payloads=(RobotPath,), by_schema=True)
+COMMANDS = Channel(name="commands", topic="/robots/commands", payloads=(WheelCommand,), by_schema=True)
 
 RECORD = Channel(name="record", topic="/runs/{run}/record", payloads=(Run,))
 MARKERS = Channel(name="markers", topic="/runs/{run}/cameras/{camera}/markers", payloads=(Markers,))
@@ -120,7 +127,7 @@ POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransfor
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
 
 CHANNELS: tuple[Channel, ...] = (
-    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH),
+    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS),
     *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
     *(SMOOTHED_TRACKS, RUN_EVENTS),
 )
@@ -130,6 +137,8 @@ MEASUREMENTS_TOPIC = MEASUREMENTS.topic
 EVENTS_TOPIC = EVENTS.topic
 LATENCY_TOPIC = LATENCY.topic
 TRUTH_TOPIC = TRUTH.topic
+PATHS_TOPIC = PATHS.topic
+COMMANDS_TOPIC = COMMANDS.topic
 
 _NAME = "[a-z][a-z0-9_]*"
 _TOPIC = re.compile(rf"(?P<run>/runs/{_NAME})?(?P<camera>/cameras/{_NAME})?(?P<rest>/.*)", re.DOTALL)

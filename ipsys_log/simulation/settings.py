@@ -35,7 +35,9 @@ class Purpose(IntEnum):
     WOBBLE = 15
     GEOMETRY = 16
     PRINTS = 17
-    WEEKS = 18
+    WHEELS = 18
+    RELAY = 19
+    WEEKS = 20
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

@@ -1,0 +1,68 @@
+"""A robot with two wheels: it gets positions from a stream, and gives its wheels their speeds.
+
+    python robot.py --robot robot_0 --positions udp://127.0.0.1:9871 --wheels 127.0.0.1:9870 \
+        --path "0.5,0.5 0.5,2.5"
+
+``ipsys drive`` starts this program. It knows only its path and the positions that it receives. The wheels are
+simulated: they send a tick 20 times a second, with their own clock, and get one command for each tick. In
+place of the simulated wheels, your robot has a motor driver and a timer.
+"""
+
+import argparse
+import json
+import socket
+import time
+
+from controller import Controller
+from positions import UdpPositions, VrpnPositions
+
+LONGEST_WAIT_S = 60.0
+
+
+def address_of(text):
+    host, _, port = text.rpartition("://")[2].rpartition(":")
+    return host, int(port)
+
+
+def parse():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robot", required=True, help="its name in the stream")
+    parser.add_argument("--positions", required=True, help="udp://HOST:PORT or vrpn://HOST:PORT")
+    parser.add_argument("--wheels", required=True, help="HOST:PORT of the simulated wheels")
+    parser.add_argument("--path", required=True, help='waypoints in m: "0.5,0.5 0.5,2.5"')
+    return parser.parse_args()
+
+
+def wait_for_positions(positions, count, now_s):
+    """Read positions. With lockstep, wait until all that were sent have arrived."""
+    positions.receive(0.0, now_s)
+    last_s = time.monotonic() + LONGEST_WAIT_S
+    while count is not None and positions.count < count and time.monotonic() < last_s:
+        positions.receive(0.5, now_s)
+
+
+def main():
+    options = parse()
+    receiver = VrpnPositions if options.positions.startswith("vrpn:") else UdpPositions
+    positions = receiver(address_of(options.positions), options.robot)
+    controller = Controller([tuple(map(float, point.split(","))) for point in options.path.split()])
+    wheels = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    wheels.connect(address_of(options.wheels))
+    wheels.settimeout(LONGEST_WAIT_S)
+    wheels.send(json.dumps({"robot": options.robot}).encode())
+    while True:
+        tick = json.loads(wheels.recv(2048))
+        if "end" in tick:
+            break
+        wait_for_positions(positions, tick.get("positions"), tick["time_s"])
+        pose = positions.pose
+        (left_m_s, right_m_s), state = controller.step(pose, tick["time_s"])
+        command = {"robot": options.robot, "tick": tick["tick"], "left_m_s": left_m_s, "right_m_s": right_m_s}
+        command |= {"state": state, "waypoint": controller.number + 1}
+        if pose is not None:
+            command |= {"x_m": pose.x_m, "y_m": pose.y_m, "time_ns": pose.time_ns}
+        wheels.send(json.dumps(command).encode())
+
+
+if __name__ == "__main__":
+    main()

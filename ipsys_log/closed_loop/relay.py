@@ -1,0 +1,121 @@
+"""A relay of datagrams that loses some and delays the others: a program of its own, with a seed.
+
+    python -m ipsys_log.closed_loop.relay --port 9921 --to 9871 --loss 0.05 --delay-s 0.1 --seed 3 --lockstep
+
+The relay listens on loopback, and sends to another port of loopback. With ``--lockstep`` its clock is that of
+the ticks, which the simulator sends to the same port; the relay answers with the number of datagrams that it
+has sent on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import select
+import socket
+from collections import deque
+from typing import Any
+
+from ipsys_log.capture.frames import Clock
+from ipsys_log.simulation.settings import Purpose, random_stream
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Relay"]
+
+_LOOPBACK = "127.0.0.1"
+_TURN_S = 0.005
+_LONGEST_BYTES = 2048
+
+
+class Relay:
+    """The queue of delayed datagrams; it draws for each datagram whether it is lost.
+
+    Examples
+    --------
+    >>> relay = Relay(loss=0.0, delay_ns=100, seed=0)
+    >>> relay.put(b"a", 1000)
+    >>> relay.take(1099), relay.take(1100)
+    ([], [b'a'])
+    """
+
+    def __init__(self, loss: float, delay_ns: int, seed: int) -> None:
+        self.arrived = self.forwarded = 0
+        self._loss, self._delay_ns = loss, delay_ns
+        self._rng = random_stream(seed, Purpose.RELAY)
+        self._waiting: deque[tuple[int, bytes]] = deque()
+
+    def put(self, datagram: bytes, now_ns: int) -> None:
+        """Take a datagram that arrives now."""
+        self.arrived += 1
+        if self._rng.random() >= self._loss:
+            self._waiting.append((now_ns + self._delay_ns, datagram))
+
+    def take(self, now_ns: int) -> list[bytes]:
+        """Return the datagrams that are due."""
+        due = []
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            due.append(self._waiting.popleft()[1])
+        self.forwarded += len(due)
+        return due
+
+
+def _tick_of(datagram: bytes) -> dict[str, Any] | None:
+    """Return the fields of a tick of the simulator; None for any other datagram."""
+    try:
+        fields = json.loads(datagram)
+        return fields if "relay_tick" in fields else None
+    except (RecursionError, TypeError, ValueError):
+        return None
+
+
+def _serve(sock: socket.socket, relay: Relay, target: tuple[str, int]) -> None:
+    """Forward datagrams by the real clock, until the process is ended."""
+    clock = Clock()
+    while True:
+        if select.select([sock], [], [], _TURN_S)[0]:
+            relay.put(sock.recv(_LONGEST_BYTES), clock.now_ns())
+        for datagram in relay.take(clock.now_ns()):
+            sock.sendto(datagram, target)
+
+
+def _serve_lockstep(sock: socket.socket, relay: Relay, target: tuple[str, int]) -> None:
+    """Forward datagrams by the clock of the ticks, until the process is ended."""
+    early: list[bytes] = []
+    tick: dict[str, Any] | None = None
+    while True:
+        datagram, sender = sock.recvfrom(_LONGEST_BYTES)
+        if (fields := _tick_of(datagram)) is None:
+            early.append(datagram)
+        else:
+            tick, simulator = fields, sender
+        if tick is None or relay.arrived + len(early) < tick["positions"]:
+            continue
+        for waiting in early:
+            relay.put(waiting, tick["time_ns"])
+        early.clear()
+        for due in relay.take(tick["time_ns"]):
+            sock.sendto(due, target)
+        answer = {"relay_tick": tick["relay_tick"], "forwarded": relay.forwarded}
+        sock.sendto(json.dumps(answer).encode(), simulator)
+        tick = None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--to", type=int, required=True)
+    parser.add_argument("--loss", type=float, default=0.0)
+    parser.add_argument("--delay-s", type=float, default=0.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--lockstep", action="store_true")
+    options = parser.parse_args()
+    relay = Relay(options.loss, round(options.delay_s * NS_PER_S), options.seed)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((_LOOPBACK, options.port))
+        print("ready", flush=True)  # noqa: T201
+        serve = _serve_lockstep if options.lockstep else _serve
+        serve(sock, relay, (_LOOPBACK, options.to))
+
+
+if __name__ == "__main__":
+    main()

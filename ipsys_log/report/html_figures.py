@@ -150,7 +150,7 @@ def joint_pictures(findings: Findings) -> list[Picture]:
     if not cameras:
         return []
     pictures = [
-        _picture(
+        picture(
             poses_figure(cameras, findings.rig),
             "Poses of the cameras, with their fields of view on the floor. Arrow: optical axis, to the floor",
         )
@@ -160,7 +160,7 @@ def joint_pictures(findings: Findings) -> list[Picture]:
             "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the "
             "reference, or that of a camera that saw no drive"
         )
-        pictures.append(_picture(clocks_figure(cameras), text))
+        pictures.append(picture(clocks_figure(cameras), text))
     most_px = residual_limit_px(cameras)
     for camera in cameras:
         if camera.residuals is None:
@@ -169,7 +169,7 @@ def joint_pictures(findings: Findings) -> list[Picture]:
             f"Corner residuals in the image of {camera.camera}, estimated minus measured, as means of cells; "
             f"arrows are enlarged{_left_out(camera.residuals.outliers)}"
         )
-        pictures.append(_picture(residuals_figure(camera, most_px), caption))
+        pictures.append(picture(residuals_figure(camera, most_px), caption))
     return pictures
 
 

@@ -84,9 +84,9 @@ def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, length_m: flo
     # Late: scipy takes 1 s.
     from ipsys_log.geometry.lenses import project
     from ipsys_log.geometry.markers import marker_corners
+    from ipsys_log.geometry.rotations import level_turns
     from ipsys_log.joint.locate import locate_markers
     from ipsys_log.joint.payload import restore_joint
-    from ipsys_log.joint.rotations import level_turns
 
     model, flat_m = restore_joint(camera), grid.points_m
     count = len(flat_m)

@@ -77,14 +77,7 @@ class LocateCorners:
                 locate = self._locate_at_height if by_height else self._locate_poses
                 located.update(zip(rows, locate(camera, own), strict=True))
         return tuple(
-            Position(
-                marker.id,
-                *located[n].point_m.tolist(),
-                located[n].heading_rad,
-                located[n].covariance_m2,
-                located[n].fits,
-                _time_offset_ns(camera, marker),
-            )
+            _position(camera, marker, located[n])
             for n, marker in enumerate(markers)
             if np.isfinite(located[n].point_m).all()
         )
@@ -113,6 +106,13 @@ class LocateCorners:
         fits = (found.chi2 < MOST_CHI2_OF_POSE).tolist()
         rows = zip(found.points_m, found.headings_rad.tolist(), found.covariances_m2, fits, strict=True)
         return [_Located(*row) for row in rows]
+
+
+def _position(camera: JointModel, marker: Marker, located: _Located) -> Position:
+    x_m, y_m, z_m = located.point_m.tolist()
+    time_offset_ns = _time_offset_ns(camera, marker)
+    own = located.heading_rad, located.covariance_m2, located.fits
+    return Position(marker.id, x_m, y_m, z_m, *own, time_offset_ns)
 
 
 def _corners(markers: Sequence[Marker]) -> tuple[Array, Array]:

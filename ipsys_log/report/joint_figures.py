@@ -125,14 +125,13 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, 0.95 + _WIDTH_IN * height / width), layout="constrained")
     axes = figure.add_subplot()
     axes.add_patch(Rectangle((0, 0), width, height, fill=False, ec="black", lw=1.0))
+    x_px, y_px = residuals.cells_px.T
     arrows = axes.quiver(
-        *residuals.cells_px.T, *residuals.means_px.T, residuals.rms_px, cmap=_COLOURS, angles="xy",
+        x_px, y_px, *residuals.means_px.T, residuals.rms_px, cmap=_COLOURS, angles="xy",
         scale_units="xy", scale=most_px / (_ARROW * width), width=0.005, zorder=3,
     )  # fmt: skip
     arrows.set_clim(0.0, most_px)
-    axes.scatter(
-        *residuals.cells_px.T, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4
-    )
+    axes.scatter(x_px, y_px, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4)
     axes.set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height), aspect="equal")
     axes.set_xticks([0, width])
     axes.set_yticks([0, height])

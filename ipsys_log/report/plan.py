@@ -262,7 +262,7 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
         if len(rig.reference_points) < 2:
             return np.zeros(len(world_m))
         floor_m, rows = np.unique(world_m[:, :2], axis=0, return_inverse=True)
-        return np.trace(covariances(floor_m), axis1=1, axis2=2)[rows.reshape(-1)]
+        return np.asarray(np.trace(covariances(floor_m), axis1=1, axis2=2)[rows.reshape(-1)])
 
     return variances
 

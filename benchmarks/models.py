@@ -23,6 +23,7 @@ from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import cross_validate, gather_points, labelled_subsets
 from ipsys_log.analysis.pairs import RiggedMeasurement, build_pairs, gather_sightings
+from ipsys_log.analysis.study import Study
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Pair
@@ -30,7 +31,7 @@ from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.view import LogView
-from ipsys_log.stages.evaluate import Study, evaluate_model
+from ipsys_log.stages.evaluate import evaluate_model
 from ipsys_log.stages.fit import fit_model
 
 # Best was selected with other folds.

@@ -31,12 +31,14 @@ if TYPE_CHECKING:
         verify,
     )
     from ipsys_log.errors import IpsysError
+    from ipsys_log.joint.fitted_corners import FittedCornerModel
 
 __all__ = [
     "CalibrationResult",
     "Comparison",
     "Export",
     "Failure",
+    "FittedCornerModel",
     "FittedModel",
     "IpsysError",
     "Listing",
@@ -70,6 +72,10 @@ def __getattr__(name: str) -> Any:
         from ipsys_log.errors import IpsysError
 
         return IpsysError
+    if name == "FittedCornerModel":
+        from ipsys_log.joint.fitted_corners import FittedCornerModel
+
+        return FittedCornerModel
     if name in __all__:
         from ipsys_log import api
 

@@ -46,7 +46,7 @@ def test_every_public_name_is_there() -> None:
 def test_package_has_the_names_of_the_api() -> None:
     from ipsys_log import api
 
-    assert set(ipsys.__all__) == {*api.__all__, "IpsysError"}
+    assert set(ipsys.__all__) == {*api.__all__, "FittedCornerModel", "IpsysError"}
 
 
 def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
@@ -221,6 +221,7 @@ def test_replay_returns_evaluations(lab_log: Path, tmp_path: Path) -> None:
 
 def test_model_predicts_the_positions_of_its_log(replayed: Path) -> None:
     model = ipsys.load_model(replayed, "poly")
+    assert isinstance(model, ipsys.FittedModel)
     with ipsys.open(replayed) as log:
         points = log.table("camera_points", run="edges").query("camera == 'red'")
         positions = log.table("positions", run="poly").query("camera == 'red'")

@@ -97,9 +97,9 @@ def choose_drive(
                 best = after_m, *square
     if best is None:
         return None
-    after_m, *square = best
-    inside_m, half_m = places_m[*square].reshape(-1, 2), _STEP_M / 2
-    cameras = tuple(camera for camera, own in zip(models, seen[:, *square], strict=True) if own.any())
+    after_m, rows_y, rows_x = best
+    inside_m, half_m = places_m[rows_y, rows_x].reshape(-1, 2), _STEP_M / 2
+    cameras = tuple(camera for camera, own in zip(models, seen[:, rows_y, rows_x], strict=True) if own.any())
     drive_m = inside_m.min(axis=0) - half_m, np.minimum(inside_m.max(axis=0) + half_m, high_m)
     return PlannedDrive(*drive_m, cameras, mean_error(modes_m), after_m)
 

@@ -68,9 +68,8 @@ def evaluate_joint(
     gross = {suspect.measurement for suspect in excluded}
     clean, reduced = study, cameras
     if gross:
-        names = {point.name for point in observations.points}
         try:
-            reduced = build_models(fit_without(observations, (names - used) | gross))
+            reduced = _refit_without(gross, observations, used)
             clean = _without(study, gross)
         except FitError as error:
             notes.append(f"gross outliers are not excluded: {error}")
@@ -90,6 +89,12 @@ def evaluate_joint(
     return Evaluation(
         time_ns, model.name, tuple(rows), tuple(learning), suspects, excluded, tuple(with_excluded)
     )
+
+
+def _refit_without(names: set[str], observations: Observations, used: Collection[str]) -> Models:
+    """Return the models of a fit to the points ``used``, without some of them."""
+    unused = {point.name for point in observations.points} - set(used)
+    return build_models(fit_without(observations, unused | names))
 
 
 class _Steps:

@@ -84,16 +84,7 @@ class LocateCorners:
                 locate = self._locate_at_height if by_height else self._locate_poses
                 located.update(zip(rows, locate(camera, own), strict=True))
         return tuple(
-            Position(
-                marker.id,
-                *located[n].point_m.tolist(),
-                located[n].heading_rad,
-                located[n].covariance_m2,
-                located[n].fits,
-                _time_offset_ns(camera, marker),
-                located[n].noise_m2,
-                located[n].heading_noise_rad,
-            )
+            _position(camera, marker, located[n])
             for n, marker in enumerate(markers)
             if np.isfinite(located[n].point_m).all()
         )
@@ -130,6 +121,14 @@ def _rows(located: LocatedMarkers | Poses, most_chi2: float) -> list[_Located]:
         located.heading_noise_rad.tolist(),
     )
     return [_Located(*row) for row in zip(*columns, strict=True)]
+
+
+def _position(camera: JointModel, marker: Marker, located: _Located) -> Position:
+    x_m, y_m, z_m = located.point_m.tolist()
+    time_offset_ns = _time_offset_ns(camera, marker)
+    own = located.heading_rad, located.covariance_m2, located.fits
+    noise = located.noise_m2, located.heading_noise_rad
+    return Position(marker.id, x_m, y_m, z_m, *own, time_offset_ns, *noise)
 
 
 def _corners(markers: Sequence[Marker]) -> tuple[Array, Array]:

@@ -151,7 +151,7 @@ def create(name: str) -> Any:
     if reads_corners(name):
         raise IpsysError(
             f"model {name} is fitted to the corners of markers, and cannot be used with camera points; use "
-            "fit, evaluate, locate, replay, live or calibrate-lab, or another model such as best"
+            "another model such as best"
         )
     return MODELS[name]()
 

@@ -16,10 +16,10 @@ from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
-from ipsys_log.models.table import reads_corners
+from ipsys_log.models.table import is_known, reads_corners
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, uses_height
-from ipsys_log.runs.graph import input_runs, method_of, writes
+from ipsys_log.runs.graph import input_runs, writes
 from ipsys_log.runs.provenance import complete_runs, replaced_lenses
 from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.selection import rig_in_force
@@ -195,21 +195,25 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
         {name: model for name, model in models.items() if model is not None},
         (*ordered, *sorted(cameras - {*ordered})),
         advise(evaluations),
-        _calibrated(session, [model for model in models.values() if model is not None]),
+        _calibrated(session, evaluated, models),
     )
 
 
-def _calibrated(session: Session, models: Sequence[Model]) -> tuple[CalibratedCamera, ...]:
-    """Return the cameras of the joint model among some models."""
-    model = next((model for model in models if reads_corners(model.name)), None)
+def _calibrated(
+    session: Session, accuracies: Sequence[Accuracy], models: Mapping[str, Model | None]
+) -> tuple[CalibratedCamera, ...]:
+    """Return the cameras of the joint model among the evaluated models."""
+    run, model = next(
+        ((one.run, models[one.model]) for one in accuracies if _is_joint(one.model)), ("", None)
+    )
     if model is None:
         return ()
     # Late: scipy takes 1 s, and most reports have no joint model.
     from ipsys_log.analysis.calibrated_cameras import describe_cameras
     from ipsys_log.analysis.joint_calibration import fit_without, observe
 
-    records = [run for run in complete_runs(session) if writes(run, MODEL)]
-    record = next((r for r in reversed(records) if method_of(session, r) == model.name), None)
+    names = _model_runs(session, run)
+    record = next((r for r in complete_runs(session)[::-1] if r.run in names and writes(r, MODEL)), None)
     view, fit = LogView(session), None
     if record is not None and {read.topic for read in record.inputs} & {*session.topics(MEASUREMENTS)}:
         view = LogView(session, input_runs(record), record.rig, replaced_lenses(record))
@@ -221,11 +225,20 @@ def _calibrated(session: Session, models: Sequence[Model]) -> tuple[CalibratedCa
     return describe_cameras(model, sizes_px, fit)
 
 
+def _is_joint(model: str) -> bool:
+    return is_known(model) and reads_corners(model)
+
+
 def _model(session: Session, run: str) -> Model | None:
-    """Return the model that a run evaluated: its own model, or the model of one of its input runs."""
-    records = [record for record in session.runs() if record.run == run and writes(record, EVALUATION)]
-    for name in (run, *(source for record in records for source in record.input_runs)):
+    """Return the model that a run evaluated."""
+    for name in _model_runs(session, run):
         if topics := session.topics(MODEL, name):
             model: Model = session.payloads(topics)[-1]
             return model
     return None
+
+
+def _model_runs(session: Session, run: str) -> list[str]:
+    """Return the runs that may have the model of an evaluation: its own run, and its input runs."""
+    records = [record for record in session.runs() if record.run == run and writes(record, EVALUATION)]
+    return [run, *(source for record in records for source in record.input_runs)]

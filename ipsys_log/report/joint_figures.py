@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
@@ -35,30 +36,45 @@ def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure
     """Draw the cameras from above and from the side, each with its field of view on the floor."""
     figure = Figure(figsize=(_WIDTH_IN, 7.0), layout="constrained")
     above, beside = figure.subplots(2, 1, height_ratios=[3.2, 1.4])
-    styles = camera_styles(camera.camera for camera in cameras)
-    around_m = [part for camera in cameras for part in (camera.outline_m, camera.origin_m[None, :2])]
-    draw_ground(above, rig, [part for part in around_m if len(part)])
-    for camera in cameras:
-        colour, shape = styles[camera.camera]
-        x_m, y_m, z_m = camera.origin_m.tolist()
-        if len(camera.outline_m):
-            above.add_patch(Polygon(camera.outline_m, fill=False, ec=colour, lw=1.5))
-        above.plot(x_m, y_m, shape, color=colour, ms=8, label=_pose_label(camera), zorder=4)
-        _draw_axis(above, camera, colour)
-        beside.plot(x_m, z_m, shape, color=colour, ms=8, zorder=4)
-        for end_m in _ends_m(camera):
-            beside.plot([x_m, end_m], [z_m, 0.0], color=colour, lw=1.0)
-    above.set_title("From above", loc="left", fontsize=10)
-    beside.axhline(0.0, color=NOTE, lw=1.2)
-    beside.set(xlabel="x in m", ylabel="height in m")
-    beside.set_ylim(bottom=0.0, top=1.15 * max(float(camera.origin_m[2]) for camera in cameras))
-    beside.set_title("From the side, along y", loc="left", fontsize=10)
-    beside.set_xlim(above.get_xlim())
-    style_axes(beside)
+    _draw_above(above, cameras, rig)
+    # Seen along the shorter direction, cameras in a row do not hide one another.
+    axis = int(np.argmax(np.ptp([camera.origin_m[:2] for camera in cameras], axis=0)))
+    _draw_beside(beside, cameras, axis)
+    beside.set_xlim(above.get_ylim() if axis else above.get_xlim())
     for axes in (above, beside):
         axes.tick_params(labelsize=8)
     figure.legend(loc="outside lower center", frameon=False, fontsize=8)
     return figure
+
+
+def _draw_above(axes: Axes, cameras: Sequence[CalibratedCamera], rig: Rig | None) -> None:
+    around_m = [part for camera in cameras for part in (camera.outline_m, camera.origin_m[None, :2])]
+    draw_ground(axes, rig, [part for part in around_m if len(part)])
+    styles = camera_styles(camera.camera for camera in cameras)
+    for camera in cameras:
+        colour, shape = styles[camera.camera]
+        if len(camera.outline_m):
+            axes.add_patch(Polygon(camera.outline_m, fill=False, ec=colour, lw=1.5))
+        x_m, y_m, _ = camera.origin_m.tolist()
+        axes.plot(x_m, y_m, shape, color=colour, ms=8, label=_pose_label(camera), zorder=4)
+        _draw_axis(axes, camera, colour)
+    axes.set_title("From above", loc="left", fontsize=10)
+
+
+def _draw_beside(axes: Axes, cameras: Sequence[CalibratedCamera], axis: int) -> None:
+    """Draw heights over x (axis 0) or y (axis 1), with the outermost rays to the floor."""
+    styles = camera_styles(camera.camera for camera in cameras)
+    for camera in cameras:
+        colour, shape = styles[camera.camera]
+        across_m, height_m = camera.origin_m[[axis, 2]].tolist()
+        axes.plot(across_m, height_m, shape, color=colour, ms=8, zorder=4)
+        for end_m in _ends_m(camera, axis):
+            axes.plot([across_m, end_m], [height_m, 0.0], color=colour, lw=1.0)
+    axes.axhline(0.0, color=NOTE, lw=1.2)
+    axes.set(xlabel=f"{'xy'[axis]} in m", ylabel="height in m")
+    axes.set_ylim(bottom=0.0, top=1.15 * max(float(camera.origin_m[2]) for camera in cameras))
+    axes.set_title(f"From the side, along {'yx'[axis]}", loc="left", fontsize=10)
+    style_axes(axes)
 
 
 def _pose_label(camera: CalibratedCamera) -> str:
@@ -78,11 +94,11 @@ def _draw_axis(axes: Axes, camera: CalibratedCamera, colour: str) -> None:
     axes.annotate("", tuple(end_m), tuple(start_m), arrowprops={"arrowstyle": "->", "color": colour})
 
 
-def _ends_m(camera: CalibratedCamera) -> list[float]:
-    """Return the x of the outermost points of the field of view."""
+def _ends_m(camera: CalibratedCamera, axis: int) -> list[float]:
+    """Return the x or y of the outermost points of the field of view."""
     if not len(camera.outline_m):
         return []
-    return [float(camera.outline_m[:, 0].min()), float(camera.outline_m[:, 0].max())]
+    return [float(camera.outline_m[:, axis].min()), float(camera.outline_m[:, axis].max())]
 
 
 def has_clocks(cameras: Sequence[CalibratedCamera]) -> bool:
@@ -125,14 +141,13 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, 0.95 + _WIDTH_IN * height / width), layout="constrained")
     axes = figure.add_subplot()
     axes.add_patch(Rectangle((0, 0), width, height, fill=False, ec="black", lw=1.0))
+    x_px, y_px = residuals.cells_px.T
     arrows = axes.quiver(
-        *residuals.cells_px.T, *residuals.means_px.T, residuals.rms_px, cmap=_COLOURS, angles="xy",
+        x_px, y_px, *residuals.means_px.T, residuals.rms_px, cmap=_COLOURS, angles="xy",
         scale_units="xy", scale=most_px / (_ARROW * width), width=0.005, zorder=3,
     )  # fmt: skip
     arrows.set_clim(0.0, most_px)
-    axes.scatter(
-        *residuals.cells_px.T, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4
-    )
+    axes.scatter(x_px, y_px, c=residuals.rms_px, cmap=_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4)
     axes.set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height), aspect="equal")
     axes.set_xticks([0, width])
     axes.set_yticks([0, height])
@@ -143,6 +158,8 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     bar = figure.colorbar(arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30)
     bar.set_label("residual in px, RMS of a cell", fontsize=8)
     bar.ax.tick_params(labelsize=8)
+    bar.locator = MaxNLocator(5)
+    bar.update_ticks()
     return figure
 
 

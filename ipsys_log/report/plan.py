@@ -262,7 +262,7 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
         if len(rig.reference_points) < 2:
             return np.zeros(len(world_m))
         floor_m, rows = np.unique(world_m[:, :2], axis=0, return_inverse=True)
-        return np.trace(covariances(floor_m), axis1=1, axis2=2)[rows.reshape(-1)]
+        return np.asarray(np.trace(covariances(floor_m), axis1=1, axis2=2)[rows.reshape(-1)])
 
     return variances
 
@@ -281,7 +281,8 @@ def _tape_covariances(session: Session, rig: Rig) -> Callable[[Array], Array]:
         if len(known_m) < 2:
             return np.broadcast_to(sigma_m**2 * np.eye(2), (len(points_m), 2, 2))
         sigmas_m = np.full(len(known_m), sigma_m)
-        return np.array([tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m])
+        each_m2 = [tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m]
+        return np.array(each_m2).reshape(-1, 2, 2)
 
     return covariances
 

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ipsys_log.analysis.drive_plan import choose_drive
-from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors
+from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors, see_markers
 from ipsys_log.analysis.joint_plan import plan_joint_points
-from ipsys_log.analysis.taped_points import choose_points, posterior_root
+from ipsys_log.analysis.taped_points import choose_points, mean_error, posterior_root, some_modes
 from ipsys_log.errors import IpsysError
+from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.model import JointModel, build_models
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
@@ -84,6 +85,37 @@ def test_plan_outside_of_all_images_is_refused(
 ) -> None:
     with pytest.raises(IpsysError, match="no camera sees a whole marker"):
         plan_joint_points(models, sizes_px, expected, np.array([[90.0, 90.0, 0.0]]), tape_m2, LENGTH_M, 1)
+
+
+def test_effect_of_a_drive_is_that_of_all_its_unknowns(
+    models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]], expected: list[ExpectedErrors]
+) -> None:
+    """A robot at one place: one large system with its x, y and heading gives the same error."""
+    place_m, around_m = np.array([2.4, 2.4]), np.full(2, 0.15)
+    drive = choose_drive(
+        models, sizes_px, expected, place_m - around_m, place_m + around_m, HEIGHT_M, LENGTH_M
+    )
+    assert drive is not None
+    assert drive.cameras == ("c0", "c1")
+    count = next(iter(models.values())).modes.shape[1]
+    information = np.diag(np.r_[np.ones(count + 1), np.zeros(3)])
+    for model in models.values():
+        view = see_markers(model, (1920, 1080), place_m[None], HEIGHT_M, LENGTH_M)
+        inward, sizes_m = edge_motion(view.corners_px), np.array([LENGTH_M * model.scale])
+        now = linearise_corners(model, view.corners_px, inward, view.centres_m, view.turns, sizes_m)
+        _, floor_slopes, floor_modes = model.floor.evaluate(view.centres_m, model.amplitudes)
+        by_height = now.by_pose[0, :, 2]
+        flat = len(model.modes) - floor_modes.shape[1]
+        by_modes = now.by_camera[0] @ model.modes[:flat]
+        by_modes += np.outer(by_height, floor_modes[0] @ model.modes[flat:])
+        by_place = now.by_pose[0, :, :2] + np.outer(by_height, floor_slopes[0])
+        slopes = np.column_stack([by_modes, 0.001 * by_height, by_place, now.by_pose[0, :, 5]])
+        tilts = 0.004 * now.by_pose[0, :, 3:5]
+        noise_px2 = (0.02**2 + model.corner_floor_px**2) * np.eye(8) + tilts @ tilts.T
+        information += 300 * slopes.T @ np.linalg.solve(noise_px2, slopes)
+    root = np.linalg.cholesky(np.linalg.inv(information)[:count, :count])
+    assert drive.mean_before_m == pytest.approx(mean_error(some_modes(expected)))
+    assert drive.mean_after_m == pytest.approx(mean_error(some_modes(expected) @ root), rel=1e-4)
 
 
 def test_planned_drive_is_seen_and_reduces_the_error(

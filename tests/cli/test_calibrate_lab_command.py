@@ -158,9 +158,7 @@ def test_a_proposed_point_gives_the_predicted_error(
     assert measured["mean_mm"] == pytest.approx(best["mean_after_mm"], rel=0.1)
 
 
-def test_plan_for_joint_names_points_and_a_drive(
-    ipsys: Ipsys, fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plan_for_joint_names_points_and_a_drive(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
     drawn = tmp_path / "plan.png"
     done = ipsys("plan", fitted, "--model", "joint", "--places", "3", "--plot", drawn, "--json")
     assert done.code == 0, done.err
@@ -174,6 +172,12 @@ def test_plan_for_joint_names_points_and_a_drive(
     drive = answer["drive"]
     assert drive["mean_after_cm"] < drive["mean_before_cm"] < 1
     assert cv2.imread(str(drawn)) is not None
+
+
+@pytest.mark.slow
+def test_plan_for_joint_proposes_a_drive_only_if_it_helps(
+    ipsys: Ipsys, fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     text = ipsys("plan", fitted, "--model", "joint", "--places", "1").out
     assert max(map(len, text.splitlines())) <= 80

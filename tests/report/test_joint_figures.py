@@ -22,8 +22,8 @@ CAMERAS = ("black", "red")
 def calibrated(name: str, y_m: float, clock_sigma_s: float) -> CalibratedCamera:
     rng = np.random.default_rng(1)
     outline_m = np.array([[0.4, y_m - 1], [4.4, y_m - 1], [4.4, y_m + 1], [0.4, y_m + 1]])
-    cells_px = np.stack(np.meshgrid(np.arange(60, 1920, 120), np.arange(60, 1080, 120)), axis=-1)
-    cells_px = cells_px.reshape(-1, 2).astype(float)
+    cells_px = np.stack(np.meshgrid(np.arange(60.0, 1920.0, 120), np.arange(60.0, 1080.0, 120)), axis=-1)
+    cells_px = cells_px.reshape(-1, 2)
     means_px = rng.normal(0, 0.02, cells_px.shape)
     residuals = ImageResiduals(cells_px, means_px, np.abs(means_px[:, 0]), 0.02, 5000, 1)
     return CalibratedCamera(

@@ -186,6 +186,7 @@ def test_loaded_joint_model_gives_the_positions_of_locate(ipsys: Ipsys, fitted: 
         model.predict(str(seen.camera), corners_px, 0.2, np.zeros(len(markers) + 7))
 
 
+@pytest.mark.slow
 def test_logs_with_runs_of_one_name_are_fitted_together(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
     """A drive of another hour has runs of the same names; the fit uses the sightings of both."""
     drive, alone, both = (tmp_path / name for name in ("drive.mcap", "alone.mcap", "both.mcap"))
@@ -208,6 +209,7 @@ def test_logs_with_runs_of_one_name_are_fitted_together(ipsys: Ipsys, fitted: Pa
     assert "leave one of them out" in refused.err
 
 
+@pytest.mark.slow
 def test_wrong_tape_reading_is_an_outlier_of_joint(ipsys: Ipsys, tmp_path: Path) -> None:
     """A drive shows a wrong reading among few points, where other models cannot search."""
 
@@ -256,6 +258,7 @@ def test_usual_joint_model_that_cannot_be_fitted_is_left_out(
     assert (named.code, named.err.count("\n")) == (1, 1)
 
 
+@pytest.mark.slow
 def test_marker_without_a_height_gets_its_full_pose(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
     rig, located = tmp_path / "lab.toml", tmp_path / "located.mcap"
     assert ipsys("init", rig, "--from", fitted).code == 0

@@ -76,7 +76,7 @@ def jacobian_of(problem: Problem, state: State, function: Callable[[State], Arra
 def minimise(problem: Problem, start: State, exact: bool = False) -> State:
     """Return the optimum by scipy's trust-region method, with derivatives by differences.
 
-    ``exact`` derivatives are central differences: a drive has unknowns that its observations hardly determine.
+    ``exact`` derivatives are central differences. A drive has unknowns that are hardly determined.
     """
     sizes = step_sizes(problem)
 

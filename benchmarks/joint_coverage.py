@@ -53,7 +53,8 @@ def _scenes() -> tuple[Scene, ...]:
             rows.append(Scene(f"{name}, flat{ending}", settings))
             uneven = replace(settings, floor_rms_m=_UNEVEN_M)
             rows.append(Scene(f"{name}, 1.5 mm{ending}", uneven))
-    return (*rows, scenes["drive and 16, clocks"], scenes["drive and 16, 1.5 mm"])
+    others = ("16 points, 3 mm", "drive and 16, clocks", "drive and 16, 1.5 mm")
+    return (*rows, *(scenes[name] for name in others))
 
 
 # Calibration points or a drive, on a flat and on an uneven floor; the last two have clock offsets.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lstsq
 from scipy.optimize import least_squares
 
 from ipsys_log.joint.parameters import State
@@ -13,6 +14,9 @@ from ipsys_log.joint.problem import Problem
 from ipsys_log.joint.robust import limit_of, robust_loss
 
 Array = NDArray[np.float64]
+
+# The limit of the loss in each step, in limits of normal errors.
+_PLAIN_STEPS, _ROBUST_STEPS = (1e9,) * 4, (1.0,) * 2
 
 
 def residuals_of(problem: Problem, state: State, ease: float = 1.0) -> Array:
@@ -73,25 +77,30 @@ def jacobian_of(problem: Problem, state: State, function: Callable[[State], Arra
     return np.stack(columns, axis=1)
 
 
-def minimise(problem: Problem, start: State, exact: bool = False) -> State:
-    """Return the optimum by scipy's trust-region method, with derivatives by differences.
-
-    ``exact`` derivatives are central differences: a drive has unknowns that its observations hardly
-    determine.
-    """
+def minimise(problem: Problem, start: State) -> State:
+    """Return the optimum by scipy's trust-region method, with derivatives by differences."""
     sizes = step_sizes(problem)
 
     def function(step: Array) -> Array:
         return residuals_of(problem, start.moved(problem.layout, *split_step(problem, step * sizes)))
 
     solved = least_squares(
-        function,
-        np.zeros(len(sizes)),
-        "3-point" if exact else "2-point",
-        xtol=1e-12,
-        ftol=1e-14,
-        gtol=1e-12,
-        x_scale="jac" if exact else 1.0,
-        method="trf",
+        function, np.zeros(len(sizes)), "2-point", xtol=1e-12, ftol=1e-14, gtol=1e-12, method="trf"
     )
     return start.moved(problem.layout, *split_step(problem, solved.x * sizes))
+
+
+def descend(problem: Problem, start: State) -> State:
+    """Return the optimum by Gauss-Newton steps of scipy's dense least squares, with central differences.
+
+    A drive has unknowns that are hardly determined: derivatives of one side end at another place. The first
+    steps have plain squares, because everything is an outlier at the start.
+    """
+    state = start
+    for ease in (*_PLAIN_STEPS, *_ROBUST_STEPS):
+        residuals = residuals_of(problem, state, ease)
+        jacobian = jacobian_of(problem, state, lambda one, ease=ease: residuals_of(problem, one, ease))
+        scales = np.linalg.norm(jacobian, axis=0)
+        step = lstsq(jacobian / scales, -residuals, cond=1e-14)[0] / scales
+        state = state.moved(problem.layout, *split_step(problem, step))
+    return state

@@ -112,6 +112,8 @@ def test_marker_seen_to_move_by_two_cameras_is_no_camera_move() -> None:
     drift = find([log(1, still), log(2, still, shifted), log(3, still, shifted)])
     assert drift.moves == []
     assert [(move.marker_id, move.log) for move in drift.marker_moves] == [(94, "week2")]
+    assert all(state.motion and 94 in state.motion.markers for state in drift.of_camera("white"))
+    assert not any(state.motion.is_moved for state in drift.states if state.motion)
 
 
 def test_slow_sag_is_one_gradual_move() -> None:

@@ -148,8 +148,9 @@ def test_mended_model_is_as_good_as_before_the_knock(
     assert row["parameters"]["mended"] == "white"
     replayed = ipsys("replay", log, "--model", "joint")
     assert replayed.code == 0, replayed.err
-    again = drift(ipsys, *weeks[:5], log)
+    again = drift(ipsys, *weeks[:5], log, "--model-from", fitted)
     assert [move["camera"] for move in again["moves"]] == ["white"]
+    assert drift(ipsys, log)["model"]["topic"] == "/runs/joint_mended/model"
 
 
 def _errors_mm(log: Path) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
@@ -103,7 +104,7 @@ def test_two_knocks_of_one_camera_are_two_moves() -> None:
 
 
 def test_still_cameras_have_no_move() -> None:
-    drift = find([log(week, still) for week in range(1, 13)])
+    drift = find([log(week, still) for week in range(1, 7)])
     assert (drift.moves, drift.marker_moves) == ([], [])
 
 
@@ -116,6 +117,7 @@ def test_marker_seen_to_move_by_two_cameras_is_no_camera_move() -> None:
     assert not any(state.motion.is_moved for state in drift.states if state.motion)
 
 
+@pytest.mark.slow
 def test_slow_sag_is_one_gradual_move() -> None:
     def sagging(camera: str, week: int, _number: int) -> Array:
         return 0.15 * week * KNOCK if camera == "red" else np.zeros(6)

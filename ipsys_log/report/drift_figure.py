@@ -66,5 +66,5 @@ def _draw_camera(axes: Axes, camera: str, states: Sequence[CameraState], style: 
     means_mm = np.array([motion.mean_shift_m for motion in motions]) * MM_PER_M
     half_mm = np.array([motion.sigma_m for motion in motions]) * MM_PER_M * _NORMAL_95
     low_mm = np.maximum(means_mm - half_mm, 0.0)
-    axes.fill_between(times, low_mm, means_mm + half_mm, color=colour, alpha=0.18, lw=0)  # type: ignore[arg-type]
-    axes.plot(times, means_mm, "-" + shape, color=colour, ms=6, lw=1.6, label=shorten(camera))  # type: ignore[arg-type]
+    axes.fill_between(times, low_mm, means_mm + half_mm, color=colour, alpha=0.18, lw=0)
+    axes.plot(times, means_mm, "-" + shape, color=colour, ms=6, lw=1.6, label=shorten(camera))

@@ -117,6 +117,13 @@ def test_marker_seen_to_move_by_two_cameras_is_no_camera_move() -> None:
     assert not any(state.motion.is_moved for state in drift.states if state.motion)
 
 
+def test_only_marker_of_two_cameras_that_moves_accuses_none() -> None:
+    one, moved = {90: PLACES[90]}, {90: (1.01, 1.62)}
+    drift = find([log(1, still, one), log(2, still, moved), log(3, still, moved)])
+    assert drift.moves == []
+    assert [(move.marker_id, move.log) for move in drift.marker_moves] == [(90, "week2")]
+
+
 @pytest.mark.slow
 def test_slow_sag_is_one_gradual_move() -> None:
     def sagging(camera: str, week: int, _number: int) -> Array:

@@ -22,7 +22,7 @@ def pairs(sigma_m: float | None) -> list[PairDisagreement]:
     ids = np.zeros(200, dtype=np.int64)
     return compare_cameras(
         [
-            CameraPositions("red", ids, times_ns, points_m + [0.005, 0.0], covariances),
+            CameraPositions("red", ids, times_ns, points_m + np.array([0.005, 0.0]), covariances),
             CameraPositions("white", ids, times_ns, points_m, covariances),
         ]
     )

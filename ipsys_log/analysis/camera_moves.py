@@ -183,11 +183,11 @@ class _Search:
             corners.pop(marker_id, None)
             if marker_id in window.corners.get(camera, {}):
                 corners[marker_id] = window.corners[camera][marker_id]
-            segment.baseline = build_baseline(
-                segment.baseline.camera, segment.baseline.floor_m, corners, self._lengths_m
-            )
+            before, first = segment.baseline, self.drift.baselines[camera]
+            segment.baseline = build_baseline(before.camera, before.floor_m, corners, self._lengths_m)
             segment.windows = segment.windows[:0]
-            self.drift.baselines[camera] = _without(self.drift.baselines[camera], marker_id)
+            # A camera that has not moved so far sees the marker from where it was at the baseline.
+            self.drift.baselines[camera] = segment.baseline if first is before else _without(first, marker_id)
 
     def _continue(
         self, camera: str, window: Window, log: str, motion: Motion | None, moved_markers: set[int]
@@ -199,14 +199,21 @@ class _Search:
             self.drift.baselines[camera] = baseline
             self._segments[camera] = _Segment(baseline, [window], window.start_ns, (window, log), [window])
             return
-        if motion is not None and motion.is_moved and not set(motion.markers) & moved_markers:
-            segment.suspected.append((window, log))
+        if motion is not None and motion.is_moved:
+            if not set(motion.markers) & moved_markers:
+                segment.suspected.append((window, log))
             if len(segment.suspected) > 1:
                 self._note_move(camera, segment)
             return
         segment.suspected.clear()
         segment.last = window, log
         segment.recent = [*segment.recent, window][-_AVERAGED:]
+        if motion is None:
+            self._extend_baseline(camera, window)
+
+    def _extend_baseline(self, camera: str, window: Window) -> None:
+        """Average the first windows of a segment, and add markers that are seen for the first time."""
+        segment = self._segments[camera]
         before, seen = segment.baseline, window.corners[camera]
         if 0 < len(segment.windows) < _AVERAGED:
             segment.windows.append(window)

@@ -16,6 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.errors import LogError
 from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import read_columns
 from ipsys_log.log.contents import camera_of_topic
@@ -46,6 +47,7 @@ LONGEST_GAP_NS = 300_000_000
 _SQUARE_95 = -2 * np.log(1 - 0.95)
 _FIELDS = ("id", "x_m", "y_m", "covariance_m2", "inside", "time_offset_ns")
 _FEWEST = 3
+_FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,12 +150,15 @@ def read_disagreement(session: Session, run: str, without: Collection[int] = ())
         fields = columns.fields
         kept = ~((fields["inside"].values == 0) & ~fields["inside"].missing)
         kept &= ~np.isin(fields["id"].values, list(without))
+        points_m = np.column_stack([fields["x_m"].values, fields["y_m"].values])
+        kept &= (np.abs(points_m) < _FARTHEST_M).all(axis=1)  # False for NaN
         times_ns = np.array([publish_ns for publish_ns, _ in rows], dtype=np.int64)[columns.message]
         covariances = np.full((len(kept), 9), np.nan)
         known = ~fields["covariance_m2"].missing
+        if known.any() and fields["covariance_m2"].values.shape[1] != 9:
+            raise LogError(f"{session}: {topic} has covariances that are not 3 x 3")
         if known.any():
             covariances[known] = fields["covariance_m2"].values[known]
-        points_m = np.column_stack([fields["x_m"].values, fields["y_m"].values])
         cameras.append(
             CameraPositions(
                 str(camera_of_topic(topic)),

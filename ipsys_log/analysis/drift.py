@@ -24,7 +24,7 @@ from ipsys_log.calibration.lens_models import project_points, project_with_slope
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import marker_corners, pixel_slopes
 from ipsys_log.geometry.poses import rotation
-from ipsys_log.geometry.square_pose import fit_squares
+from ipsys_log.geometry.square_pose import fit_squares, is_convex
 from ipsys_log.joint.observations import lens_model_of
 
 __all__ = ["LEAST_SHIFT_M", "Baseline", "MeanCorners", "Motion", "build_baseline", "estimate_motion"]
@@ -131,7 +131,7 @@ def build_baseline(
     points_c = {}
     for marker_id, mean in sorted(corners.items()):
         uv = undistort(mean.corners_px, camera.lens)
-        if not np.isfinite(uv).all():
+        if not (np.isfinite(uv).all() and is_convex(uv)):
             continue
         whitening = np.zeros((1, 8, 8))
         for corner, slopes in enumerate(pixel_slopes(uv, camera.lens)):

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.lenses import in_image
+from ipsys_log.geometry.lenses import check_calibration, in_image
 from ipsys_log.geometry.poses import rotation
-from ipsys_log.messages import CameraCalibration, Floor, Model
+from ipsys_log.messages import CameraCalibration, CameraModel, Floor, Model
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import reads_corners
 
@@ -48,29 +48,44 @@ def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) ->
     ----------
     model : a fitted model.
     lenses : intrinsics by camera; they also give the size of the images.
+
+    Raises
+    ------
+    IpsysError
+        The model of a camera is not complete, or its intrinsics are not valid.
     """
     cameras = {}
     for camera in model.cameras:
-        lens = lenses.get(camera.camera)
-        if lens is None:
+        if camera.camera not in lenses:
             continue
-        if reads_corners(model.name):
-            # Late: scipy takes 1 s, and most commands need no joint model.
-            from ipsys_log.joint.payload import restore_joint
-
-            joint = restore_joint(camera)
-            own = joint.calibration
-            lens = replace(lens, distortion_model=own.distortion_model, K=own.K, D=own.D)
-            cameras[camera.camera] = FloorCamera(camera.camera, lens, joint.camera_from_world, joint.origin_m)
-            continue
-        world_m = np.array([pair.world_m for pair in camera.pairs]).reshape(-1, 3)
-        camera_m = np.array([pair.camera_m for pair in camera.pairs]).reshape(-1, 3)
-        try:
-            turn, shift_m = rigid_transform(world_m, camera_m)
-        except FitError:
-            continue
-        cameras[camera.camera] = FloorCamera(camera.camera, lens, turn, -turn.T @ shift_m)
+        lens = check_calibration(lenses[camera.camera], f"calibration of {camera.camera}")
+        own = (_joint_camera if reads_corners(model.name) else _rigid_camera)(camera, lens)
+        if own is not None and np.isfinite(own.camera_from_world).all() and np.isfinite(own.origin_m).all():
+            cameras[own.name] = own
     return cameras
+
+
+def _joint_camera(camera: CameraModel, lens: CameraCalibration) -> FloorCamera:
+    # Late: scipy takes 1 s, and most commands need no joint model.
+    from ipsys_log.joint.payload import restore_joint
+
+    joint = restore_joint(camera)
+    own = joint.calibration
+    lens = replace(lens, distortion_model=own.distortion_model, K=own.K, D=own.D)
+    return FloorCamera(camera.camera, lens, joint.camera_from_world, joint.origin_m)
+
+
+def _rigid_camera(camera: CameraModel, lens: CameraCalibration) -> FloorCamera | None:
+    """Return a camera with the pose that its calibration points give; None if they are too few."""
+    world_m = np.array([pair.world_m for pair in camera.pairs]).reshape(-1, 3)
+    camera_m = np.array([pair.camera_m for pair in camera.pairs]).reshape(-1, 3)
+    if not (np.isfinite(world_m).all() and np.isfinite(camera_m).all()):
+        return None
+    try:
+        turn, shift_m = rigid_transform(world_m, camera_m)
+    except FitError:
+        return None
+    return FloorCamera(camera.camera, lens, turn, -turn.T @ shift_m)
 
 
 def floor_grid(camera: FloorCamera, floor: Floor | None) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.drift import MeanCorners
+from ipsys_log.errors import LogError
 from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import read_columns
 from ipsys_log.log.contents import camera_of_topic
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 _MOST_WINDOWS = 60
 _LEAST_NS, _LONGEST_NS = NS_PER_S, 2 * NS_PER_S
 _FEWEST_FRAMES = 3
+_FARTHEST_PX = 1e5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,11 +75,15 @@ def _mean_corners(
     parts = session.part_counter()
     for topic, encoded in messages.items():
         columns = read_columns(schema_name(Markers), encoded, ("id", "corners_px"), parts)
-        seen, corners_px = columns.fields["id"].values, columns.fields["corners_px"]
+        seen, corners_px = columns.fields["id"].values, columns.fields["corners_px"].values
+        if corners_px.shape[1] not in (0, 8):
+            raise LogError(f"{session}: {topic} has markers with other than four corners")
+        # A comparison with NaN is False.
+        valid = ~columns.fields["corners_px"].missing & (np.abs(corners_px) < _FARTHEST_PX).all(axis=1)
         for marker_id in sorted(ids):
-            rows = (seen == marker_id) & ~corners_px.missing
+            rows = (seen == marker_id) & valid
             if rows.sum() >= _FEWEST_FRAMES:
-                middle = np.median(corners_px.values[rows], axis=0).reshape(4, 2)
+                middle = np.median(corners_px[rows], axis=0).reshape(4, 2)
                 own = means.setdefault(str(camera_of_topic(topic)), {})
                 own[marker_id] = MeanCorners(middle, int(rows.sum()))
     return means

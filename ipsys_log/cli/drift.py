@@ -12,7 +12,7 @@ from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, RigFile
 
 if TYPE_CHECKING:
-    from ipsys_log.report.drift import DriftReading
+    from ipsys_log.report.drift_reading import DriftReading
 
 __all__ = ["add_commands"]
 
@@ -63,7 +63,7 @@ def drift(
     The command compares reference markers, which are fixed to the floor or to a wall, in logs of weeks. The
     rig lists them under reference_markers. It finds a mean shift of the floor map from 2 mm on.
     """
-    from ipsys_log.report.drift import read_drift
+    from ipsys_log.report.drift_reading import read_drift
     from ipsys_log.report.files import check_figure_file
     from ipsys_log.rig.file import load_rig
 
@@ -112,7 +112,7 @@ def _print(reading: DriftReading, run: str | None, as_json: bool) -> None:
         print(json.dumps(result, indent=2, allow_nan=False))  # noqa: T201
     else:
         for line, is_good in drift_lines(reading):
-            console.print(line, style="green" if is_good else "red", markup=False, soft_wrap=False)
+            console.print(line, style="green" if is_good else "red", markup=False)
         console.print()
         console.print(drift_table(reading))
     for remark in reading.remarks:

@@ -1,183 +1,23 @@
-"""Drift of the cameras over several logs: reading of the logs, sentences, table and JSON."""
+"""Drift of the cameras over several logs: sentences, table and JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, MarkerMove, Move, find_drift
+from ipsys_log.analysis.camera_moves import CameraState, MarkerMove, Move
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Motion
-from ipsys_log.analysis.floor_cameras import FloorCamera, read_floor_cameras
-from ipsys_log.analysis.reference_markers import image_sizes, read_windows
-from ipsys_log.errors import IpsysError
-from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Rig
-from ipsys_log.messages.channels import MARKERS, RIG
-from ipsys_log.report.tables import plain_table
-from ipsys_log.runs.mended_model import find_model
-from ipsys_log.runs.provenance import newest_run
+from ipsys_log.report.drift_reading import DriftReading
+from ipsys_log.report.tables import name_cell, plain_table, wrap_text
 from ipsys_log.units import MM_PER_M, format_time
 
-__all__ = ["DriftReading", "drift_json", "drift_lines", "drift_table", "read_drift"]
+__all__ = ["drift_json", "drift_lines", "drift_table"]
 
 # A normal distribution has 95 % within this many standard deviations.
 _NORMAL_95 = 1.96
 _SEPARATE = "turn {turn:.2f} ({turn_sigma:.2f}) degrees, shift {shift:.1f} ({shift_sigma:.1f}) mm"
-
-
-@dataclass(slots=True, eq=False)
-class DriftReading:
-    """The drift over logs, and its sources.
-
-    Attributes
-    ----------
-    paths : the logs in order of time; the first is the baseline.
-    model : name of the model with the camera poses; ``source`` are its log and its topic.
-    remarks : on logs that were left out, and others.
-    """
-
-    drift: LabDrift
-    paths: list[Path]
-    model: str
-    source: tuple[Path, str]
-    remarks: list[str] = field(default_factory=list)
-
-    def moved(self) -> dict[str, Motion]:
-        """Return the motions since the baseline of the cameras that have moved at the end of the logs."""
-        motions = {}
-        for camera in sorted(self.drift.baselines):
-            motion = next((s.motion for s in reversed(self.drift.of_camera(camera)) if s.motion), None)
-            if motion is not None and motion.is_moved:
-                motions[camera] = motion
-        return motions
-
-
-def read_drift(
-    paths: Sequence[Path],
-    baseline: Path | None = None,
-    model_from: Path | None = None,
-    rig: Rig | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> DriftReading:
-    """Find the moves of the cameras over logs.
-
-    Parameters
-    ----------
-    paths : the logs, in any order.
-    baseline : the log before all moves; None: the first by time.
-    model_from : a log with a fitted model; None: the baseline, or else the first log with a model.
-    rig : used instead of the rigs of the logs.
-    progress : called with the number of logs done, and of all logs.
-
-    Raises
-    ------
-    IpsysError
-        No rig has reference markers, a log has no markers or is of other cameras, or no log has a model.
-    """
-    starts_ns = {path: _start_ns(path) for path in dict.fromkeys([*paths, *([baseline] if baseline else [])])}
-    first = baseline or min(starts_ns, key=starts_ns.__getitem__)
-    order = sorted(starts_ns, key=lambda path: (path != first, starts_ns[path]))
-    remarks = [
-        f"{path}: is older than the baseline; it is left out"
-        for path in order
-        if starts_ns[path] < starts_ns[first]
-    ]
-    order = [path for path in order if starts_ns[path] >= starts_ns[first]]
-    logs, read, lab = [], [], None
-    for number, path in enumerate(order):
-        progress(number, len(order))
-        one = _read_log(path, rig)
-        lab = lab or one
-        _check_same(one, lab)
-        if one.windows.windows:
-            logs.append(one.windows)
-            read.append(path)
-        elif path == first:
-            raise IpsysError(f"{path}: {_unseen(one.rig)}; give another log with --baseline")
-        else:
-            remarks.append(f"{path}: {_unseen(one.rig)}; it is left out")
-    progress(len(order), len(order))
-    assert lab is not None
-    model, source, cameras = _cameras([model_from] if model_from else read, starts_ns[first])
-    lengths_m = {marker.id: lab.rig.length_of(marker.id) for marker in lab.rig.reference_markers}
-    drift = find_drift(logs, cameras, lengths_m, lab.rig.floor)
-    seen = {camera for log in logs for window in log.windows for camera in window.corners}
-    remarks += [f"camera {name}: {source[0]} has no model of it" for name in sorted(seen - set(cameras))]
-    remarks += [
-        f"camera {name}: sees no reference marker; it is not watched" for name in sorted(set(cameras) - seen)
-    ]
-    if len(read) == 1:
-        remarks.append("one log shows only moves during its recording; add earlier logs")
-    return DriftReading(drift, read, model, source, remarks)
-
-
-@dataclass(slots=True, eq=False)
-class _Log:
-    path: Path
-    rig: Rig
-    sizes_px: Mapping[str, tuple[int, int]]
-    windows: DriftLog
-
-
-def _start_ns(path: Path) -> int:
-    with Session([path]) as session:
-        return session.start_ns
-
-
-def _read_log(path: Path, rig: Rig | None) -> _Log:
-    with Session([path]) as session:
-        rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
-        if not rigs or not rigs[-1].reference_markers:
-            raise IpsysError(
-                f"{path}: its rig has no reference markers; fix markers to the floor, add "
-                "[[reference_markers]] with their ids to lab.toml, and give --rig lab.toml for older logs"
-            )
-        run = newest_run(session, MARKERS)
-        if run is None:
-            raise IpsysError(f"{path}: has no detected markers; to detect them: ipsys detect {path}")
-        ids = {marker.id for marker in rigs[-1].reference_markers}
-        windows = DriftLog(path.name, read_windows(session, run, ids))
-        return _Log(path, rigs[-1], image_sizes(session, run), windows)
-
-
-def _unseen(rig: Rig) -> str:
-    ids = ", ".join(str(marker.id) for marker in rig.reference_markers)
-    return f"no camera sees a reference marker ({ids}) in it, or its markers were detected with an older rig"
-
-
-def _check_same(log: _Log, first: _Log) -> None:
-    """Check that a log is of the same cameras as the baseline."""
-    if not set(log.sizes_px) & set(first.sizes_px):
-        raise IpsysError(
-            f"{log.path}: has the cameras {', '.join(sorted(log.sizes_px))}, but {first.path} has "
-            f"{', '.join(sorted(first.sizes_px))}; compare only logs of one lab"
-        )
-    for camera, (width, height) in sorted(log.sizes_px.items()):
-        before = first.sizes_px.get(camera, (width, height))
-        if before != (width, height):
-            raise IpsysError(
-                f"{log.path}: camera {camera} has images of {width} x {height} px, but in {first.path} of "
-                f"{before[0]} x {before[1]} px; compare only logs with the same image size"
-            )
-
-
-def _cameras(paths: Sequence[Path], until_ns: int) -> tuple[str, tuple[Path, str], dict[str, FloorCamera]]:
-    """Return the name and the source of the first model with camera poses, and its cameras."""
-    for path in paths:
-        with Session([path]) as session:
-            model = find_model(session, until_ns)
-            lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        if model is not None and (cameras := read_floor_cameras(model[0], lenses)):
-            return model[0].name, (path, model[1]), cameras
-    raise IpsysError(
-        f"{paths[0]}: has no fitted model with camera poses and intrinsics; give the log of the calibration "
-        "with --model-from LOG"
-    )
 
 
 def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
@@ -188,7 +28,7 @@ def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
     if not lines:
         least_mm = LEAST_SHIFT_M * MM_PER_M
         lines = [(f"No camera has moved: the mean shift of each floor map is below {least_mm:.1f} mm.", True)]
-    return lines
+    return [(wrap_text(text), is_good) for text, is_good in lines]
 
 
 def _marker_line(move: MarkerMove) -> str:
@@ -252,17 +92,17 @@ def drift_table(reading: DriftReading) -> Table:
     """Return a table with the mean shift of each floor map since the baseline, one row for each log."""
     drift = reading.drift
     cameras = sorted(drift.baselines)
-    first = reading.paths[0].name
-    table = plain_table(f"Mean shift of the floor maps since {first}, in mm", ["log", "start (UTC)"], cameras)
-    for path in reading.paths:
-        states = {state.camera: state for state in drift.states if state.log == path.name}
+    title = f"Mean shift of the floor maps since {reading.names[0]}, in mm"
+    table = plain_table(title, ["log", "end (UTC)"], cameras)
+    for name in reading.names:
+        states = {state.camera: state for state in drift.states if state.log == name}
         if states:
             time = format_time(min(state.time_ns for state in states.values()))[:16]
-            table.add_row(path.name, time, *(_cell(states.get(camera)) for camera in cameras))
+            table.add_row(name_cell(name), time, *(_cell(states.get(camera)) for camera in cameras))
     return table
 
 
-def _cell(state: Any) -> str:
+def _cell(state: CameraState | None) -> str:
     if state is None or state.motion is None:
         return "-"
     low_mm, high_mm = _band_mm(state.motion)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
+from ipsys_log.analysis.camera_moves import CameraState
 from ipsys_log.analysis.drift import LEAST_SHIFT_M
-from ipsys_log.report.drift import DriftReading
+from ipsys_log.report.drift_reading import DriftReading
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
@@ -32,15 +35,8 @@ def draw_drift(reading: DriftReading, path: Path) -> None:
     styles = camera_styles(drift.baselines)
     for camera in sorted(drift.baselines):
         states = [state for state in drift.of_camera(camera) if state.motion is not None]
-        if not states:
-            continue
-        colour, shape = styles[camera]
-        times = np.array([datetime.fromtimestamp(s.time_ns / NS_PER_S, UTC) for s in states])
-        means_mm = np.array([s.motion.mean_shift_m for s in states if s.motion]) * MM_PER_M
-        half_mm = np.array([s.motion.sigma_m for s in states if s.motion]) * MM_PER_M * _NORMAL_95
-        low_mm = np.maximum(means_mm - half_mm, 0.0)
-        axes.fill_between(times, low_mm, means_mm + half_mm, color=colour, alpha=0.18, lw=0)
-        axes.plot(times, means_mm, "-" + shape, color=colour, ms=6, lw=1.6, label=shorten(camera))
+        if states:
+            _draw_camera(axes, camera, states, styles[camera])
     for move in drift.moves:
         moment = datetime.fromtimestamp(move.after_ns / NS_PER_S, UTC)
         axes.axvline(moment, color=styles[move.camera][0], ls=":", lw=1.4)  # type: ignore[arg-type]
@@ -55,8 +51,20 @@ def draw_drift(reading: DriftReading, path: Path) -> None:
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     axes.set(ylabel="mean shift of the floor map in mm", ylim=(0, None))
     axes.set_title(
-        f"Drift of the cameras since {shorten(reading.paths[0].name)}; bands: 95 %", loc="left", fontsize=11
+        f"Drift of the cameras since {shorten(reading.names[0])}; bands: 95 %", loc="left", fontsize=11
     )
     style_axes(axes)
     axes.legend(loc="upper left", fontsize=9, frameon=False)
     write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
+
+
+def _draw_camera(axes: Axes, camera: str, states: Sequence[CameraState], style: tuple[str, str]) -> None:
+    """Draw the line of a camera, with its band."""
+    colour, shape = style
+    times = np.array([datetime.fromtimestamp(state.time_ns / NS_PER_S, UTC) for state in states])
+    motions = [state.motion for state in states if state.motion]
+    means_mm = np.array([motion.mean_shift_m for motion in motions]) * MM_PER_M
+    half_mm = np.array([motion.sigma_m for motion in motions]) * MM_PER_M * _NORMAL_95
+    low_mm = np.maximum(means_mm - half_mm, 0.0)
+    axes.fill_between(times, low_mm, means_mm + half_mm, color=colour, alpha=0.18, lw=0)
+    axes.plot(times, means_mm, "-" + shape, color=colour, ms=6, lw=1.6, label=shorten(camera))

@@ -10,7 +10,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.joint.mending import PoseChange, mend_poses
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Model, Run
+from ipsys_log.messages import ChannelRead, Message, Model, Run
 from ipsys_log.messages.channels import MARKERS, MODEL
 from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.graph import version_parameters, writer_of
@@ -79,30 +79,39 @@ def append_mended_model(
         )
     with Session([baseline]) as first:
         reference = read_channels(first, first.topics(MARKERS, newest_run(first, MARKERS)))
+    parameters = {
+        "model": model.name,
+        _MENDED: ", ".join(sorted(changes)),
+        _BASELINE: baseline.name,
+        _VALID_FROM: str(valid_from_ns),
+    }
     with Session([target]) as session:
-        markers = str(newest_run(session, MARKERS))
-        topics = session.topics(MARKERS, markers)
-        stage = writer_of(MODEL)
-        log_time_ns, time_ns = session.last(topics)
-        parameters = {
-            "model": model.name,
-            _MENDED: ", ".join(sorted(changes)),
-            _BASELINE: baseline.name,
-            _VALID_FROM: str(valid_from_ns),
-            **version_parameters(stage.name, model.name),
-        }
-        record = Run(
-            timestamp=time_ns,
-            run="",
-            stage=stage.name,
-            parameters=parameters,
-            fingerprint=fingerprint(),
-            input_runs=(f"{log.name}:{run_of_topic(topic)}", markers),
-            inputs=(*foreign, *reference, *read_channels(session, topics)),
-            number=max((run.number for run in session.runs()), default=0) + 1,
-        )
-        name = free_name(session, record, f"{model.name}_mended", stage.writes)
-    mended = mend_poses(model, changes, time_ns)
-    message = Message(MODEL.topic_of(name), log_time_ns, time_ns, mended)
-    append_run(target, replace(record, run=name), log_time_ns, lambda: [message], {})
-    return name
+        sources = f"{log.name}:{run_of_topic(topic)}", str(newest_run(session, MARKERS))
+        record, log_time_ns = _record(session, parameters, sources, (*foreign, *reference))
+    mended = mend_poses(model, changes, record.timestamp)
+    message = Message(MODEL.topic_of(record.run), log_time_ns, record.timestamp, mended)
+    append_run(target, record, log_time_ns, lambda: [message], {})
+    return record.run
+
+
+def _record(
+    session: Session,
+    parameters: Mapping[str, str],
+    sources: tuple[str, str],
+    foreign: tuple[ChannelRead, ...],
+) -> tuple[Run, int]:
+    """Return the record of the new run, which reads the markers of the log, and its log time."""
+    stage, model = writer_of(MODEL), parameters["model"]
+    topics = session.topics(MARKERS, sources[1])
+    log_time_ns, time_ns = session.last(topics)
+    record = Run(
+        timestamp=time_ns,
+        run="",
+        stage=stage.name,
+        parameters={**parameters, **version_parameters(stage.name, model)},
+        fingerprint=fingerprint(),
+        input_runs=sources,
+        inputs=(*foreign, *read_channels(session, topics)),
+        number=max((run.number for run in session.runs()), default=0) + 1,
+    )
+    return replace(record, run=free_name(session, record, f"{model}_mended", stage.writes)), log_time_ns

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
@@ -103,7 +104,7 @@ def test_two_knocks_of_one_camera_are_two_moves() -> None:
 
 
 def test_still_cameras_have_no_move() -> None:
-    drift = find([log(week, still) for week in range(1, 13)])
+    drift = find([log(week, still) for week in range(1, 7)])
     assert (drift.moves, drift.marker_moves) == ([], [])
 
 
@@ -112,8 +113,18 @@ def test_marker_seen_to_move_by_two_cameras_is_no_camera_move() -> None:
     drift = find([log(1, still), log(2, still, shifted), log(3, still, shifted)])
     assert drift.moves == []
     assert [(move.marker_id, move.log) for move in drift.marker_moves] == [(94, "week2")]
+    assert all(state.motion and 94 in state.motion.markers for state in drift.of_camera("white"))
+    assert not any(state.motion.is_moved for state in drift.states if state.motion)
 
 
+def test_only_marker_of_two_cameras_that_moves_accuses_none() -> None:
+    one, moved = {90: PLACES[90]}, {90: (1.01, 1.62)}
+    drift = find([log(1, still, one), log(2, still, moved), log(3, still, moved)])
+    assert drift.moves == []
+    assert [(move.marker_id, move.log) for move in drift.marker_moves] == [(90, "week2")]
+
+
+@pytest.mark.slow
 def test_slow_sag_is_one_gradual_move() -> None:
     def sagging(camera: str, week: int, _number: int) -> Array:
         return 0.15 * week * KNOCK if camera == "red" else np.zeros(6)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +30,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import NS_PER_S
+from tests.conftest import Ipsys
 
 STEP_NS = NS_PER_S // 30
 # Greatest distance of an arc from its chord of one frame, v^2 t^2 / 8 r, for 0.26 m/s and a radius of 0.5 m.
@@ -149,8 +149,34 @@ def test_display_has_one_line_for_each_pair() -> None:
     assert summary.lines() == ["positions of cameras a and b differ by 3.2 mm (median), 3.2 mm (p95)"]
 
 
-def test_info_shows_the_disagreement(log: Path, ipsys: Any) -> None:
+def test_info_shows_the_disagreement(log: Path, ipsys: Ipsys) -> None:
     shown = ipsys("info", log)
     assert (shown.code, shown.err) == (0, "")
     row = next(line for line in shown.out.splitlines() if line.startswith("a and b"))
     assert row.split()[3:6] == ["89", "3.2", "3.2"]
+
+
+def test_impossible_positions_cause_no_traceback(tmp_path: Path, ipsys: Ipsys) -> None:
+    def write(name: str, position: Position) -> Path:
+        rows = [
+            Message(
+                one.topic,
+                one.log_time_ns,
+                one.publish_time_ns,
+                Positions(one.publish_time_ns, (position,)),
+                one.camera,
+            )
+            for one in messages(5)
+        ]
+        outputs = tuple(ChannelWritten(f"/runs/joint/cameras/{camera}/positions", 90) for camera in "ab")
+        record = Message(
+            "/runs/joint/record", rows[-1].log_time_ns, 0, Run(0, "joint", IMPORTED, {}, outputs=outputs)
+        )
+        write_log(tmp_path / name, [*rows, record])
+        return tmp_path / name
+
+    lost = ipsys("info", write("nan.mcap", Position(0, float("nan"), 1e300, 0.0)))
+    assert (lost.code, lost.err, "Disagreement" in lost.out) == (0, "", False)
+    odd = ipsys("info", write("odd.mcap", Position(0, 1.0, 1.0, 0.0, covariance_m2=np.eye(2))))
+    assert (odd.code, odd.err.count("\n")) == (1, 1)
+    assert "covariances that are not 3 x 3" in odd.err

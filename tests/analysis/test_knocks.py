@@ -68,14 +68,21 @@ def frames(
 
 
 def positions(
-    motion: Motion, rate_hz: float, bias_m: float = 0.0, inside: bool | None = None
+    motion: Motion,
+    rate_hz: float,
+    bias_m: float = 0.0,
+    inside: bool | None = None,
+    start_s: float = 0.0,
 ) -> Iterator[Message]:
-    """Yield the positions of a robot on a circle that all cameras see, as models with a bias locate it."""
+    """Yield the positions of a robot on a circle that all cameras see, as models with a bias locate it.
+
+    The robot stands still until ``start_s``.
+    """
     rng = np.random.default_rng(6)
     for number in range(round(LAST_S * rate_hz)):
         for offset, (name, camera) in enumerate(CAMERAS.items()):
             time_s = number / rate_hz + 0.011 * offset
-            turn = 0.26 / 0.5 * time_s
+            turn = 0.26 / 0.5 * max(time_s - start_s, 0.0)
             point_m = np.array([[2.4 + 0.5 * np.cos(turn), 2.4 + 0.5 * np.sin(turn), 0.0]])
             x_m, y_m = (point_m[:, :2] + shift_floor_map(camera, point_m, motion(name, time_s)))[0]
             x_m += bias_m * np.sin(4 * point_m[0, 0] + 3 * offset) + rng.normal(0, 0.0003)
@@ -129,6 +136,11 @@ def test_overlap_names_a_knocked_camera_without_references() -> None:
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0])
 def test_models_that_disagree_over_the_floor_cause_no_warning(rate_hz: float) -> None:
     assert warnings(positions(still, rate_hz, bias_m=0.006), Rig("lab", "DICT_4X4_100", LENGTH_M)) == []
+
+
+def test_robot_that_starts_to_drive_causes_no_warning() -> None:
+    rows = positions(still, 30.0, bias_m=0.020, start_s=AT_S)
+    assert warnings(rows, Rig("lab", "DICT_4X4_100", LENGTH_M)) == []
 
 
 def test_positions_outside_of_their_model_cause_no_warning() -> None:

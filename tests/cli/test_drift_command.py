@@ -128,7 +128,11 @@ def test_text_and_figure_name_the_camera(
     assert done.code == 0, done.err
     assert "Camera white moved between" in done.out
     assert (tmp_path / "drift.png").stat().st_size > 10_000
-    still = ipsys("drift", *weeks[:4], "--model-from", fitted)
+    folder = tmp_path / "other"
+    folder.mkdir()
+    copy = folder / weeks[0].name
+    copy.write_bytes(weeks[3].read_bytes())
+    still = ipsys("drift", *weeks[:2], copy, "--model-from", fitted)
     assert "No camera has moved" in still.out
 
 
@@ -148,8 +152,9 @@ def test_mended_model_is_as_good_as_before_the_knock(
     assert row["parameters"]["mended"] == "white"
     replayed = ipsys("replay", log, "--model", "joint")
     assert replayed.code == 0, replayed.err
-    again = drift(ipsys, *weeks[:5], log)
+    again = drift(ipsys, *weeks[:5], log, "--model-from", fitted)
     assert [move["camera"] for move in again["moves"]] == ["white"]
+    assert drift(ipsys, log)["model"]["topic"] == "/runs/joint_mended/model"
 
 
 def _errors_mm(log: Path) -> float:

@@ -64,8 +64,8 @@ def _go_live(folder: Path, lab: Path, calibrated: Path, seconds: float, with_str
     with serve(lab, loops, 3, folder, _LIMIT_S) as served:
         program = subprocess.Popen(
             [
-                *(sys.executable, "-m", "ipsys_log", "live", "--rig", served.rig),
-                *("--model-from", calibrated, "-o", log, "--seconds", str(seconds), *options),
+                *(sys.executable, "-m", "ipsys_log", "live", "--rig", str(served.rig)),
+                *("--model-from", str(calibrated), "-o", str(log), "--seconds", str(seconds), *options),
             ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -277,7 +277,7 @@ def test_only_this_machine_can_connect_to_foxglove_without_a_host() -> None:
 
 def test_stalled_client_loses_messages_and_others_do_not() -> None:
     """The stalled client reads nothing; its socket and its queue fill up."""
-    long = Message("/events", START_NS, START_NS, Event(START_NS, "camera_lost", "x" * (1 << 20)))
+    long = Message("/events", START_NS, START_NS, Event(START_NS, "camera_lost", "x" * (1 << 19)))
     with streaming() as (stream, events), opened(stream) as stalled, opened(stream) as good:
         stream.consume(iter([long]))  # announces its topic
         stalled.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

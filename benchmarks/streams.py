@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -29,10 +30,11 @@ from stream_server import free_ports, loops_of, serve
 from ipsys_log import pipeline
 from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import FRAME_SKIPPED, Latency, Tracks
+from ipsys_log.messages import FRAME_SKIPPED, Latency, Message, Track, Tracks
 from ipsys_log.messages.channels import EVENTS, TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
 
 __all__ = ["measure"]
 
@@ -40,11 +42,17 @@ _NS_PER_MS = 1e6
 _LIMIT_S = 120.0
 # Positions before the clients are connected, and those on their way at the end, are not counted.
 _EDGE_S = 2.0
+_FRESH_NS = 300_000_000
+# Messages with three robots each, for the processor time.
+_MESSAGES, _MS_PER_S = 1000, 1e3
 
 
 @dataclass(slots=True)
 class _Run:
-    """A run of ``ipsys live``: its ledger, its log, and the arrivals at each client by stream."""
+    """A run of ``ipsys live``: its ledger, the times of its positions, and the arrivals at each client.
+
+    A position outside the calibrated volume or without heading is not counted: some streams withhold it.
+    """
 
     ledger: list[Latency]
     skipped: int
@@ -64,8 +72,8 @@ def _go_live(folder: Path, lab: Path, calibrated: Path, seconds: float, with_str
     with serve(lab, loops, 3, folder, _LIMIT_S) as served:
         program = subprocess.Popen(
             [
-                *(sys.executable, "-m", "ipsys_log", "live", "--rig", served.rig),
-                *("--model-from", calibrated, "-o", log, "--seconds", str(seconds), *options),
+                *(sys.executable, "-m", "ipsys_log", "live", "--rig", str(served.rig)),
+                *("--model-from", str(calibrated), "-o", str(log), "--seconds", str(seconds), *options),
             ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -110,7 +118,11 @@ def _read(log: Path, arrivals: dict[str, list[list[tuple[int, int]]]]) -> _Run:
         events = session.payloads(session.topics(EVENTS))
         frames = sum(session.count(topic) for topic in session.images.values())
         tracks: list[Tracks] = session.payloads(session.topics(TRACKS))
-    poses = [row.timestamp for row in tracks for _ in row.tracks]
+    poses = [
+        row.timestamp
+        for row in tracks
+        if any(track.inside is not False and track.heading_rad is not None for track in row.tracks)
+    ]
     skipped = sum(event.kind == FRAME_SKIPPED for event in events)
     return _Run(recorded_latencies([log]), skipped, frames, poses, arrivals)
 
@@ -123,15 +135,17 @@ def _after_ms(run: _Run, client: list[tuple[int, int]]) -> NDArray[np.float64]:
     return np.array(late, dtype=np.float64) / _NS_PER_MS
 
 
-def _lost(run: _Run, client: list[tuple[int, int]], per_pose: bool) -> int:
-    """Return how many positions a client missed, without the edges of the run."""
-    if not client or not run.poses:
-        return len(run.poses)
+def _lost(run: _Run, client: list[tuple[int, int]]) -> int:
+    """Return how many positions a client missed, without the edges of the run and old positions.
+
+    VRPN and ROS 2 withhold positions that are older than 0.5 s: those of a machine that is too slow.
+    """
     edge_ns = round(_EDGE_S * 1e9)
-    first_ns, last_ns = client[0][0] + edge_ns, max(run.poses) - edge_ns
-    poses = run.poses if per_pose else sorted(set(run.poses))
-    expected = sum(first_ns <= t <= last_ns for t in poses)
-    return expected - sum(first_ns <= t <= last_ns for t, _ in client)
+    first_ns = client[0][0] + edge_ns if client else 0
+    last_ns = max(run.poses, default=0) - edge_ns
+    fresh = {e.timestamp // 1000 for e in run.ledger if e.published - e.timestamp < _FRESH_NS}
+    expected = {t // 1000 for t in run.poses if first_ns <= t <= last_ns} & fresh
+    return len(expected - {t // 1000 for t, _ in client})
 
 
 def _rows(pairs: list[tuple[_Run, _Run]], report: Report) -> None:
@@ -150,11 +164,8 @@ def _rows(pairs: list[tuple[_Run, _Run]], report: Report) -> None:
             for title, share, most in (("median", 50, 2), ("99 %", 99, 10)):
                 values = tuple(float(np.percentile(rows, share)) for rows in joined)
                 report.rows.append(Row(f"position to {stream}, {title}", values, "ms", ("<=", most)))
-        lost = [
-            sum(_lost(run, client, stream != "Foxglove") for client in run.arrivals[stream])
-            for _, run in pairs
-        ]
-        name = f"lost by {count} clients of {stream}"
+        lost = [sum(_lost(run, client) for client in run.arrivals[stream]) for _, run in pairs]
+        name = f"lost by {stream} clients ({count})"
         report.rows.append(Row(name, tuple(map(float, lost)), "positions", ("<=", 0)))
     for name, index in (("without", 0), ("with", 1)):
         runs = [pair[index] for pair in pairs]
@@ -187,7 +198,41 @@ def _table(pairs: list[tuple[_Run, _Run]]) -> str:
 def _cell(values: NDArray[np.float64]) -> str:
     if not len(values):
         return f"{'-':>16}"
-    return f"{f'{np.percentile(values, 50):.2f} / {np.percentile(values, 99):.2f}':>16}"
+    return f"{f'{np.percentile(values, 50):.1f} / {np.percentile(values, 99):.1f}':>16}"
+
+
+def _costs(rounds: int) -> list[Row]:
+    """Return the processor time of each stream for a message with three robots, without clients.
+
+    Unlike latencies, it does not depend on other programs.
+    """
+    *ports, udp = free_ports(4)
+    streams = {
+        "UDP": StreamSettings(udp=(f"127.0.0.1:{udp}",)),
+        "VRPN": StreamSettings(vrpn=ports[0]),
+        "ROS 2": StreamSettings(ros2=ports[1]),
+        "Foxglove": StreamSettings(foxglove=ports[2]),
+    }
+    return [
+        Row(f"processor time, {name}", tuple(_cost_ms(settings) for _ in range(rounds)), "ms/message")
+        for name, settings in streams.items()
+    ]
+
+
+def _cost_ms(settings: StreamSettings) -> float:
+    step_ns, topic = 33_000_000, "/runs/poly/tracks"
+
+    def message(number: int) -> Message:
+        rows = (Track(f"robot_{n}", n, 0.01 * number, n, 0.1, 0.3, np.eye(3) * 1e-4) for n in range(3))
+        time_ns = number * step_ns
+        return Message(topic, time_ns, time_ns, Tracks(time_ns, tuple(rows)))
+
+    messages = [message(number) for number in range(_MESSAGES)]
+    with open_streams(settings, {topic}, lambda: 0, lambda kind, text: None, 1) as (stream,):
+        stream.consume(iter(messages[:10]))
+        begin_s = time.process_time()
+        stream.consume(iter(messages[10:]))
+        return _MS_PER_S * (time.process_time() - begin_s) / (_MESSAGES - 10)
 
 
 def measure(options: argparse.Namespace) -> Report:
@@ -207,6 +252,7 @@ def measure(options: argparse.Namespace) -> Report:
         for _ in range(options.rounds):
             without = _go_live(folder, lab, calibrated, seconds, with_streams=False)
             pairs.append((without, _go_live(folder, lab, calibrated, seconds, with_streams=True)))
+    report.rows += _costs(options.rounds)
     _rows(pairs, report)
     report.tables.append(_table(pairs))
     report.details["latency_ms"] = {

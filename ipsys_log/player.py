@@ -86,7 +86,8 @@ class Player:
             raise
         self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
         self._viewers = [] if page is None else [_viewer(*logs[0], rigs[0], page, say)]
-        lines = [opened.describe() for opened in (*self._streams, *([] if page is None else [page]))]
+        lines = [stream.describe() for stream in self._streams]
+        lines += [] if page is None else [page.describe()]
         if settings and not robots:
             lines.append("the rig names no robots; the streams name them marker_<id>")
         self.lines = tuple(lines)

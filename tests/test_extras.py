@@ -107,6 +107,11 @@ REFUSED = {
     "live --view --model-from model.mcap -o x.mcap": "--view needs Rerun: pip install 'ipsys_log[view]'",
     "live --mavlink marker_0=127.0.0.1:14550 --model-from model.mcap -o x.mcap": "--mavlink needs pymavlink: "
     "pip install 'ipsys_log[mavlink]'",
+    "live --ros2 --model-from model.mcap -o x.mcap": "--ros2 needs Zenoh and rosbags and xxhash: pip install "
+    "'ipsys_log[ros2]'",
+    "live --foxglove --model-from model.mcap -o x.mcap": "--foxglove needs websockets: pip install "
+    "'ipsys_log[foxglove]'",
+    "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",
     "evaluate lab.mcap --plots x": "--plots needs Matplotlib: pip install 'ipsys_log[report]'",

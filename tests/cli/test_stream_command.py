@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import select
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import termios
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -56,6 +59,11 @@ def started(*arguments: object, stdin: int = subprocess.DEVNULL) -> subprocess.P
     return subprocess.Popen(command, stdin=stdin, stderr=subprocess.PIPE, text=True)
 
 
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return port_of(free)
+
+
 def stop(program: subprocess.Popen[str]) -> str:
     program.send_signal(signal.SIGINT)
     _, text = program.communicate(timeout=_LIMIT_S)
@@ -76,18 +84,47 @@ def test_stream_sends_a_log_and_ends(ipsys: Ipsys, log: Path, listening: socket.
 def test_no_socket_is_open_beyond_loopback_without_host(
     log: Path, listening: socket.socket, host: str | None
 ) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        vrpn = port_of(free)
     options = ["--udp", f"127.0.0.1:{port_of(listening)}", "--udp", "239.255.0.1:9870", "--loop"]
-    options += ["--vrpn-port", str(vrpn)]
+    ports = [free_port() for _ in range(3)]
+    for name, port in zip(("vrpn", "ros2", "foxglove"), ports, strict=True):
+        options += [f"--{name}-port", str(port)]
     program = started("stream", log, *options, *(["--host", host] if host else []))
     try:
         listening.recv(2048)
-        assert len(open_sockets(program.pid)) == 4
+        opened = open_sockets(program.pid)
+        assert {port for *_, port in opened} >= set(ports)
+        assert len(opened) == 6
         assert bool(exposed(program.pid)) is (host is not None)
     finally:
         text = stop(program)
     assert ("every computer of this network" in text) is (host is not None)
+
+
+@pytest.mark.slow
+def test_rerun_page_is_for_this_machine_only_and_ends(log: Path, listening: socket.socket) -> None:
+    pytest.importorskip("rerun")
+    program = started("stream", log, "--rerun", "--udp", port_of(listening), "--loop")
+    assert program.stderr is not None
+    try:
+        line = next(line for line in program.stderr if line.startswith("Rerun"))
+        listening.recv(2048)
+        page, data = map(int, re.findall("(?::|%3A)([0-9]+)", line))
+        with urllib.request.urlopen(f"http://127.0.0.1:{page}/", timeout=_LIMIT_S) as answer:
+            assert b"Rerun" in answer.read()
+        servers = [row for row in listening_sockets() if row[1] in (page, data)]
+        assert sorted(servers) == sorted([("127.0.0.1", page), ("127.0.0.1", data)])
+    finally:
+        stop(program)
+    assert not [row for row in listening_sockets() if row[1] in (page, data)]
+
+
+def listening_sockets() -> list[tuple[str, int]]:
+    """Return address and port of all listening sockets of TCP, from ``ss``."""
+    if shutil.which("ss") is None:
+        pytest.skip("ss is not installed")
+    text = subprocess.run(["ss", "-Hlnt"], capture_output=True, text=True, check=True).stdout
+    addresses = (line.split()[3].rpartition(":") for line in text.splitlines())
+    return [(address.strip("[]"), int(port)) for address, _, port in addresses]
 
 
 def test_keys_of_the_terminal_control_the_player(log: Path, listening: socket.socket) -> None:
@@ -170,6 +207,12 @@ REFUSED = {
     "--udp 9870 --topics /rig": "name one topic with tracks: /runs/poly/tracks",
     "--host 0.0.0.0": "--host: has no effect without a stream",
     "--robot ada": "--robot: has no effect without a stream",
+    "--ros2-domain 0": "--ros2-domain: has no effect without a stream",
+    "--udp 9870 --ros2-domain 0": "--ros2-domain: has no effect without ROS 2; add --ros2",
+    "--udp 9870 --images": "--images: has no effect without a viewer; add --foxglove or --rerun",
+    "--ros2 --ros2-domain 300": "--ros2-domain 300: give a domain ID from 0 to 232",
+    "--ros2 --robot eve": "robot 'eve' is not known; the rig has ada, bob",
+    "--foxglove --host 192.0.2.77": "--host 192.0.2.77: is not an address of this machine",
 }
 
 
@@ -200,6 +243,11 @@ def test_ground_truth_of_a_simulated_lab_can_be_played(
 Change = Callable[[Rig], Rig]
 WRONG_RIGS: dict[str, tuple[Change, str]] = {
     "port": (lambda rig: replace(rig, stream=RigStream(vrpn=0)), "[stream]: vrpn is 0; give a port"),
+    "ros2": (lambda rig: replace(rig, stream=RigStream(ros2=70000)), "[stream]: ros2 is 70000; give a port"),
+    "foxglove": (
+        lambda rig: replace(rig, stream=RigStream(foxglove=0)),
+        "[stream]: foxglove is 0; give a port",
+    ),
     "robot": (lambda rig: replace(rig, stream=RigStream(robots=("eve",))), "robot 'eve' is not known"),
     "time": (lambda rig: replace(rig, stream=RigStream(stale_s=-1.0)), "stale_s is -1; give a time"),
     "no robots": (
@@ -296,7 +344,7 @@ def test_live_refuses_a_stream_before_it_opens_a_camera(
 
 
 def test_rig_with_a_stream_reads_back(tmp_path: Path) -> None:
-    stream = RigStream("10.0.0.1", ("a:1", "b:2"), "udp.key", 3883, ("ada",), 0.3)
+    stream = RigStream("10.0.0.1", ("a:1", "b:2"), "udp.key", 3883, ("ada",), 0.3, (), 0.0, 7447, 3, 8765)
     rig = replace(LAB, stream=stream, markers=(RigMarker(0, robot="ada"),))
     path = tmp_path / "lab.toml"
     path.write_text(rig_toml(rig))

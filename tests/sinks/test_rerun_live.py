@@ -14,6 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
 from ipsys_log.sinks.rerun.live import LiveView
+from ipsys_log.sinks.streams.poses import NewSession
 
 Write = Callable[[bytes], object]
 
@@ -41,6 +42,24 @@ def test_frames_and_robots_arrive_in_rerun(replayed_log: Path, tmp_path: Path) -
     entities = {chunk.entity_path for chunk in RrdReader(whole).stream().to_chunks()}
     assert {f"/cameras/{camera}/image" for camera in session.images} <= entities
     assert any(entity.startswith("/world/runs/poly/robots/robot_") for entity in entities)
+
+
+def test_session_of_a_playback_is_a_recording_of_its_own(replayed_log: Path, tmp_path: Path) -> None:
+    """Times go back after a loop: in one recording, trails and cleared entities would be wrong."""
+    messages, session = replayed(replayed_log)
+    tracks = [message for message in messages if isinstance(message.payload, Tracks)]
+    (rig,) = session.payloads(["/rig"])
+    parts: list[bytes] = []
+    begin = [Message("", 0, 0, NewSession(number)) for number in (1, 2)]
+    view = LiveView(rig, (), "poly", print, lambda feed: feed(parts.append), "Rerun")
+    assert not isinstance(messages[0].payload, view.payloads)
+    view.consume(iter([begin[0], *tracks, begin[1], *tracks[:3]]))
+    path = tmp_path / "live.rrd"
+    path.write_bytes(b"".join(parts))
+    whole = tmp_path / "whole.rrd"
+    command = [sys.executable, "-m", "rerun", "rrd", "merge", str(path), "-o", str(whole)]
+    subprocess.run(command, check=True, capture_output=True)
+    assert len(list(RrdReader(whole).recordings())) == 2
 
 
 def test_missing_screen_is_reported_before_the_recording(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -223,7 +223,7 @@ def test_no_message_comes_in_or_passes_through() -> None:
 
                 assert heard == []
                 wait_for(reached)
-        inner.undeclare()
+        inner.undeclare()  # type: ignore[no-untyped-call]
         assert received == []
 
 

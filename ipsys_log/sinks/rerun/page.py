@@ -9,6 +9,8 @@ import tempfile
 import threading
 from collections.abc import Callable
 
+import rerun as rr
+
 from ipsys_log.errors import IpsysError
 from ipsys_log.sinks.rerun.recording import last_line, stop_viewer, viewer_command
 
@@ -45,6 +47,8 @@ class ViewerPage:
             env={"RUST_LOG": "error", **os.environ},
         )
         try:
+            # The viewer opens its ports only after the first bytes.
+            self.show(lambda write: write(_header()))
             self._wait()
         except BaseException:
             self.close()
@@ -90,6 +94,15 @@ class ViewerPage:
                     return
             threading.Event().wait(_TURN_S)
         raise IpsysError("--rerun: the viewer does not start; try again when the machine is less busy")
+
+
+def _header() -> bytes:
+    """Return the first bytes of a recording."""
+    recording = rr.RecordingStream("ipsys", send_properties=False)
+    try:
+        return rr.binary_stream(recording).read() or b""
+    finally:
+        recording.disconnect()
 
 
 def _free_ports() -> tuple[int, int]:

@@ -240,7 +240,7 @@ def _waypoint(
     )
 
 
-def _within(times_ns: NDArray[np.generic], start_ns: int, end_ns: int) -> NDArray[np.bool_]:
+def _within(times_ns: NDArray[np.int64] | Array, start_ns: int, end_ns: int) -> NDArray[np.bool_]:
     within: NDArray[np.bool_] = (times_ns >= start_ns) & (times_ns <= end_ns)
     return within
 

@@ -66,9 +66,8 @@ def measure(options: argparse.Namespace) -> Report:
             results = []
             for seed in range(1 if options.smoke else options.seeds):
                 run = _run(calibrated, seed, case, options)
-                robots.append(
-                    _driven(run, folder / "run.mcap", Request(models=models, model_from=calibrated))
-                )
+                request = Request(models=models, model_from=calibrated)
+                results.append(_driven(run, folder / "run.mcap", request))
             _add(report, case, results)
     return report
 

@@ -63,7 +63,7 @@ def measure(options: argparse.Namespace) -> Report:
         shutil.copy(drawn(_SMALL if options.smoke else _LAB), calibrated)
         replay([calibrated], Request(models=models))
         for case in cases[:1] if options.smoke else cases:
-            results = []
+            results: list[RobotRunResult] = []
             for seed in range(1 if options.smoke else options.seeds):
                 run = _run(calibrated, seed, case, options)
                 request = Request(models=models, model_from=calibrated)

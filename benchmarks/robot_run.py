@@ -25,11 +25,12 @@ from results import Report, command
 from rounds import Row
 from scenes import drawn
 
-from ipsys_log.analysis.robot_run import RobotResult, read_robot_run
+from ipsys_log.analysis.robot_run import RobotRunResult, read_robot_run
 from ipsys_log.closed_loop.run import drive_robots
 from ipsys_log.closed_loop.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab
 from ipsys_log.log.dataset import Session
 from ipsys_log.pipeline import replay
+from ipsys_log.report.robot_run import robot_run_json
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
 
@@ -62,13 +63,12 @@ def measure(options: argparse.Namespace) -> Report:
         shutil.copy(drawn(_SMALL if options.smoke else _LAB), calibrated)
         replay([calibrated], Request(models=models))
         for case in cases[:1] if options.smoke else cases:
-            robots = []
+            results: list[RobotRunResult] = []
             for seed in range(1 if options.smoke else options.seeds):
                 run = _run(calibrated, seed, case, options)
-                robots.append(
-                    _driven(run, folder / "run.mcap", Request(models=models, model_from=calibrated))
-                )
-            _add(report, case, robots)
+                request = Request(models=models, model_from=calibrated)
+                results.append(_driven(run, folder / "run.mcap", request))
+            _add(report, case, results)
     return report
 
 
@@ -79,45 +79,32 @@ def _run(calibrated: Path, seed: int, case: str, options: argparse.Namespace) ->
     return RobotRun(lab, paths, program, lockstep=True, port=0, seed=seed, **_FAULTS[case])
 
 
-def _driven(run: RobotRun, log: Path, request: Request) -> RobotResult:
+def _driven(run: RobotRun, log: Path, request: Request) -> RobotRunResult:
     drive_robots(run, log, request, overwrite=True)
     with Session([log]) as session:
-        return read_robot_run(session).robots[0]
+        return read_robot_run(session)
 
 
-def _add(report: Report, case: str, robots: Sequence[RobotResult]) -> None:
-    report.details[case] = [_details(robot) for robot in robots]
+def _add(report: Report, case: str, results: Sequence[RobotRunResult]) -> None:
+    report.details[case] = [robot_run_json(result) for result in results]
+    robots = [robot for result in results for robot in result.robots]
     unfinished = sum(not robot.is_finished for robot in robots)
     if unfinished:
         report.remarks.append(f"{case}: {unfinished} of {len(robots)} robots did not finish")
         report.failed = True
     by_number: dict[int, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for robot in robots:
-        for point in robot.reached:
-            row = by_number[point.number]
-            row["control"].append(_CM * point.control_m)
-            if point.true_m is not None:
-                row["true"].append(_CM * point.true_m.median_m)
-            for model, errors in point.positioning_m.items():
-                row[model].append(_CM * errors.median_m)
+    for point in [point for robot in robots for point in robot.reached]:
+        row = by_number[point.number]
+        row["control"].append(_CM * point.control_m)
+        for name, errors in {"true": point.true_m, **point.positioning_m}.items():
+            if errors is not None and errors.median_m is not None:
+                row[name].append(_CM * errors.median_m)
     report.tables.append(_table(case, by_number))
     controls = [value for row in by_number.values() for value in row["control"]]
     report.rows.append(Row(f"{case}: largest control error", (max(controls, default=0.0),), "cm", ("<=", 2)))
     moved = [_CM * stop.moved_m for robot in robots for stop in robot.stops if stop.moved_m is not None]
     if moved:
         report.rows.append(Row(f"{case}: moved while stopped", (max(moved),), "cm", ("<=", 0.5)))
-
-
-def _details(robot: RobotResult) -> dict[str, Any]:
-    return {
-        "finished": robot.is_finished,
-        "control_cm": [_CM * point.control_m for point in robot.reached],
-        "true_cm": [None if point.true_m is None else _CM * point.true_m.median_m for point in robot.reached],
-        "stops": [
-            {"age_s": stop.age_s, "braking_m": stop.braking_m, "moved_m": stop.moved_m}
-            for stop in robot.stops
-        ],
-    }
 
 
 def _table(case: str, by_number: Mapping[int, Mapping[str, Sequence[float]]]) -> str:

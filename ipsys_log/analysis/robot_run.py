@@ -206,20 +206,12 @@ def _waypoint(
     errors: Mapping[str, Array],
 ) -> WaypointResult | None:
     """Return the last stay at a waypoint; None if the robot did not reach it."""
-    stays = [
-        list(group)
-        for stays, group in groupby(
-            commands, lambda c: c.waypoint == number and c.state in (HOLDING, FINISHED)
-        )
-        if stays
-    ]
-    if not stays:
-        return None
+    stay = _last_stay(number, commands)
     target_m = np.array([place.x_m, place.y_m])
-    points_m = [(c.x_m, c.y_m) for c in stays[-1] if c.x_m is not None and c.y_m is not None]
+    points_m = [(c.x_m, c.y_m) for c in stay if c.x_m is not None and c.y_m is not None]
     if not points_m:
         return None
-    start_ns, end_ns = stays[-1][0].timestamp, stays[-1][-1].timestamp
+    start_ns, end_ns = stay[0].timestamp, stay[-1].timestamp
     true_m = None
     if true is not None and (within := _within(true.times_ns, start_ns, end_ns)).any():
         true_m = error_statistics(
@@ -240,7 +232,16 @@ def _waypoint(
     )
 
 
-def _within(times_ns: NDArray[np.generic], start_ns: int, end_ns: int) -> NDArray[np.bool_]:
+def _last_stay(number: int, commands: Sequence[WheelCommand]) -> list[WheelCommand]:
+    """Return the commands of a robot's last stay at a waypoint; empty if it did not reach it."""
+    stay: list[WheelCommand] = []
+    for stands, group in groupby(commands, lambda c: c.waypoint == number and c.state in (HOLDING, FINISHED)):
+        if stands:
+            stay = list(group)
+    return stay
+
+
+def _within(times_ns: NDArray[np.int64] | Array, start_ns: int, end_ns: int) -> NDArray[np.bool_]:
     within: NDArray[np.bool_] = (times_ns >= start_ns) & (times_ns <= end_ns)
     return within
 

@@ -124,7 +124,12 @@ class _Parts:
                 )
                 streams += stack.enter_context(opened)
             programs: list[Programs] = []
-            wheels = Wheels(ports[0], run.paths, lambda: [one.check() for one in programs], self.say)
+
+            def check() -> None:
+                for started in programs:
+                    started.check()
+
+            wheels = Wheels(ports[0], run.paths, check, self.say)
             stack.enter_context(closing(wheels))
             programs.append(stack.enter_context(start_programs(run, wheels.address, ports[1:])))
             wheels.wait_for_robots()

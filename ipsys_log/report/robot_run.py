@@ -157,12 +157,7 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
     )
     robots = [
         {
-            "name": robot.name,
-            "models": list(robot.positioning_m),
-            "rows": _rows(robot, result.start_ns, robot.positioning_m),
-            "drive": [(run, _three(errors)) for run, errors in robot.positioning_m.items()],
-            "stops": [stop_line(robot.name, stop, result.start_ns) for stop in robot.stops],
-            "reached": f"{len(robot.reached)} of {len(robot.path)}",
+            **_robot_values(robot, result.start_ns),
             "panels": f"data:image/png;base64,{base64.b64encode(image).decode()}",
             "map": svg_data_uri(draw_drive(session, robot)),
         }
@@ -175,3 +170,15 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
         robots=robots,
     )
     return text, panels[0]
+
+
+def _robot_values(robot: RobotResult, start_ns: int) -> dict[str, Any]:
+    """Return the texts of a robot on the page."""
+    return {
+        "name": robot.name,
+        "models": list(robot.positioning_m),
+        "rows": _rows(robot, start_ns, robot.positioning_m),
+        "drive": [(run, _three(errors)) for run, errors in robot.positioning_m.items()],
+        "stops": [stop_line(robot.name, stop, start_ns) for stop in robot.stops],
+        "reached": f"{len(robot.reached)} of {len(robot.path)}",
+    }

@@ -63,11 +63,11 @@ def draw_panels(session: Session, result: RobotRunResult, robot: RobotResult) ->
         axes.imshow(picture)
         for (camera, topic), top_px in zip(cameras, tops_px, strict=True):
             _outline(axes, session, robot, camera, _frame_at(session, topic, panel.time_ns), top_px)
-            axes.text(_WIDTH_PX - 8, top_px + 12, shorten(camera), **_TEXT, ha="right", fontsize=9)  # type: ignore[arg-type]
+            axes.text(_WIDTH_PX - 8, top_px + 12, shorten(camera), **_TEXT, ha="right", fontsize=9)
         axes.set_axis_off()
         at_s = (panel.time_ns - result.start_ns) / NS_PER_S
         axes.set_title(f"({letter}) {panel.title}, {at_s:.1f} s", fontsize=12, loc="left")
-        axes.text(8, 12, _position_text(robot, panel.time_ns), **_TEXT, fontsize=11)  # type: ignore[arg-type]
+        axes.text(8, 12, _position_text(robot, panel.time_ns), **_TEXT, fontsize=11)
     return figure
 
 

@@ -68,7 +68,9 @@ def expose(view: FloorView, placed: Sequence[Print], settings: LabSettings) -> P
     return _compose(view, placed, settings)[0]
 
 
-def add_static_prints(view: FloorView, placed: Sequence[PlacedMarker], settings: LabSettings) -> FloorView:
+def add_static_prints(
+    view: FloorView, placed: Sequence[PlacedMarker | PlacedBoard], settings: LabSettings
+) -> FloorView:
     """Return a view whose floor contains stationary prints, so the renderer does not draw them again."""
     grey, bare = _compose(view, placed, settings)
     return replace(view, floor=to_light(grey, settings), bare=bare)

@@ -23,10 +23,11 @@ from ipsys_log.messages import (
     Tracks,
     Vector3,
 )
-from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
+from ipsys_log.messages.channels import POSES, POSITIONS, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.position_sightings import read_sightings
+from ipsys_log.tracking.track_inputs import TRACK_READS, make_modes, model_of, track_reads, tracked_part
 from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
@@ -68,11 +69,7 @@ class Fuse:
 
     def _use_rig(self, rig: Rig) -> None:
         self._rig = rig
-        if self._model is not None:
-            # Late: the modes of a joint model need scipy.
-            from ipsys_log.tracking.calibration_modes import calibration_modes
-
-            self._modes = calibration_modes(self._model, rig)
+        self._modes = make_modes(self._model, rig)
 
     def _note_late(self, event: Event) -> None:
         if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
@@ -122,28 +119,21 @@ def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
 
 
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
-    models = view.payloads(MODEL) if view.run(MODEL) else []
-    has_late_frames = any(event.kind == STAMP_UNRELIABLE for event in view.payloads(EVENTS))
+    model = model_of(view)
     return Plan(
         run=view.run(POSITIONS),
         parameters={},
-        # A log without such events keeps its existing runs.
-        reads=(RIG, POSITIONS, *([MODEL] if models else []), *([EVENTS] if has_late_frames else [])),
-        step=lambda run: Fuse(run, models[-1] if models else None),
+        reads=track_reads(view),
+        step=lambda run: Fuse(run, model),
     )
 
 
 STAGE = Stage(
     name="fuse",
     versions={"fuse": 2},
-    reads=(RIG, POSITIONS, MODEL, EVENTS),
+    reads=TRACK_READS,
     writes=(TRACKS, POSES),
     plan=_plan,
-    rig_part=lambda rig, method: (
-        {(m.id, m.robot, m.height_m, m.height_sigma_m) for m in rig.markers},
-        rig.marker_height_m,
-        rig.marker_height_sigma_m,
-        rig.marker_length_m,
-    ),
+    rig_part=tracked_part,
     per_camera=False,
 )

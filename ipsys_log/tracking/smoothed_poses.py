@@ -86,11 +86,11 @@ def _smooth_track(
     for row, record in enumerate(records):
         # Sightings of one instant have equal states: the last one has the pose.
         if row + 1 == len(records) or times_ns[row + 1] > times_ns[row]:
-            source, recent = (
-                sources[id(record.sightings)],
-                history.recent(record.time_ns, settings.window_ns),
-            )
+            recent = history.recent(record.time_ns, settings.window_ns)
             flags = [one.inside for one in recent if one.inside is not None]
+            # The pose has the errors of all recent sightings, and none of them has all of its weight.
+            rests_m2 = [sources[id(one.sightings)].rest_m2[one.sighting] for one in recent]
+            source = sources[id(record.sightings)]
             pose = Pose(
                 robot,
                 record.time_ns,
@@ -98,7 +98,7 @@ def _smooth_track(
                 row,
                 tuple(sorted({one.camera for one in recent})),
                 any(flags) if flags else None,
-                source.rest_m2[record.sighting],
+                np.mean(rests_m2, axis=0),
                 source.has_covariance[record.sighting],
                 age_ns=record.time_ns - times_ns[0],
             )

@@ -184,8 +184,7 @@ def _elements(names: Sequence[str], places: Sequence[int], size: int) -> _Expand
         rows = column.values if complete else np.zeros((len(column.values), size))
         missing = column.missing | (not complete)
         return {
-            name: np.where(missing, np.nan, rows[:, place])
-            for name, place in zip(names, places, strict=True)
+            name: np.where(missing, np.nan, rows[:, place]) for name, place in zip(names, places, strict=True)
         }
 
     return expand

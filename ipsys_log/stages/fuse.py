@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from math import cos, pi, sin, sqrt
 from typing import Any
-
-import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
@@ -112,23 +111,23 @@ def _track(pose: Pose) -> Track:
     mean, covariance = pose.states.means[pose.state], pose.states.covariances[pose.state]
     robot, marker_id = pose.robot
     x_m, y_m, z_m, heading_rad, _, _, _, turn_rate, _, _ = mean.tolist()
-    sigmas = np.sqrt(covariance.diagonal()).tolist()
-    has_heading = sigmas[3] < _UNKNOWN_HEADING_RAD
+    heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance[3, 3]), sqrt(covariance[7, 7])
+    has_heading = heading_sigma_rad < _UNKNOWN_HEADING_RAD
     return Track(
         robot,
         marker_id,
         x_m,
         y_m,
         z_m,
-        (heading_rad + np.pi) % (2 * np.pi) - np.pi if has_heading else None,
+        (heading_rad + pi) % (2 * pi) - pi if has_heading else None,
         covariance[:3, :3] + pose.rest_m2 if pose.has_covariance else None,
         pose.cameras,
         pose.inside,
         mean[4:7],
         covariance[4:7, 4:7] if pose.has_covariance else None,
-        sigmas[3] if has_heading and pose.has_covariance else None,
+        heading_sigma_rad if has_heading and pose.has_covariance else None,
         turn_rate if has_heading else None,
-        sigmas[7] if has_heading and pose.has_covariance else None,
+        turn_sigma_rad_s if has_heading and pose.has_covariance else None,
         pose.coasting_ns,
     )
 
@@ -145,7 +144,7 @@ def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
         "world",
         f"{run}/{track.robot}",
         Vector3(track.x_m, track.y_m, track.z_m),
-        Quaternion(0.0, 0.0, float(np.sin(half_rad)), float(np.cos(half_rad))),
+        Quaternion(0.0, 0.0, sin(half_rad), cos(half_rad)),
     )
 
 

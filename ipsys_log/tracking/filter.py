@@ -43,6 +43,12 @@ class States:
         """Return the states of some robots."""
         return States(self.means[rows], self.covariances[rows], self.cross[rows])
 
+    def replace(self, rows: NDArray[np.intp], states: States) -> States:
+        """Return the states with those of some robots replaced."""
+        means, covariances, cross = self.means.copy(), self.covariances.copy(), self.cross.copy()
+        means[rows], covariances[rows], cross[rows] = states.means, states.covariances, states.cross
+        return States(means, covariances, cross)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
@@ -77,14 +83,18 @@ class Innovations:
     covariances : (k, 4, 4), of the differences.
     modes : (k, 4, m), sensitivities of the sightings with the errors of their times.
     across : (k, 10, 4), minus the covariance of the errors of the states and the differences.
-    chi2 : (k,), squared differences in units of their covariances.
     """
 
     differences: Array
     covariances: Array
     modes: Array
     across: Array
-    chi2: Array
+
+    def chi2(self, more: Array | None = None) -> Array:
+        """Return the squared differences (k,) in units of their covariances, to which ``more`` is added."""
+        covariances = self.covariances if more is None else self.covariances + more
+        solved = np.linalg.solve(covariances, self.differences[:, :, None])
+        return np.asarray((self.differences[:, None] @ solved)[:, 0, 0])
 
 
 def start(sightings: Sightings, noise: MotionNoise) -> States:
@@ -126,9 +136,7 @@ def compare(states: States, sightings: Sightings) -> Innovations:
     # Errors are estimate minus truth. The difference is modes b + noise - error, so a common error cancels.
     across = states.covariances[:, :, POSE] - states.cross @ turned
     covariances = across[:, POSE] + modes @ (turned - states.cross[:, POSE].swapaxes(1, 2)) + sightings.noise
-    solved = np.linalg.solve(covariances, differences[:, :, None])
-    chi2 = (differences[:, None] @ solved)[:, 0, 0]
-    return Innovations(differences, covariances, modes, across, chi2)
+    return Innovations(differences, covariances, modes, across)
 
 
 def update(states: States, sightings: Sightings, innovations: Innovations) -> States:

@@ -205,19 +205,7 @@ class RobotTracks:
         self, batch: _Batch, rows: NDArray[np.intp], tracks: list[_Track], places: list[int]
     ) -> NDArray[np.bool_]:
         """Filter the sightings of some rows, and the later ones again; return a mask of the accepted rows."""
-        sightings = batch.sightings.take(rows)
-        states, accepted = start(sightings, self._settings.motion), np.ones(len(rows), dtype=bool)
-        known = np.flatnonzero(places)
-        if len(known):
-            before = [tracks[n].history.records[places[n] - 1] for n in known.tolist()]
-            times_ns = [batch.times_ns[row] for row in rows[known].tolist()]
-            predicted = self._predicted(before, times_ns)
-            seen = sightings.take(known)
-            innovations = compare(predicted, seen)
-            accepted[known] = self._agrees(innovations, batch.rest_m2[rows[known]])
-            after = update(predicted, seen, innovations)
-            states.means[known], states.covariances[known] = after.means, after.covariances
-            states.cross[known] = after.cross
+        states, accepted = self._states_after(batch, rows, tracks, places)
         later = []
         for number, (row, track, place) in enumerate(zip(rows.tolist(), tracks, places, strict=True)):
             record = Record(
@@ -232,6 +220,26 @@ class RobotTracks:
                 track.rest_m2, track.has_covariance = batch.rest_m2[row], batch.has_covariance[row]
         self._filter_again(later)
         return accepted
+
+    def _states_after(
+        self, batch: _Batch, rows: NDArray[np.intp], tracks: list[_Track], places: list[int]
+    ) -> tuple[States, NDArray[np.bool_]]:
+        """Return the states after sightings, and a mask of those within the gate; new tracks have no gate."""
+        known = np.flatnonzero(places)
+        states, accepted = None, np.ones(len(rows), dtype=bool)
+        if len(known) < len(rows):
+            states = start(batch.sightings.take(rows), self._settings.motion)
+        if len(known):
+            before = [tracks[n].history.records[places[n] - 1] for n in known.tolist()]
+            rows = rows[known]
+            predicted = self._predicted(before, [batch.times_ns[row] for row in rows.tolist()])
+            sightings = batch.sightings.take(rows)
+            innovations = compare(predicted, sightings)
+            accepted[known] = self._agrees(innovations, batch.rest_m2[rows])
+            after = update(predicted, sightings, innovations)
+            states = after if states is None else states.replace(known, after)
+        assert states is not None
+        return states, accepted
 
     def _filter_again(self, changed: list[tuple[_Track, int, list[Record]]]) -> None:
         """Filter the records after the first of each list again, and put the lists into the histories."""
@@ -254,12 +262,10 @@ class RobotTracks:
 
     def _agrees(self, innovations: Innovations, rest_m2: Array) -> NDArray[np.bool_]:
         """Return a mask (k,) of the sightings within the gate."""
-        settings, wide = self._settings, innovations.covariances.copy()
-        wide[:, :3, :3] += rest_m2 + settings.slack_m**2 * np.eye(3)
-        wide[:, 3, 3] += settings.slack_rad**2
-        solved = np.linalg.solve(wide, innovations.differences[:, :, None])
-        chi2 = (innovations.differences[:, None] @ solved)[:, 0, 0]
-        return np.asarray(chi2 < settings.gate)
+        settings, more = self._settings, np.zeros_like(innovations.covariances)
+        more[:, :3, :3] = rest_m2 + settings.slack_m**2 * np.eye(3)
+        more[:, 3, 3] = settings.slack_rad**2
+        return np.asarray(innovations.chi2(more) < settings.gate)
 
     def _contradict(self, track: _Track, record: Record, rest_m2: Array) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""

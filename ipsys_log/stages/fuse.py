@@ -23,7 +23,7 @@ from ipsys_log.messages import (
     Vector3,
 )
 from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
-from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
+from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.position_sightings import read_sightings
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
@@ -48,7 +48,7 @@ class Fuse:
         self._run, self._model = run, model
         self._rig: Rig | None = None
         self._modes = BiasModes.none()
-        self._tracks = RobotTracks(settings)
+        self._settings, self._tracks = settings, RobotTracks(settings)
         # By camera, the start and end time of its last late frames; None if there is no end yet.
         self._late_ns: dict[str, tuple[int, int | None]] = {}
 
@@ -70,7 +70,9 @@ class Fuse:
             # Late: the modes of a joint model need scipy.
             from ipsys_log.tracking.calibration_modes import calibration_modes
 
-            self._modes = calibration_modes(self._model, rig)
+            before, self._modes = self._modes, calibration_modes(self._model, rig)
+            if before.count != self._modes.count:
+                self._tracks = RobotTracks(self._settings, self._modes.fade_m)
 
     def _note_late(self, event: Event) -> None:
         if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
@@ -85,13 +87,11 @@ class Fuse:
         camera, positions = str(message.camera), message.payload.positions
         poses: list[Pose] = []
         if positions:
-            sightings, rest_m2 = read_sightings(camera, positions, self._modes)
             poses = self._tracks.observe(
                 camera,
                 [(rig.robot_of(position.id), position.id) for position in positions],
                 [message.publish_time_ns + (position.time_offset_ns or 0) for position in positions],
-                sightings,
-                rest_m2,
+                read_sightings(camera, positions, self._modes),
                 [position.inside for position in positions],
                 [position.covariance_m2 is not None for position in positions],
             )
@@ -120,7 +120,7 @@ def _track(pose: Pose) -> Track:
         y_m,
         z_m,
         (heading_rad + pi) % (2 * pi) - pi if has_heading else None,
-        covariance[:3, :3] + pose.rest_m2 if pose.has_covariance else None,
+        covariance[:3, :3] if pose.has_covariance else None,
         pose.cameras,
         pose.inside,
         mean[4:7],

@@ -103,7 +103,7 @@ def _of_acceleration(durations_s: Array, hold_s: float) -> tuple[Array, Array, A
 
 
 def _acceleration_noise(durations_s: Array, hold_s: float) -> Array:
-    """Return the covariance (k, 3, 3) of position, velocity and acceleration by an acceleration of 1 m/s^2."""
+    """Return the covariances (k, 3, 3) of position, velocity and an acceleration of 1 m/s^2."""
     effects = np.stack(_of_acceleration(durations_s[:, None] * _NODES, hold_s), axis=1)
     weights = (2 / hold_s * durations_s)[:, None] * _WEIGHTS
     covariance: Array = (effects * weights[:, None]) @ effects.swapaxes(1, 2)

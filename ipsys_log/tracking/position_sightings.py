@@ -23,32 +23,25 @@ _USUAL_M, _USUAL_RAD = 3e-4, 3e-3
 _UNKNOWN_M = 0.005
 
 
-def read_sightings(camera: str, positions: Sequence[Position], modes: BiasModes) -> tuple[Sightings, Array]:
-    """Return the sightings of positions of one camera, and the rest of their covariances.
+def read_sightings(camera: str, positions: Sequence[Position], modes: BiasModes) -> Sightings:
+    """Return the sightings of positions of one camera.
 
     Parameters
     ----------
     camera : its name.
     positions : (k,), at least one.
     modes : the errors of the calibration.
-
-    Returns
-    -------
-    sightings : (k,).
-    rest_m2 : (k, 3, 3), the errors that are neither noise nor modes. They are slow: the covariance of a track
-        has them in full.
     """
     count = len(positions)
     headings = np.array([0.0 if p.heading_rad is None else p.heading_rad for p in positions])
     poses = np.column_stack([[(p.x_m, p.y_m, p.z_m) for p in positions], headings])
-    sensitivities, rest_m2 = modes.at(camera, poses, headings)
     noise = np.zeros((count, 4, 4))
     noise[:, :3, :3] = _LEAST_M**2 * np.eye(3)
     for row, position in enumerate(positions):
         noise[row, :3, :3] += _position_noise(position, camera in modes.tables)
         noise[row, 3, 3] = _heading_variance(position)
     clock_s = np.broadcast_to(modes.clock_of(camera), (count, modes.count))
-    return Sightings(poses, noise, sensitivities, clock_s), rest_m2
+    return Sightings(poses, noise, modes.at(camera, poses, headings), clock_s)
 
 
 def _position_noise(position: Position, has_modes: bool) -> Array:

@@ -51,8 +51,7 @@ class TrackSettings:
 class Pose:
     """The pose of one robot at one instant: a row of ``states``.
 
-    The covariance of its position is that of the state plus ``rest_m2`` (3, 3). It means nothing without
-    ``has_covariance``: a position of the track has none.
+    Its covariance means nothing without ``has_covariance``: the position has none.
 
     ``cameras`` are those of the recent sightings, ``newest`` the last sighting; ``coasting_ns`` is the time
     since then if the robot is unseen, otherwise None.
@@ -64,7 +63,6 @@ class Pose:
     state: int
     cameras: tuple[str, ...]
     inside: bool | None
-    rest_m2: Array
     has_covariance: bool
     coasting_ns: int | None = None
 
@@ -74,7 +72,6 @@ class _Track:
     """A track, and the sightings that contradict it: a rival track of the same robot."""
 
     history: History
-    rest_m2: Array
     has_covariance: bool = True
     rival: History | None = None
     hits: int = 0
@@ -86,7 +83,6 @@ class _Batch:
 
     camera: str
     sightings: Sightings
-    rest_m2: Array
     times_ns: Sequence[int]
     inside: Sequence[bool | None]
     has_covariance: Sequence[bool]
@@ -101,10 +97,15 @@ class RobotTracks:
 
     A sighting outside the gate changes nothing. If several of them agree with one another, and none agrees
     with the track, the track starts again with them.
+
+    Parameters
+    ----------
+    settings : the limits of tracks.
+    fade_m : (m,), of the amplitudes of the calibration, see :class:`~ipsys_log.tracking.filter.States`.
     """
 
-    def __init__(self, settings: TrackSettings | None = None) -> None:
-        self._settings = settings or TrackSettings()
+    def __init__(self, settings: TrackSettings | None = None, fade_m: Array | None = None) -> None:
+        self._settings, self._fade_m = settings or TrackSettings(), fade_m
         self._tracks: dict[Hashable, _Track] = {}
 
     def observe(
@@ -113,7 +114,6 @@ class RobotTracks:
         robots: Sequence[Hashable],
         times_ns: Sequence[int],
         sightings: Sightings,
-        rest_m2: Array,
         inside: Sequence[bool | None],
         has_covariance: Sequence[bool],
     ) -> list[Pose]:
@@ -125,7 +125,6 @@ class RobotTracks:
         robots : (k,), one sighting of each robot.
         times_ns : (k,), capture times.
         sightings : (k,).
-        rest_m2 : (k, 3, 3), covariances of errors that are neither noise nor modes of the calibration.
         inside : (k,), flags of the positions.
         has_covariance : (k,), False for a position whose covariance is unknown.
 
@@ -133,7 +132,7 @@ class RobotTracks:
         -------
         The poses at the instants of the sightings. An instant of a robot that already has a pose gets none.
         """
-        batch = _Batch(camera, sightings, rest_m2, times_ns, inside, has_covariance)
+        batch = _Batch(camera, sightings, times_ns, inside, has_covariance)
         # A frame can show the same marker twice: one sighting of each robot after the other.
         poses, waiting = [], list(range(len(robots)))
         while waiting:
@@ -166,7 +165,6 @@ class RobotTracks:
                 row,
                 (),
                 track.history.newest.inside,
-                track.rest_m2,
                 track.has_covariance,
                 age_ns,
             )
@@ -198,7 +196,7 @@ class RobotTracks:
             batch.times_ns[row] - track.history.newest.time_ns > self._settings.coast_ns
         )
         if track is None or ended:
-            track = self._tracks[robot] = _Track(History(), batch.rest_m2[row])
+            track = self._tracks[robot] = _Track(History())
         return track
 
     def _filter(
@@ -212,12 +210,12 @@ class RobotTracks:
                 batch.times_ns[row], batch.camera, batch.inside[row], batch.sightings, row, states, number
             )
             if not accepted[number]:
-                accepted[number] = self._contradict(track, record, batch.rest_m2[row])
+                accepted[number] = self._contradict(track, record)
                 continue
             track.rival, track.hits = None, 0
             later.append((track, place, [record, *track.history.records[place:]]))
             if place == len(track.history.records):
-                track.rest_m2, track.has_covariance = batch.rest_m2[row], batch.has_covariance[row]
+                track.has_covariance = batch.has_covariance[row]
         self._filter_again(later)
         return accepted
 
@@ -228,14 +226,14 @@ class RobotTracks:
         known = np.flatnonzero(places)
         states, accepted = None, np.ones(len(rows), dtype=bool)
         if len(known) < len(rows):
-            states = start(batch.sightings.take(rows), self._settings.motion)
+            states = start(batch.sightings.take(rows), self._settings.motion, self._fade_m)
         if len(known):
             before = [tracks[n].history.records[places[n] - 1] for n in known.tolist()]
             rows = rows[known]
             predicted = self._predicted(before, [batch.times_ns[row] for row in rows.tolist()])
             sightings = batch.sightings.take(rows)
             innovations = compare(predicted, sightings)
-            accepted[known] = self._agrees(innovations, batch.rest_m2[rows])
+            accepted[known] = self._agrees(innovations)
             after = update(predicted, sightings, innovations)
             states = after if states is None else states.replace(known, after)
         assert states is not None
@@ -260,21 +258,20 @@ class RobotTracks:
         durations_s = np.array([t - r.time_ns for t, r in zip(times_ns, before, strict=True)]) / NS_PER_S
         return predict(_gather(before), durations_s, self._settings.motion)
 
-    def _agrees(self, innovations: Innovations, rest_m2: Array) -> NDArray[np.bool_]:
+    def _agrees(self, innovations: Innovations) -> NDArray[np.bool_]:
         """Return a mask (k,) of the sightings within the gate."""
-        settings, more = self._settings, np.zeros_like(innovations.covariances)
-        more[:, :3, :3] = rest_m2 + settings.slack_m**2 * np.eye(3)
-        more[:, 3, 3] = settings.slack_rad**2
-        return np.asarray(innovations.chi2(more) < settings.gate)
+        settings = self._settings
+        slack = np.diag([settings.slack_m**2] * 3 + [settings.slack_rad**2])
+        return np.asarray(innovations.chi2(slack) < settings.gate)
 
-    def _contradict(self, track: _Track, record: Record, rest_m2: Array) -> bool:
+    def _contradict(self, track: _Track, record: Record) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
         seen, rival = record.sightings.take(_ONE + record.sighting), track.rival
-        states, hits = start(seen, self._settings.motion), 1
+        states, hits = start(seen, self._settings.motion, self._fade_m), 1
         if rival is not None and rival.newest.time_ns <= record.time_ns:
             predicted = self._predicted([rival.newest], [record.time_ns])
             innovations = compare(predicted, seen)
-            if self._agrees(innovations, rest_m2[None])[0]:
+            if self._agrees(innovations)[0]:
                 states, hits = update(predicted, seen, innovations), track.hits + 1
         own = record._replace(states=states, state=0)
         if hits == 1 or rival is None:
@@ -284,7 +281,7 @@ class RobotTracks:
         if hits < self._settings.restart:
             return False
         rival.rows_ns = track.history.rows_ns
-        track.history, track.rest_m2, track.rival, track.hits = rival, rest_m2, None, 0
+        track.history, track.rival, track.hits = rival, None, 0
         return True
 
     def _pose(self, robot: Hashable, track: _Track, batch: _Batch, row: int) -> Pose | None:
@@ -302,7 +299,6 @@ class RobotTracks:
             recent[-1].state,
             tuple(sorted({record.camera for record in recent})),
             any(flags) if flags else None,
-            batch.rest_m2[row],
             batch.has_covariance[row],
         )
 
@@ -313,6 +309,7 @@ def _gather(records: Sequence[Record]) -> States:
         np.array([record.states.means[record.state] for record in records]),
         np.array([record.states.covariances[record.state] for record in records]),
         np.array([record.states.cross[record.state] for record in records]),
+        records[0].states.fade_m,
     )
 
 

@@ -241,8 +241,6 @@ def test_same_marker_twice_in_a_frame_uses_the_one_on_the_track() -> None:
     follow(sight(circle, 1.0), tracks=tracks)
     time_ns = START_NS + NS_PER_S + 50 * MS
     twice = arrays([circle(time_ns) + np.array([1.0, 0.0, 0.0, 0.0]), circle(time_ns)])
-    poses = tracks.observe(
-        "red", ["ada", "ada"], [time_ns] * 2, twice, np.zeros((2, 3, 3)), [None] * 2, [True] * 2
-    )
+    poses = tracks.observe("red", ["ada", "ada"], [time_ns] * 2, twice, [None] * 2, [True] * 2)
     assert len(poses) == 1
     assert errors_m(poses, circle)[0] < 1e-3

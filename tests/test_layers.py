@@ -12,8 +12,8 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
     ("errors", "interrupts"), ("units", "plain_text", "extras"), ("messages",), ("geometry", "rig"),
-    ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("tracking",), ("stages",), ("runs",),
-    ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",),
+    ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("tracking",), ("stages",),
+    ("runs",), ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",),
     ("tracker",), ("player",), ("api",), ("report",), ("web",), ("cli",), ("__main__", "__init__"),
 )  # fmt: skip
 LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -25,7 +25,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.bias_modes import BiasModes
-from ipsys_log.tracking.position_sightings import read_sightings
+from ipsys_log.tracking.position_sightings import has_covariance, is_usable, read_sightings
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
 __all__ = ["STAGE", "Fuse"]
@@ -84,7 +84,8 @@ class Fuse:
         return start_ns is not None and start_ns <= time_ns and (end_ns is None or time_ns <= end_ns)
 
     def _poses(self, message: Message, rig: Rig) -> list[Pose]:
-        camera, positions = str(message.camera), message.payload.positions
+        camera = str(message.camera)
+        positions = [position for position in message.payload.positions if is_usable(position)]
         poses: list[Pose] = []
         if positions:
             poses = self._tracks.observe(
@@ -93,7 +94,7 @@ class Fuse:
                 [message.publish_time_ns + (position.time_offset_ns or 0) for position in positions],
                 read_sightings(camera, positions, self._modes),
                 [position.inside for position in positions],
-                [position.covariance_m2 is not None for position in positions],
+                [has_covariance(position) for position in positions],
             )
         return poses + self._tracks.coast(message.publish_time_ns)
 

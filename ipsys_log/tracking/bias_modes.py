@@ -1,9 +1,9 @@
 """Errors of the calibration as a few modes: tables over the floor, one per camera.
 
 The error of a position is a slow function of the place, the same in each frame. It is linear in independent
-standard normal numbers, the amplitudes. Most of them are common to all cameras and places, so that the products
-of sensitivities are the covariances of any two positions. The others are local: each camera has its own, and a
-robot meets new ones after some distance.
+standard normal numbers, the amplitudes. Most of them are common to all cameras and places, so that the
+products of sensitivities are the covariances of any two positions. The others are local: each camera has its
+own, and a robot meets new ones after some distance.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def reduce_modes(grid: Grid, cameras: Mapping[str, NodeModes], count: int) -> Bi
 
 
 def _rows(node: NodeModes) -> Array:
-    """Return the errors of all nodes as rows (r, M); each node has the same weight, and so has each camera."""
+    """Return the errors of all nodes as rows (r, M). All nodes have the same weight, and all cameras."""
     seen = np.isfinite(node.modes_m).all(axis=(1, 2))
     modes_m = node.modes_m[seen]
     sizes_m = np.sqrt((modes_m**2).sum(axis=(1, 2), keepdims=True))

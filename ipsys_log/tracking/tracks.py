@@ -31,7 +31,7 @@ class TrackSettings:
         exceeded by chance once in 200,000 sightings.
     slack_m, slack_rad : errors that the covariances do not contain; they widen the gate.
     restart : a track starts again after this number of consecutive sightings that contradict it and agree
-        with one another.
+        with one another, or are too late.
     gap_ns : a robot that is unseen for longer is coasting.
     coast_ns : a track ends when its robot is unseen for longer.
     window_ns : the cameras of a pose are those of the sightings in this time.
@@ -69,12 +69,16 @@ class Pose:
 
 @dataclass(slots=True)
 class _Track:
-    """A track, and the sightings that contradict it: a rival track of the same robot."""
+    """A track, and the sightings that contradict it: a rival track of the same robot.
+
+    ``hits`` is the number of consecutive sightings of the rival, ``late`` that of those that are too late.
+    """
 
     history: History
     has_covariance: bool = True
     rival: History | None = None
     hits: int = 0
+    late: int = 0
 
 
 @dataclass(slots=True)
@@ -175,12 +179,11 @@ class RobotTracks:
         rows, tracks, places = [], [], []
         for row in all_rows:
             time_ns = batch.times_ns[row]
-            track = self._track_of(robots[row], batch, row)
-            records = track.history.records
-            if not records or time_ns >= records[-1].time_ns - HISTORY_NS:
+            track = self._track_of(robots[row], time_ns)
+            if track is not None:
                 rows.append(row)
                 tracks.append(track)
-                places.append(track.history.place_of(time_ns) if records else 0)
+                places.append(track.history.place_of(time_ns) if track.history.records else 0)
         if not rows:
             return []
         accepted = self._filter(batch, np.array(rows), tracks, places)
@@ -190,12 +193,18 @@ class RobotTracks:
             if is_accepted and (pose := self._pose(robots[row], track, batch, row))
         ]
 
-    def _track_of(self, robot: Hashable, batch: _Batch, row: int) -> _Track:
+    def _track_of(self, robot: Hashable, time_ns: int) -> _Track | None:
+        """Return the track for a sighting, a new one if there is none; None for a sighting that is too late.
+
+        After a sighting with a time in the future, all others are too late: then the track starts again.
+        """
         track = self._tracks.get(robot)
-        ended = track is not None and (
-            batch.times_ns[row] - track.history.newest.time_ns > self._settings.coast_ns
-        )
-        if track is None or ended:
+        if track is not None and time_ns < track.history.newest.time_ns - HISTORY_NS:
+            track.late += 1
+            if track.late < self._settings.restart:
+                return None
+            track = None
+        if track is None or time_ns - track.history.newest.time_ns > self._settings.coast_ns:
             track = self._tracks[robot] = _Track(History())
         return track
 
@@ -212,7 +221,7 @@ class RobotTracks:
             if not accepted[number]:
                 accepted[number] = self._contradict(track, record)
                 continue
-            track.rival, track.hits = None, 0
+            track.rival, track.hits, track.late = None, 0, 0
             later.append((track, place, [record, *track.history.records[place:]]))
             if place == len(track.history.records):
                 track.has_covariance = batch.has_covariance[row]

@@ -134,6 +134,26 @@ def test_unseen_robot_coasts_at_the_instants_of_other_frames() -> None:
     assert coasting[-1][1].cameras == ()
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Position(3, float("nan"), 0.0, 0.0),
+        Position(3, 1e300, 0.0, 0.0),
+        Position(3, 0.0, 0.0, 0.0, float("inf"), -np.eye(3)),
+        Position(3, 0.0, 0.0, 0.0, 0.1, np.full((3, 3), np.nan), noise_m2=np.full((3, 3), np.inf)),
+        Position(3, 0.0, 0.0, 0.0, 0.1, 1e-6 * np.eye(3), heading_noise_rad=float("nan")),
+    ],
+)
+def test_impossible_numbers_of_a_log_do_not_spread(wrong: Position) -> None:
+    good = at(0.0, 1e-6, 0.1)
+    made = fused(("red", 0, wrong), ("red", 33, good), ("red", 66, wrong), ("red", 99, good))
+    track = made[-2].tracks[0]
+    assert made[-2].timestamp == 99_000_000
+    assert abs(track.x_m) < 1e-3
+    assert track.heading_rad == pytest.approx(0.1, abs=1e-3)
+    assert np.linalg.eigvalsh(track.covariance_m2)[0] > 0
+
+
 def test_no_marker_no_track() -> None:
     fuse = Fuse("poly")
     list(fuse(RIG))

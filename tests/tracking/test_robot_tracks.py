@@ -100,6 +100,14 @@ def test_sighting_older_than_half_a_second_is_left_out() -> None:
     assert last.time_ns - sightings[0].time_ns > NS_PER_S // 2
 
 
+def test_time_in_the_future_stops_a_track_for_two_frames() -> None:
+    sightings = sight(circle, 2.0)
+    wrong = replace(sightings[60], time_ns=sightings[60].time_ns + 3600 * NS_PER_S)
+    poses = follow([*sightings[:60], wrong, *sightings[61:]])
+    assert len(poses) == len(sightings) - 2
+    assert errors_m([pose for pose in poses if pose.time_ns < wrong.time_ns], circle).max() < 1e-3
+
+
 def moved(one: Sighting, by: Array) -> Sighting:
     return replace(one, pose=one.pose + by)
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from math import cos, pi, sin, sqrt
 from typing import Any
 
+import numpy as np
+
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
     STAMP_UNRELIABLE,
@@ -25,6 +27,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.bias_modes import BiasModes
+from ipsys_log.tracking.bodies import Bodies
 from ipsys_log.tracking.position_sightings import has_covariance, is_usable, read_sightings
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
@@ -49,6 +52,7 @@ class Fuse:
         self._rig: Rig | None = None
         self._modes = BiasModes.none()
         self._settings, self._tracks = settings, RobotTracks(settings)
+        self._bodies, self._has_bodies = Bodies(), False
         # By camera, the start and end time of its last late frames; None if there is no end yet.
         self._late_ns: dict[str, tuple[int, int | None]] = {}
 
@@ -66,6 +70,8 @@ class Fuse:
 
     def _use_rig(self, rig: Rig) -> None:
         self._rig = rig
+        names = [marker.robot for marker in rig.markers if marker.robot is not None]
+        self._has_bodies = len(names) > len(set(names))
         if self._model is not None:
             # Late: the modes of a joint model need scipy.
             from ipsys_log.tracking.calibration_modes import calibration_modes
@@ -88,11 +94,19 @@ class Fuse:
         positions = [position for position in message.payload.positions if is_usable(position)]
         poses: list[Pose] = []
         if positions:
+            sightings = read_sightings(camera, positions, self._modes)
+            robots = [(rig.robot_of(position.id), position.id) for position in positions]
+            if self._has_bodies:
+                self._bodies.learn(robots, sightings)
+                rows = [row for row, robot in enumerate(robots) if self._bodies.knows(*robot)]
+                positions, robots = [positions[row] for row in rows], [robots[row] for row in rows]
+                sightings = self._bodies.move(robots, sightings.take(np.array(rows, dtype=np.intp)))
+                robots = [(name, self._bodies.reference(name, number)) for name, number in robots]
             poses = self._tracks.observe(
                 camera,
-                [(rig.robot_of(position.id), position.id) for position in positions],
+                robots,
                 [message.publish_time_ns + (position.time_offset_ns or 0) for position in positions],
-                read_sightings(camera, positions, self._modes),
+                sightings,
                 [position.inside for position in positions],
                 [has_covariance(position) for position in positions],
             )

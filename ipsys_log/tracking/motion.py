@@ -34,7 +34,7 @@ class MotionNoise:
         the velocity on the floor, the vertical speed, the turn rate, and the acceleration.
     """
 
-    acceleration_m_s2: float = 0.5
+    acceleration_m_s2: float = 0.3
     bend_rad_s: float = 1.5
     hold_s: float = 0.4
     turn_rad_s2: float = 2.0

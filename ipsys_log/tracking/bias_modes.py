@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 # A clock error counts like an error of 1 mm for each of these times.
 _CLOCK_S = 0.001
-# Distance over which errors of the place change: the correlation length of a floor and of a lens misfit.
-LOCAL_M = 0.3
+# Distance over which local errors change: the correlation length of a floor. From 0.3 to 1 m, tracks are alike.
+LOCAL_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

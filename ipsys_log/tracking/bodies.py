@@ -1,4 +1,4 @@
-"""Robots with several markers: where each marker is on its robot, learned from frames that show two of them."""
+"""Robots with several markers: the place of each marker on its robot, from frames that show two of them."""
 
 from __future__ import annotations
 

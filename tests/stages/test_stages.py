@@ -83,19 +83,19 @@ def at(x_m: float, variance: float | None, heading_rad: float | None = None) -> 
     return Position(3, x_m, 0.0, 0.0, heading_rad, covariance)
 
 
-def fused(*sent: tuple[str, int, Position]) -> list[Any]:
+def fused(*sent: tuple[str, float, Position]) -> list[Any]:
     """Return the payloads of fuse for positions of cameras at times in ms."""
     fuse = Fuse("poly")
     list(fuse(RIG))
     made = []
     for camera, time_ms, position in sent:
-        time_ns = time_ms * 1_000_000
+        time_ns = round(time_ms * 1_000_000)
         made += fuse(Message("t", time_ns, time_ns, Positions(time_ns, (position,)), camera))
     return made
 
 
 def test_track_lies_between_positions_by_their_weights() -> None:
-    made = fused(("red", 0, at(0.0, 1e-6)), ("white", 0, at(0.001, 3e-6)), ("red", 1, at(0.0, 1.0)))
+    made = fused(("red", 0, at(0.0, 1e-6)), ("white", 0, at(0.001, 3e-6)), ("red", 0.001, at(0.0, 1.0)))
     track = made[2].tracks[0]
     assert track.x_m == pytest.approx(0.00025, abs=2e-5)
     assert track.covariance_m2[0, 0] == pytest.approx(0.75e-6, rel=0.1)

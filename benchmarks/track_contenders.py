@@ -16,7 +16,6 @@ from ipsys_log.tracking.interpolation import TrackRows, interpolate
 from ipsys_log.tracking.motion import MotionNoise
 from ipsys_log.tracking.robot_rows import gather_rows
 from ipsys_log.tracking.smoothed_poses import Frame, smooth_positions
-from ipsys_log.tracking.track_inputs import make_modes
 from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.units import NS_PER_S
 
@@ -224,15 +223,12 @@ def _stage(drive: SeenDrive) -> dict[int, RobotTrack]:
 
 def _smoothed(drive: SeenDrive) -> dict[int, RobotTrack]:
     """Smooth the sightings of the whole drive, as the stage of the program."""
-    frames = []
-    for message in drive.positions:
-        positions = message.payload.positions
-        robots = [(drive.rig.robot_of(position.id), position.id) for position in positions]
-        frames.append(
-            Frame(message.publish_time_ns, str(message.camera), message.log_time_ns, positions, robots)
-        )
+    frames = [
+        Frame(one.publish_time_ns, str(one.camera), one.log_time_ns, one.payload.positions)
+        for one in drive.positions
+    ]
     rows: dict[int, list[tuple[int, Track]]] = defaultdict(list)
-    for _, pose in smooth_positions(frames, make_modes(drive.model, drive.rig)):
+    for _, pose in smooth_positions(frames, drive.rig, drive.model):
         track = make_track(pose)
         rows[track.id].append((pose.time_ns, track))
     return {robot: _of_tracks(tracks, _interpolate) for robot, tracks in rows.items()}

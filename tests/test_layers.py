@@ -12,9 +12,10 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
     ("errors", "interrupts"), ("units", "plain_text", "extras"), ("messages",), ("geometry", "rig"),
-    ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("tracking",), ("stages",), ("runs",),
-    ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",),
-    ("tracker",), ("player",), ("sampled_track",), ("opened_log",), ("api",), ("report",), ("web",), ("cli",), ("__main__", "__init__"),
+    ("images",), ("models", "log"), ("calibration",), ("joint",), ("analysis",), ("tracking",), ("stages",),
+    ("runs",), ("simulation",), ("capture",), ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",),
+    ("tracker",), ("player",), ("sampled_track",), ("opened_log",), ("api",), ("report",), ("web",), ("cli",),
+    ("__main__", "__init__"),
 )  # fmt: skip
 LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -6,11 +6,11 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import STAMP_UNRELIABLE, Event, Rig, Track, Tracks
+from ipsys_log.messages import STAMP_UNRELIABLE, Event, Track, Tracks
 from ipsys_log.messages.channels import EVENTS, POSITIONS, RIG, SMOOTHED_TRACKS
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, Timed
 from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
-from ipsys_log.tracking.track_inputs import TRACK_READS, make_modes, model_of, track_reads, tracked_part
+from ipsys_log.tracking.track_inputs import TRACK_READS, model_of, track_reads, tracked_part
 from ipsys_log.tracking.track_rows import make_track
 
 __all__ = ["STAGE"]
@@ -20,21 +20,20 @@ def _compute(view: StageView, progress: Progress) -> list[Timed]:
     rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
     if rig is None:
         raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
-    frames = list(_frames(view, rig))
+    frames = list(_frames(view))
     progress(0, len(frames))
-    poses = smooth_positions(frames, make_modes(model_of(view), rig))
+    poses = smooth_positions(frames, rig, model_of(view))
     progress(len(frames), len(frames))
     return _messages(poses)
 
 
-def _frames(view: StageView, rig: Rig) -> Iterator[Frame]:
+def _frames(view: StageView) -> Iterator[Frame]:
     """Yield the positions of all frames, without late frames: these have wrong times."""
     late_ns = _late_intervals(view.payloads(EVENTS))
     for message in view.messages(POSITIONS):
         camera, time_ns, positions = str(message.camera), message.publish_time_ns, message.payload.positions
         if not any(start <= time_ns and (end is None or time_ns <= end) for start, end in late_ns[camera]):
-            robots = [(rig.robot_of(position.id), position.id) for position in positions]
-            yield Frame(time_ns, camera, message.log_time_ns, positions, robots)
+            yield Frame(time_ns, camera, message.log_time_ns, positions)
 
 
 def _late_intervals(events: Iterable[Event]) -> Mapping[str, list[tuple[int, int | None]]]:

@@ -35,7 +35,7 @@ def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Arra
     count, size = len(durations_s) + 1, MOTION + MODES
     means, joint = np.zeros((count, size)), np.zeros((count, size, count, size))
     means[0, :MOTION] = first.means[0]
-    joint[0, :, 0] = np.block([[first.covariances[0], first.cross[0]], [first.cross[0].T, np.eye(MODES)]])
+    joint[0, :, 0] = np.block([[first.covariances[0], -first.cross[0]], [-first.cross[0].T, np.eye(MODES)]])
     for n, duration_s in enumerate(durations_s):
         (motion,), (spread,) = transition(np.array([duration_s]), np.zeros(1), NOISE)
         forward = np.eye(size)

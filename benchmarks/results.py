@@ -28,6 +28,7 @@ BENCHMARKS = {
     "startup": "ipsys --help and ipsys info",
     "joint": "error over the floor of calibrations, in simulated labs",
     "tracks": "error of the tracks of driving robots, in simulated labs",
+    "track_cost": "time of a message with the positions of 20 robots",
 }
 
 

@@ -58,7 +58,6 @@ _SMOKE_S = 3.0
 _WANTED = (
     ("mean_mm", "joint", 0.8, 0.8),
     ("p95_mm", "joint", 1.5, 1.5),
-    ("ratio", "joint", 1.05, 1.05),
     ("mean_mm", "joint, drive", 0.6, 0.7),
     ("median_3d_mm", "best", 1.5, 1.9),
     ("p95_3d_mm", "best", 2.6, 3.5),
@@ -71,7 +70,19 @@ _WANTED = (
     ("hand_over_mm", "joint", 0.75, 1.7),
     ("velocity_m_s", "joint", 0.02, 0.10),
 )
+# The error of tracks relative to that of single positions.
+_MOST_RATIO = 1.05
 _WANTED_SMOOTHED = (("hand_over_mm", "joint", 0.15, 0.25), ("velocity_m_s", "joint", 0.005, 0.01))
+_UNITS = {
+    "mean_mm": "mm",
+    "p95_mm": "mm",
+    "median_3d_mm": "mm",
+    "p95_3d_mm": "mm",
+    "heading_mean_deg": "deg",
+    "heading_p95_deg": "deg",
+    "hand_over_mm": "mm",
+    "velocity_m_s": "m/s",
+}
 _FAST_M_S = 1.0
 
 
@@ -142,7 +153,11 @@ def _add(report: Report, condition: Condition, model: str, errors: dict[str, lis
     )
     for name, wanted in (("fuse", _WANTED), ("smooth", _WANTED_SMOOTHED)):
         if name in figures and not condition.floor_rms_m:
-            _add_limits(report, condition, f"{name}, {model}", model, figures[name], wanted)
+            _add_limits(report, condition, name, model, figures[name], wanted)
+        if name in figures:
+            ratios = tuple(float(lab.error_2d_mm.mean() / lab.single_mm) for lab in errors[name])
+            limit = ("<=", _MOST_RATIO) if model == "joint" else None
+            report.rows.append(Row(f"{condition.name} {model}: {name} / single", ratios, wanted=limit))
 
 
 _KEYS = (
@@ -179,7 +194,7 @@ def _cell(value: float | None, width: int, digits: int) -> str:
 def _add_limits(
     report: Report,
     condition: Condition,
-    title: str,
+    name: str,
     model: str,
     figures: Figures,
     wanted: Sequence[tuple[str, str, float, float]],
@@ -188,8 +203,18 @@ def _add_limits(
     for key, of_model, slow_limit, fast_limit in wanted:
         if of_model == model and math.isfinite(figures[key]):
             limit = fast_limit if fast else slow_limit
-            unit = "" if key == "ratio" else key.rpartition("_")[2]
-            report.rows.append(Row(f"{condition.name} {title} {key}", (figures[key],), unit, ("<=", limit)))
+            report.rows.append(
+                Row(
+                    f"{condition.name} {model}: {name} {_title(key)}",
+                    (figures[key],),
+                    _UNITS[key],
+                    ("<=", limit),
+                )
+            )
+
+
+def _title(key: str) -> str:
+    return key.removesuffix("_mm").removesuffix("_deg").removesuffix("_m_s").replace("_", " ")
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:

@@ -13,13 +13,14 @@ from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.messages.channels import EVALUATION
+from ipsys_log.messages.channels import EVALUATION, TRACKS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.runs.graph import stages_until, writer_of, writes
+from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
 
@@ -57,6 +58,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **_text_values(findings),
         flat=html_sections.flat_rows(_measured(session, findings)),
         **_figure_values(findings),
+        tracks_picture=html_figures.tracks_picture(session, newest_run(session, TRACKS)),
         **_provenance(session, findings),
     )
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import Model, Position, Rig
 from ipsys_log.tracking.frame_reader import FrameReader
 from ipsys_log.tracking.history import History
-from ipsys_log.tracking.smoother import smooth
+from ipsys_log.tracking.smoother import smooth_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings, gather_sightings
 from ipsys_log.units import NS_PER_S
 
@@ -81,7 +81,7 @@ def _smooth_track(
     records = history.records
     times_ns = [record.time_ns for record in records]
     durations_s = np.diff(times_ns) / NS_PER_S
-    states = smooth(gather_sightings(records), durations_s, settings.motion, fade_m)
+    states = smooth_track(gather_sightings(records), durations_s, settings.motion, fade_m)
     for row, record in enumerate(records):
         # Sightings of one instant have equal states: the last one has the pose.
         if row + 1 == len(records) or times_ns[row + 1] > times_ns[row]:

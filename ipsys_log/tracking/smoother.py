@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings, States, start
 from ipsys_log.tracking.motion import MOTION, POSE, RATES, MotionNoise, transition
 
-__all__ = ["smooth"]
+__all__ = ["smooth_track"]
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ _HEADING = 3
 _SPEED_S = 0.1
 
 
-def smooth(
+def smooth_track(
     sightings: Sightings, durations_s: Array, noise: MotionNoise, fade_m: Array | None = None
 ) -> States:
     """Return the motion of one robot by all sightings of its track.

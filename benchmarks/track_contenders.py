@@ -10,11 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from track_drives import SeenDrive
 
-from ipsys_log.messages import Position, Track, Tracks
+from ipsys_log.messages import Message, Position, Track, Tracks
 from ipsys_log.stages.fuse import Fuse
+from ipsys_log.tracking.interpolation import TrackRows, interpolate
+from ipsys_log.tracking.motion import MotionNoise
+from ipsys_log.tracking.robot_rows import gather_rows
+from ipsys_log.tracking.smoothed_poses import Frame, smooth_positions
+from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["CONTENDERS", "RobotTrack"]
+__all__ = ["COASTING", "CONTENDERS", "RobotTrack"]
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -206,33 +211,78 @@ def _ahead(state: Array, spread: Array, step_s: float) -> tuple[Array, Array]:
 
 def _stage(drive: SeenDrive) -> dict[int, RobotTrack]:
     """Track with the stage of the program, as while recording."""
-    step = Fuse(_RUN)
+    step = Fuse(_RUN, drive.model)
     rows: dict[int, list[tuple[int, Track]]] = defaultdict(list)
     for message in drive.messages():
         for payload in step(message):
             if isinstance(payload, Tracks):
                 for track in payload.tracks:
                     rows[track.id].append((payload.timestamp, track))
-    return {robot: _of_tracks(tracks) for robot, tracks in rows.items()}
+    return {robot: _of_tracks(tracks, _extrapolate) for robot, tracks in rows.items()}
 
 
-def _of_tracks(rows: list[tuple[int, Track]]) -> RobotTrack:
-    rows = sorted(rows, key=lambda row: row[0])
-    times_ns = np.array([time_ns for time_ns, _ in rows], dtype=np.int64)
-    points_m = np.array([(t.x_m, t.y_m, t.z_m) for _, t in rows])
-    headings_rad = np.array([np.nan if t.heading_rad is None else t.heading_rad for _, t in rows])
-    unknown = np.full((2, 2), np.nan)
-    covariances = np.array([unknown if t.covariance_m2 is None else t.covariance_m2[:2, :2] for _, t in rows])
-    velocities = np.full((len(rows), 2), np.nan)
-    predict = _hold(times_ns, points_m)
-    return RobotTrack(times_ns, points_m, headings_rad, covariances, velocities, predict)
+def _smoothed(drive: SeenDrive) -> dict[int, RobotTrack]:
+    """Smooth the sightings of the whole drive, as the stage of the program."""
+    frames = [
+        Frame(one.publish_time_ns, str(one.camera), one.log_time_ns, one.payload.positions)
+        for one in drive.positions
+    ]
+    rows: dict[int, list[tuple[int, Track]]] = defaultdict(list)
+    for _, pose in smooth_positions(frames, drive.rig, drive.model):
+        track = make_track(pose)
+        rows[track.id].append((pose.time_ns, track))
+    return {robot: _of_tracks(tracks, _interpolate) for robot, tracks in rows.items()}
+
+
+def _of_tracks(rows: list[tuple[int, Track]], make_predict: Callable[[TrackRows], Predict]) -> RobotTrack:
+    messages = [Message("", time_ns, time_ns, Tracks(time_ns, (track,))) for time_ns, track in rows]
+    gathered, _ = gather_rows(messages, rows[0][1].robot)
+    return RobotTrack(
+        gathered.times_ns,
+        gathered.points_m,
+        gathered.headings_rad,
+        gathered.covariances_m2[:, :2, :2],
+        gathered.velocities_m_s[:, :2],
+        make_predict(gathered),
+    )
+
+
+def _interpolate(rows: TrackRows) -> Predict:
+    def predict(wanted_ns: Times) -> tuple[Array, Array]:
+        samples = interpolate(rows, wanted_ns)
+        return samples.points_m[:, :2], samples.covariances_m2[:, :2, :2]
+
+    return predict
+
+
+def _extrapolate(rows: TrackRows) -> Predict:
+    """Return the prediction of a reader of live rows: constant speed and turn rate from the last row."""
+    usual = MotionNoise()
+
+    def predict(wanted_ns: Times) -> tuple[Array, Array]:
+        last = np.maximum(np.searchsorted(rows.times_ns, wanted_ns, side="right") - 1, 0)
+        ahead_s = (wanted_ns - rows.times_ns[last]) / NS_PER_S
+        velocities = rows.velocities_m_s[last, :2]
+        turned = np.exp(0.5j * np.nan_to_num(rows.turn_rates_rad_s[last]) * ahead_s)
+        along = (velocities @ np.array([1, 1j])) * turned * ahead_s
+        points_m = rows.points_m[last, :2] + np.stack([along.real, along.imag], axis=1)
+        by_velocity = ahead_s[:, None, None] ** 2 * rows.velocity_covariances_m2_s2[last][:, :2, :2]
+        usual_m_s2 = np.hypot(usual.acceleration_m_s2, usual.bend_rad_s * np.linalg.norm(velocities, axis=1))
+        unknown_m2 = (usual_m_s2 * ahead_s**2 / 2) ** 2
+        own = rows.covariances_m2[last][:, :2, :2]
+        return points_m, own + by_velocity + unknown_m2[:, None, None] * np.eye(2)
+
+    return predict
 
 
 # By name, from a drive to the tracks of its robots.
 CONTENDERS: dict[str, Callable[[SeenDrive], dict[int, RobotTrack]]] = {
     "fuse": _stage,
+    "smooth": _smoothed,
     "average in 5 ms": _average,
     "authors' rule": _by_rule(_authors),
     "nearest camera": _by_rule(_nearest),
     "velocity filter": _velocity_filter,
 }
+# These have covariances while no camera sees a robot.
+COASTING = frozenset({"fuse", "smooth", "velocity filter"})

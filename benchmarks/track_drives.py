@@ -5,9 +5,9 @@ A drive has other noise than the session that calibrated its lab, and another pa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from geometric_labs import Scene, Session, fit_session, make_session
@@ -24,7 +24,7 @@ from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.locate import Locate, LocateCorners
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["CALIBRATIONS", "Condition", "SeenDrive", "Truth", "calibrate", "drive_through"]
+__all__ = ["CALIBRATIONS", "Condition", "SeenDrive", "Truth", "calibrate", "cover", "drive_through"]
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -56,6 +56,7 @@ class Condition:
     rolling: bool = False
     unknown_clocks: bool = False
     floor_rms_m: float = 0.0
+    height_sigma_m: float = 0.0
 
     def settings(self, lab: LabSettings, points: int) -> GeometricSettings:
         """Return the settings of a session of the lab under this condition."""
@@ -65,11 +66,17 @@ class Condition:
             clock_offset_s=_CLOCKS_S if self.unknown_clocks else 0.0,
             frame_delays_s=_DELAYS_S,
             floor_rms_m=self.floor_rms_m,
+            robot_height_sigma_m=self.height_sigma_m,
         )
 
 
 def calibrate(condition: Condition, name: str, seed: int) -> Model:
-    """Return a calibration of a lab, by its name in ``CALIBRATIONS``."""
+    """Return a calibration of a lab, by its name in ``CALIBRATIONS``; the speed of its drive is usual."""
+    return _calibrate(replace(condition, name="", speed_m_s=0.5), name, seed)
+
+
+@cache
+def _calibrate(condition: Condition, name: str, seed: int) -> Model:
     model, drives = CALIBRATIONS[name]
     settings = LabSettings(rate_hz=10.0, drive_s=120.0 if drives else 0.0, markers=1 if drives else 3)
     session: Session = make_session(Scene(name, condition.settings(settings, 75)), seed)
@@ -167,6 +174,17 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
         Truth(lab, late_ns),
         {camera.name: camera.origin_m[:2] for camera in lab.cameras},
     )
+
+
+def cover(drive: SeenDrive, gaps_ns: Sequence[tuple[int, int]]) -> SeenDrive:
+    """Return a drive without the positions in some intervals, as if all cameras were covered."""
+    positions = tuple(
+        replace(message, payload=replace(message.payload, positions=()))
+        if any(start <= message.publish_time_ns < end for start, end in gaps_ns)
+        else message
+        for message in drive.positions
+    )
+    return replace(drive, positions=positions)
 
 
 def _located(messages: list[Message], model: Model) -> Iterator[Message]:

@@ -12,7 +12,14 @@ from track_drives import SeenDrive
 
 from ipsys_log.analysis.floor_error import region_shares
 
-__all__ = ["Figures", "LabErrors", "compute_lab_errors", "summarize_labs"]
+__all__ = [
+    "Figures",
+    "LabErrors",
+    "compute_coasting_errors",
+    "compute_lab_errors",
+    "find_gaps",
+    "summarize_labs",
+]
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -24,6 +31,8 @@ _LEFT_OUT_NS, _MOST_GAP_NS = 500_000_000, 60_000_000
 # A hand-over is a change of the cameras of this time.
 _HAND_OVER_NS = 100_000_000
 _GRID_NS = 1_000_000
+# All cameras are covered for a while, again and again; the errors are sampled in these gaps.
+_GAP_NS, _GAP_EVERY_NS, _GAP_STEP_NS = 600_000_000, 3_000_000_000, 50_000_000
 _MM = 1000.0
 
 
@@ -31,7 +40,7 @@ _MM = 1000.0
 class LabErrors:
     """The errors of a contender in one lab, over all its robots. Distances are in mm, angles in degrees.
 
-    ``at_rows`` and ``between`` are 2D errors in m, (n, 2), each with covariances (n, 2, 2).
+    ``at_rows``, ``between`` and ``coasting`` are 2D errors in m, (n, 2), each with covariances (n, 2, 2).
     """
 
     single_mm: float
@@ -44,10 +53,16 @@ class LabErrors:
     heading_deg: Array
     at_rows: tuple[Array, Array]
     between: tuple[Array, Array]
+    coasting: tuple[Array, Array]
 
 
-def compute_lab_errors(drive: SeenDrive, tracks: dict[int, RobotTrack]) -> LabErrors:
-    """Return the errors of the tracks of a drive, without the first half second of each."""
+def compute_lab_errors(
+    drive: SeenDrive, tracks: dict[int, RobotTrack], coasting: tuple[Array, Array] | None = None
+) -> LabErrors:
+    """Return the errors of the tracks of a drive, without the first half second of each.
+
+    ``coasting`` are the errors while no camera sees a robot, from :func:`compute_coasting_errors`.
+    """
     robots = [_robot_errors(drive, robot, track) for robot, track in tracks.items()]
 
     def join(key: str) -> Array:
@@ -64,7 +79,30 @@ def compute_lab_errors(drive: SeenDrive, tracks: dict[int, RobotTrack]) -> LabEr
         join("heading_deg"),
         (join("errors_m"), join("covariances_m2")),
         (join("between_m"), join("between_covariances_m2")),
+        coasting or (np.empty((0, 2)), np.empty((0, 2, 2))),
     )
+
+
+def find_gaps(drive: SeenDrive) -> list[tuple[int, int]]:
+    """Return intervals in which all cameras are covered: 0.6 s in every 3 s."""
+    first_ns, last_ns = drive.positions[0].publish_time_ns, drive.positions[-1].publish_time_ns
+    starts = np.arange(first_ns + _GAP_EVERY_NS - _GAP_NS, last_ns - 2 * _GAP_NS, _GAP_EVERY_NS)
+    return [(start, start + _GAP_NS) for start in starts.tolist()]
+
+
+def compute_coasting_errors(
+    drive: SeenDrive, gaps_ns: Sequence[tuple[int, int]], tracks: dict[int, RobotTrack]
+) -> tuple[Array, Array]:
+    """Return the errors in the intervals without positions, and their covariances."""
+    errors_m, covariances_m2 = [np.empty((0, 2))], [np.empty((0, 2, 2))]
+    for robot, track in tracks.items():
+        times_ns = [np.arange(start + _GAP_STEP_NS, end, _GAP_STEP_NS) for start, end in gaps_ns]
+        within = np.concatenate([np.empty(0, dtype=np.int64), *times_ns])
+        within = within[(within > track.times_ns[0] + _LEFT_OUT_NS) & (within < track.times_ns[-1])]
+        points_m, covariances = track.predict(within)
+        errors_m.append(points_m - _place(drive, robot, within))
+        covariances_m2.append(covariances)
+    return np.concatenate(errors_m), np.concatenate(covariances_m2)
 
 
 def single_error_mm(drive: SeenDrive) -> float:
@@ -81,13 +119,14 @@ def _robot_errors(drive: SeenDrive, robot: int, track: RobotTrack) -> dict[str, 
     times_ns = track.times_ns
     poses = drive.truth.poses(robot, times_ns)
     errors_m = track.points_m - poses[:, :3]
-    later = times_ns >= times_ns[0] + _LEFT_OUT_NS
+    # A row without a sighting is a prediction.
+    later = (times_ns >= times_ns[0] + _LEFT_OUT_NS) & np.isin(times_ns, drive.sightings[robot][0])
     turned_rad = (track.headings_rad - poses[:, 3] + np.pi) % (2 * np.pi) - np.pi
     grid_ns = np.arange(times_ns[0] + _LEFT_OUT_NS, times_ns[-1], _GRID_NS)
     middle_ns = _middles(times_ns[later])
     between_m, between_covariances_m2 = track.predict(middle_ns)
     steps_mm = _MM * np.linalg.norm(np.diff(errors_m[:, :2], axis=0), axis=1)
-    near = (np.diff(times_ns) <= _MOST_GAP_NS) & later[:-1]
+    near = (np.diff(times_ns) <= _MOST_GAP_NS) & later[:-1] & later[1:]
     handed_over, other = _changes(*drive.sightings[robot][:2], times_ns)
     return {
         "errors_m": errors_m[later, :2],
@@ -149,15 +188,15 @@ def summarize_labs(labs: Sequence[LabErrors]) -> Figures:
         "p95_3d_mm": median([np.percentile(lab.error_3d_mm, 95) for lab in labs]),
         "ratio": median([lab.error_2d_mm.mean() / lab.single_mm for lab in labs]),
         "single_mm": median([lab.single_mm for lab in labs]),
-        "grid_mm": median([lab.grid_mm.mean() for lab in labs]),
-        "grid_p95_mm": median([np.percentile(lab.grid_mm, 95) for lab in labs]),
+        "grid_mm": median([np.nanmean(lab.grid_mm) for lab in labs]),
+        "grid_p95_mm": median([np.nanpercentile(lab.grid_mm, 95) for lab in labs]),
         "hand_over_mm": pooled([lab.hand_over_mm for lab in labs]),
         "other_camera_mm": pooled([lab.other_camera_mm for lab in labs]),
         "velocity_m_s": pooled([lab.velocity_m_s for lab in labs]),
         "heading_mean_deg": median([np.nanmean(lab.heading_deg) for lab in labs]),
         "heading_p95_deg": median([np.nanpercentile(lab.heading_deg, 95) for lab in labs]),
     }
-    for name in ("at_rows", "between"):
+    for name in ("at_rows", "between", "coasting"):
         figures |= {f"{name}_{key}": value for key, value in _coverage([getattr(lab, name) for lab in labs])}
     return figures
 
@@ -166,7 +205,7 @@ def _coverage(labs: Sequence[tuple[Array, Array]]) -> list[tuple[str, float]]:
     """Return the mean shares inside the 68 and 95 % regions over labs, in %, and the NEES."""
     shares = []
     for errors_m, covariances_m2 in labs:
-        known = np.isfinite(covariances_m2).all(axis=(1, 2))
+        known = np.isfinite(covariances_m2).all(axis=(1, 2)) & np.isfinite(errors_m).all(axis=1)
         if known.any():
             shares.append(region_shares(errors_m[known], covariances_m2[known]))
     if not shares:

@@ -77,6 +77,7 @@ def test_log_lists_cameras_runs_and_channels(replayed: Path) -> None:
             ("edges", "detect", "current"),
             ("poly", "fuse", "current"),
             ("rigid", "fuse", "current"),
+            ("rigid", "smooth", "current"),
         }
         channels = {(row[0], row[1]) for row in log.channels}
         assert {("rig", None), ("images", None), ("markers", "edges"), ("tracks", "poly")} <= channels

@@ -159,6 +159,7 @@ def test_each_result_is_computed_once(ipsys: Ipsys, lab: Path) -> None:
         "evaluate": ("poly", True),
         "locate": ("poly", True),
         "fuse": ("poly", True),
+        "smooth": ("poly", True),
     }
     after = lab.read_bytes()
     assert after.startswith(recorded)

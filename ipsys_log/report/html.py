@@ -14,7 +14,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.messages.channels import EVALUATION, POSITIONS
+from ipsys_log.messages.channels import EVALUATION, POSITIONS, TRACKS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
@@ -61,6 +61,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         flat=html_sections.flat_rows(_measured(session, findings)),
         **_figure_values(findings),
         **_overlap(session, findings),
+        tracks_picture=html_figures.tracks_picture(session, newest_run(session, TRACKS)),
         **_provenance(session, findings),
     )
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ipsys_log.log.dataset import Session
 from ipsys_log.report.advice import has_published, label
 from ipsys_log.report.figures import svg_data_uri
 from ipsys_log.report.findings import Findings
@@ -29,6 +30,7 @@ from ipsys_log.report.paper_figures import (
     shown_models,
 )
 from ipsys_log.report.points_figure import draw_coverage
+from ipsys_log.report.tracks_figure import draw_tracks, read_drawn_tracks
 
 __all__ = [
     "coverage_picture",
@@ -39,6 +41,7 @@ __all__ = [
     "picture",
     "published_pictures",
     "residual_pictures",
+    "tracks_picture",
 ]
 
 _WIDTH_IN = 4.7
@@ -189,4 +192,19 @@ def coverage_picture(findings: Findings) -> Picture | None:
     draw_coverage(axes, findings)
     return picture(
         figure, "Calibration points of the models. Hatched: floor outside the area of these points"
+    )
+
+
+def tracks_picture(session: Session, run: str | None) -> Picture | None:
+    """Return a map of the tracks of a run with their regions and hand-overs; None without tracks."""
+    tracks = read_drawn_tracks(session, run) if run is not None else {}
+    if not tracks:
+        return None
+    figure, axes = _figure(5.4)
+    enlarged = draw_tracks(axes, tracks)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    return _picture(
+        figure,
+        f"Tracks of run {run}, seen from above. Ellipses: regions that hold 95 % of the errors, "
+        f"{enlarged} times as large. White dots: other cameras see the robot from there on",
     )

@@ -138,6 +138,7 @@ ENTRIES: tuple[StageEntry, ...] = (
     ),
     StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),
     StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),
+    StageEntry(name="smooth", help="Smooth the tracks by the sightings before and after each pose."),
 )
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from math import cos, sin
 from typing import Any
-
-import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
@@ -23,10 +22,10 @@ from ipsys_log.messages import (
     Tracks,
     Vector3,
 )
-from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TRACKS
+from ipsys_log.messages.channels import POSES, POSITIONS, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
-from ipsys_log.tracking.bias_modes import BiasModes
-from ipsys_log.tracking.position_sightings import read_sightings
+from ipsys_log.tracking.frame_reader import FrameReader
+from ipsys_log.tracking.track_inputs import TRACK_READS, model_of, track_reads, tracked_part
 from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
@@ -47,10 +46,9 @@ class Fuse:
     """
 
     def __init__(self, run: str, model: Model | None = None, settings: TrackSettings | None = None) -> None:
-        self._run, self._model = run, model
+        self._run, self._reader = run, FrameReader(model)
         self._rig: Rig | None = None
-        self._modes = BiasModes.none()
-        self._tracks = RobotTracks(settings)
+        self._settings, self._tracks = settings, RobotTracks(settings)
         # By camera, the start and end time of its last late frames; None if there is no end yet.
         self._late_ns: dict[str, tuple[int, int | None]] = {}
 
@@ -64,15 +62,14 @@ class Fuse:
                 raise IpsysError(
                     "the log has no rig (robots and their markers): give one with --rig lab.toml"
                 )
-            yield from self._messages(self._poses(message, self._rig))
+            yield from self._messages(self._poses(message))
 
     def _use_rig(self, rig: Rig) -> None:
         self._rig = rig
-        if self._model is not None:
-            # Late: the modes of a joint model need scipy.
-            from ipsys_log.tracking.calibration_modes import calibration_modes
-
-            self._modes = calibration_modes(self._model, rig)
+        count = self._reader.modes.count
+        self._reader.use_rig(rig)
+        if count != self._reader.modes.count:
+            self._tracks = RobotTracks(self._settings, self._reader.modes.fade_m)
 
     def _note_late(self, event: Event) -> None:
         if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
@@ -83,19 +80,17 @@ class Fuse:
         time_ns = message.publish_time_ns
         return start_ns is not None and start_ns <= time_ns and (end_ns is None or time_ns <= end_ns)
 
-    def _poses(self, message: Message, rig: Rig) -> list[Pose]:
-        camera, positions = str(message.camera), message.payload.positions
+    def _poses(self, message: Message) -> list[Pose]:
         poses: list[Pose] = []
-        if positions:
-            sightings, rest_m2 = read_sightings(camera, positions, self._modes)
+        frame = self._reader.read(str(message.camera), message.publish_time_ns, message.payload.positions)
+        if frame is not None:
             poses = self._tracks.observe(
-                camera,
-                [(rig.robot_of(position.id), position.id) for position in positions],
-                [message.publish_time_ns + (position.time_offset_ns or 0) for position in positions],
-                sightings,
-                rest_m2,
-                [position.inside for position in positions],
-                [position.covariance_m2 is not None for position in positions],
+                frame.camera,
+                frame.robots,
+                frame.times_ns,
+                frame.sightings,
+                frame.inside,
+                frame.has_covariance,
             )
         return poses + self._tracks.coast(message.publish_time_ns)
 
@@ -117,33 +112,26 @@ def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
         "world",
         f"{run}/{track.robot}",
         Vector3(track.x_m, track.y_m, track.z_m),
-        Quaternion(0.0, 0.0, float(np.sin(half_rad)), float(np.cos(half_rad))),
+        Quaternion(0.0, 0.0, sin(half_rad), cos(half_rad)),
     )
 
 
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
-    models = view.payloads(MODEL) if view.run(MODEL) else []
-    has_late_frames = any(event.kind == STAMP_UNRELIABLE for event in view.payloads(EVENTS))
+    model = model_of(view)
     return Plan(
         run=view.run(POSITIONS),
         parameters={},
-        # A log without such events keeps its existing runs.
-        reads=(RIG, POSITIONS, *([MODEL] if models else []), *([EVENTS] if has_late_frames else [])),
-        step=lambda run: Fuse(run, models[-1] if models else None),
+        reads=track_reads(view),
+        step=lambda run: Fuse(run, model),
     )
 
 
 STAGE = Stage(
     name="fuse",
     versions={"fuse": 2},
-    reads=(RIG, POSITIONS, MODEL, EVENTS),
+    reads=TRACK_READS,
     writes=(TRACKS, POSES),
     plan=_plan,
-    rig_part=lambda rig, method: (
-        {(m.id, m.robot, m.height_m, m.height_sigma_m) for m in rig.markers},
-        rig.marker_height_m,
-        rig.marker_height_sigma_m,
-        rig.marker_length_m,
-    ),
+    rig_part=tracked_part,
     per_camera=False,
 )

@@ -1,8 +1,9 @@
 """Errors of the calibration as a few modes: tables over the floor, one per camera.
 
-The error of a position is a slow function of the place, the same in each frame. It is linear in m independent
-standard normal numbers, the amplitudes. They are common to all cameras and places, so that the products of
-sensitivities are the covariances of any two positions.
+The error of a position is a slow function of the place, the same in each frame. It is linear in independent
+standard normal numbers, the amplitudes. Most of them are common to all cameras and places, so that the
+products of sensitivities are the covariances of any two positions. The others are local: each camera has its
+own, and a robot meets new ones after some distance.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BiasModes", "Grid", "NodeModes", "reduce_modes"]
+__all__ = ["LOCAL_M", "BiasModes", "Grid", "NodeModes", "reduce_modes"]
 
 Array = NDArray[np.float64]
 
-# A step of the clock counts like an error of a position at this speed.
-_CLOCK_M_S = 1.0
+# A clock error counts like an error of 1 mm for each of these times.
+_CLOCK_S = 0.001
+# Distance over which local errors change: the correlation length of a floor. From 0.3 to 1 m, tracks are alike.
+LOCAL_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +48,7 @@ class NodeModes:
     Attributes
     ----------
     modes_m : (n, 3, M), errors by all M amplitudes; NaN at a node that the camera cannot see.
-    rest_m2 : (n, 3, 3), covariances of errors of the place alone: no two places share them.
+    rest_m2 : (n, 3, 3), covariances of local errors.
     clock_s : (M,), error of the camera's clock by the amplitudes.
     """
 
@@ -62,23 +65,26 @@ class BiasModes:
     ----------
     grid : the nodes; between them, the sensitivities are bilinear. Outside, they keep the value at the edge.
     tables : by camera, (nx, ny, 3, m) in m.
-    rest_m2 : by camera, (nx, ny, 3, 3): the variance that is not in the m modes, and errors of the place.
-    clock_s : by camera, (m,).
-    count : the number m of amplitudes.
+    clock_s : by camera, (m,), error of its clock.
+    fade_m : (m,), distance after which a robot meets other amplitudes; infinite for the common ones.
     """
 
     grid: Grid
     tables: Mapping[str, Array]
-    rest_m2: Mapping[str, Array]
     clock_s: Mapping[str, Array]
-    count: int
+    fade_m: Array
+
+    @property
+    def count(self) -> int:
+        """The number m of amplitudes."""
+        return len(self.fade_m)
 
     @classmethod
     def none(cls) -> BiasModes:
         """Return no modes: for models without a covariance."""
-        return cls(Grid(np.zeros(2), 1.0, (2, 2)), {}, {}, {}, 0)
+        return cls(Grid(np.zeros(2), 1.0, (2, 2)), {}, {}, np.zeros(0))
 
-    def at(self, camera: str, points_m: Array, headings_rad: Array) -> tuple[Array, Array]:
+    def at(self, camera: str, points_m: Array, headings_rad: Array) -> Array:
         """Return the sensitivities of poses that a camera measured.
 
         Parameters
@@ -89,25 +95,22 @@ class BiasModes:
 
         Returns
         -------
-        sensitivities : (k, 4, m), of x, y, z in m and of the heading in rad.
-        rest_m2 : (k, 3, 3), covariances of the other errors.
+        (k, 4, m), of x, y, z in m and of the heading in rad.
         """
         count = len(points_m)
         if camera not in self.tables:
-            return np.zeros((count, 4, self.count)), np.zeros((count, 3, 3))
+            return np.zeros((count, 4, self.count))
         cells, shares = self._cells(points_m)
         i, j = cells[:, 0], cells[:, 1]
         s, t = shares[:, 0, None, None], shares[:, 1, None, None]
-        table, rest = self.tables[camera], self.rest_m2[camera]
+        table = self.tables[camera]
         near, right, above, far = table[i, j], table[i + 1, j], table[i, j + 1], table[i + 1, j + 1]
         sensitivities = np.empty((count, 4, self.count))
         sensitivities[:, :3] = (near * (1 - s) + right * s) * (1 - t) + (above * (1 - s) + far * s) * t
         by_x = (right - near) * (1 - t) + (far - above) * t
         by_y = (above - near) * (1 - s) + (far - right) * s
         sensitivities[:, 3] = _turns(by_x, by_y, headings_rad) / self.grid.spacing_m
-        lower = rest[i, j] * (1 - s) + rest[i + 1, j] * s
-        upper = rest[i, j + 1] * (1 - s) + rest[i + 1, j + 1] * s
-        return sensitivities, lower * (1 - t) + upper * t
+        return sensitivities
 
     def clock_of(self, camera: str) -> Array:
         """Return the error (m,) of a camera's clock by the amplitudes, in s."""
@@ -131,30 +134,43 @@ def _turns(by_x: Array, by_y: Array, headings_rad: Array) -> Array:
 def reduce_modes(grid: Grid, cameras: Mapping[str, NodeModes], count: int) -> BiasModes:
     """Return the tables with the ``count`` strongest combinations of the amplitudes of all cameras.
 
-    The variance of the others is in ``rest_m2``, so that the total variance of a position is kept.
+    The other combinations become local errors, so that the variance of each position is kept.
     """
-    rows = [_rows(node) for node in cameras.values()]
-    if not rows:
+    if not cameras:
         return BiasModes.none()
-    together = np.concatenate(rows)
+    together = np.concatenate([_rows(node) for node in cameras.values()])
     # The right singular vectors, from the small matrix of all amplitudes: ascending order.
     _, axes = np.linalg.eigh(together.T @ together)
     kept, others = axes[:, ::-1][:, :count], axes[:, ::-1][:, count:]
-    tables, rest_m2 = {}, {}
-    for name, node in cameras.items():
-        left = node.modes_m @ others
-        tables[name] = _fill(grid, node.modes_m @ kept)
-        rest_m2[name] = _fill(grid, node.rest_m2 + left @ left.swapaxes(1, 2))
-    clock_s = {name: node.clock_s @ kept for name, node in cameras.items()}
-    return BiasModes(grid, tables, rest_m2, clock_s, kept.shape[1])
+    size = kept.shape[1]
+    total, tables, clock_s = size + 3 * len(cameras), {}, {}
+    for number, (name, node) in enumerate(cameras.items()):
+        left, modes_m = node.modes_m @ others, np.zeros((len(node.modes_m), 3, total))
+        modes_m[:, :, :size] = node.modes_m @ kept
+        own = size + 3 * number
+        modes_m[:, :, own : own + 3] = _roots(node.rest_m2 + left @ left.swapaxes(1, 2))
+        tables[name] = _fill(grid, modes_m)
+        clock_s[name] = np.append(node.clock_s @ kept, np.zeros(total - size))
+    fade_m = np.where(np.arange(total) < size, np.inf, LOCAL_M)
+    return BiasModes(grid, tables, clock_s, fade_m)
 
 
 def _rows(node: NodeModes) -> Array:
-    """Return the errors of all nodes as rows (r, M), each camera with the same weight."""
+    """Return the errors of all nodes as rows (r, M). All nodes have the same weight, and all cameras."""
     seen = np.isfinite(node.modes_m).all(axis=(1, 2))
-    flat = node.modes_m[seen].reshape(-1, node.modes_m.shape[2])
-    rows: Array = np.concatenate([flat / np.sqrt(max(seen.sum(), 1)), _CLOCK_M_S * node.clock_s[None]])
-    return rows
+    modes_m = node.modes_m[seen]
+    sizes_m = np.sqrt((modes_m**2).sum(axis=(1, 2), keepdims=True))
+    flat = (modes_m / np.maximum(sizes_m, 1e-12)).reshape(-1, modes_m.shape[2])
+    return np.concatenate([flat / np.sqrt(max(seen.sum(), 1)), node.clock_s[None] / _CLOCK_S])
+
+
+def _roots(covariances: Array) -> Array:
+    """Return the symmetric square roots of covariances (n, 3, 3); NaN stays NaN."""
+    seen = np.isfinite(covariances).all(axis=(1, 2))
+    variances, axes = np.linalg.eigh(covariances[seen])
+    roots = np.full_like(covariances, np.nan)
+    roots[seen] = (axes * np.sqrt(np.maximum(variances, 0.0))[:, None]) @ axes.swapaxes(1, 2)
+    return roots
 
 
 def _fill(grid: Grid, values: Array) -> Array:

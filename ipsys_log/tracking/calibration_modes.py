@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 # The number of modes, the distance of the nodes, and their reach beyond the calibration points.
 MODES = 12
-_SPACING_M, _MARGIN_M = 0.2, 1.0
+_SPACING_M, _MARGIN_M = 0.2, 0.5
 _ROBOT_HEIGHT_M, _ROBOT_LENGTH_M = 0.1, 0.2
 # Standard deviation of a corner of detect: a weight of corners without noise.
 _USUAL_PX = 0.012

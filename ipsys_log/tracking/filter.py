@@ -33,15 +33,24 @@ class States:
     covariances : (k, 10, 10), of all errors, those of the calibration included.
     cross : (k, 10, m), errors (estimate minus truth) by the amplitudes of the calibration. The covariance of
         two states by their calibration is the product of their rows.
+    fade_m : (m,), distance after which a robot meets other amplitudes, see
+        :class:`ipsys_log.tracking.bias_modes.BiasModes`. None if all are constant.
     """
 
     means: Array
     covariances: Array
     cross: Array
+    fade_m: Array | None = None
 
     def take(self, rows: NDArray[np.intp]) -> States:
         """Return the states of some robots."""
-        return States(self.means[rows], self.covariances[rows], self.cross[rows])
+        return States(self.means[rows], self.covariances[rows], self.cross[rows], self.fade_m)
+
+    def replace(self, rows: NDArray[np.intp], states: States) -> States:
+        """Return the states with those of some robots replaced."""
+        means, covariances, cross = self.means.copy(), self.covariances.copy(), self.cross.copy()
+        means[rows], covariances[rows], cross[rows] = states.means, states.covariances, states.cross
+        return States(means, covariances, cross, self.fade_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,23 +86,26 @@ class Innovations:
     covariances : (k, 4, 4), of the differences.
     modes : (k, 4, m), sensitivities of the sightings with the errors of their times.
     across : (k, 10, 4), minus the covariance of the errors of the states and the differences.
-    chi2 : (k,), squared differences in units of their covariances.
     """
 
     differences: Array
     covariances: Array
     modes: Array
     across: Array
-    chi2: Array
+
+    def chi2(self, more: Array | None = None) -> Array:
+        """Return the squared differences (k,) in units of their covariances, to which ``more`` is added."""
+        covariances = self.covariances if more is None else self.covariances + more
+        solved = np.linalg.solve(covariances, self.differences[:, :, None])
+        return np.asarray((self.differences[:, None] @ solved)[:, 0, 0])
 
 
-def start(sightings: Sightings, noise: MotionNoise) -> States:
-    """Return the states of new tracks, after their first sightings."""
+def start(sightings: Sightings, noise: MotionNoise, fade_m: Array | None = None) -> States:
+    """Return the states of new tracks, after their first sightings; ``fade_m`` as in :class:`States`."""
     count, modes = len(sightings.poses), sightings.sensitivities
     means, covariances = np.zeros((count, MOTION)), np.zeros((count, MOTION, MOTION))
     cross = np.zeros((count, MOTION, modes.shape[2]))
-    # A sighting is the pose plus the errors of the calibration, so that the pose has minus these errors.
-    means[:, POSE], cross[:, POSE] = sightings.poses, -modes
+    means[:, POSE], cross[:, POSE] = sightings.poses, modes
     covariances[:, POSE, POSE] = sightings.noise + modes @ modes.swapaxes(1, 2)
     unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
     covariances[unknown, 3, 3] = _START_HEADING_RAD2
@@ -104,7 +116,7 @@ def start(sightings: Sightings, noise: MotionNoise) -> States:
     )
     rates = np.arange(RATES.start, ACCELERATION.stop)
     covariances[:, rates, rates] = np.square(sigmas)
-    return States(means, covariances, cross)
+    return States(means, covariances, cross, fade_m)
 
 
 def predict(states: States, durations_s: Array, noise: MotionNoise) -> States:
@@ -113,7 +125,10 @@ def predict(states: States, durations_s: Array, noise: MotionNoise) -> States:
     forward, spread = transition(durations_s, speeds_m_s, noise)
     means = (forward @ states.means[:, :, None])[:, :, 0]
     covariances = forward @ states.covariances @ forward.swapaxes(1, 2) + spread
-    return States(means, covariances, forward @ states.cross)
+    cross = forward @ states.cross
+    if states.fade_m is not None:
+        cross *= np.exp(-(speeds_m_s * durations_s)[:, None, None] / states.fade_m)
+    return States(means, covariances, cross, states.fade_m)
 
 
 def compare(states: States, sightings: Sightings) -> Innovations:
@@ -127,9 +142,7 @@ def compare(states: States, sightings: Sightings) -> Innovations:
     # Errors are estimate minus truth. The difference is modes b + noise - error, so a common error cancels.
     across = states.covariances[:, :, POSE] - states.cross @ turned
     covariances = across[:, POSE] + modes @ (turned - states.cross[:, POSE].swapaxes(1, 2)) + sightings.noise
-    solved = np.linalg.solve(covariances, differences[:, :, None])
-    chi2 = (differences[:, None] @ solved)[:, 0, 0]
-    return Innovations(differences, covariances, modes, across, chi2)
+    return Innovations(differences, covariances, modes, across)
 
 
 def update(states: States, sightings: Sightings, innovations: Innovations) -> States:
@@ -155,4 +168,4 @@ def update(states: States, sightings: Sightings, innovations: Innovations) -> St
     cross = states.cross - gains @ (states.cross[:, POSE] - modes)
     observed = left[:, :, POSE] - cross @ modes.swapaxes(1, 2)
     covariances = left + (gains @ sightings.noise - observed) @ gains.swapaxes(1, 2)
-    return States(means, (covariances + covariances.swapaxes(1, 2)) / 2, cross)
+    return States(means, (covariances + covariances.swapaxes(1, 2)) / 2, cross, states.fade_m)

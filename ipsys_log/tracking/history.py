@@ -13,6 +13,8 @@ __all__ = ["HISTORY_NS", "History", "Record"]
 
 # A sighting that is older than the newest one by more than this is left out.
 HISTORY_NS = NS_PER_S // 2
+# More instants than this are checked for those that no late sighting can reach.
+_MOST_ROWS = 256
 
 
 class Record(NamedTuple):
@@ -66,8 +68,8 @@ class History:
         kept = 0
         while kept + 1 < len(self.records) and self.records[kept + 1].time_ns <= oldest_ns:
             kept += 1
-        if kept:
-            del self.records[:kept]
+        del self.records[:kept]
+        if len(self.rows_ns) > _MOST_ROWS:
             self.rows_ns = {time_ns for time_ns in self.rows_ns if time_ns >= oldest_ns}
 
     def recent(self, time_ns: int, window_ns: int) -> list[Record]:

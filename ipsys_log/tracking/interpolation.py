@@ -117,7 +117,7 @@ def _between(
     speeds_m_s = np.linalg.norm((ends_m[1] - ends_m[0])[:, :2], axis=1) / np.where(whole_s > 0, whole_s, 1.0)
     on_floor_m2, up_m2 = (weights.unknown_motion(columns, speeds_m_s, noise) for columns in (_ON_FLOOR, _UP))
     unknown_m2 = np.stack([on_floor_m2, on_floor_m2, up_m2], axis=1)
-    turning = np.isfinite(rows.turn_rates_rad_s[before] + rows.turn_rates_rad_s[after])
+    turning = np.isfinite(_rates(rows, before, after)).all(axis=0)
     turns = _Weights.of(elapsed_s, whole_s, turning)
     headings_rad, turn_rates_rad_s = turns.mix(
         _unwrap(rows, before, after, whole_s), _rates(rows, before, after)
@@ -194,7 +194,7 @@ class _Weights:
 
         The rows are exact. The acceleration of the first row, if it is a column, has its usual deviation.
         """
-        own = np.ix_(np.arange(len(speeds_m_s)), columns, columns)
+        own = np.ix_(np.arange(len(speeds_m_s)), np.array(columns), np.array(columns))
         rest_s = np.maximum(self.whole_s - self.elapsed_s, 0.0)
         forward, spread = (one[own] for one in transition(self.elapsed_s, speeds_m_s, noise))
         onward, more = (one[own] for one in transition(rest_s, speeds_m_s, noise))
@@ -207,7 +207,8 @@ class _Weights:
         later = np.stack([self.values[1], self.rates[1]], axis=1)
         shared = (cross[:, 0, :2] * later).sum(axis=1)
         known = (later[:, None] @ end[:, :2, :2] @ later[:, :, None])[:, 0, 0]
-        return np.maximum(spread[:, 0, 0] - 2 * shared + known, 0.0)
+        variances: Array = np.maximum(spread[:, 0, 0] - 2 * shared + known, 0.0)
+        return variances
 
 
 def _sum(weights: Array, values: Array) -> Array:

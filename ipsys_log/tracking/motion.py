@@ -25,16 +25,16 @@ class MotionNoise:
 
     Attributes
     ----------
-    acceleration_m_s2, bend_rad_s, hold_s : standard deviation of the acceleration along each axis of the floor
-        of a robot that stands; its growth with the speed, because the acceleration in a bend is the product
-        of speed and turn rate; its correlation time.
+    acceleration_m_s2, bend_rad_s, hold_s : standard deviation of the acceleration along each axis of the
+        floor, for a robot that stands; its growth with the speed, because the acceleration in a bend is the
+        product of speed and turn rate; its correlation time.
     turn_rad_s2, climb_m_s2 : changes of the turn rate and of the vertical speed: square root of the density
         of white noise, as their standard deviation after one second.
     start_m_s, start_climb_m_s, start_rad_s, start_acceleration_m_s2 : standard deviations of a new track: of
         the velocity on the floor, the vertical speed, the turn rate, and the acceleration.
     """
 
-    acceleration_m_s2: float = 0.5
+    acceleration_m_s2: float = 0.3
     bend_rad_s: float = 1.5
     hold_s: float = 0.4
     turn_rad_s2: float = 2.0
@@ -65,26 +65,34 @@ def transition(durations_s: Array, speeds_m_s: Array, noise: MotionNoise) -> tup
     ----------
     Singer, IEEE Trans. AES 1970.
     """
-    count = len(durations_s)
-    forward, spread = np.zeros((count, MOTION, MOTION)), np.zeros((count, MOTION, MOTION))
+    # The robots of one message mostly have the same duration.
+    durations_s, places = np.unique(durations_s, return_inverse=True)
+    forward, other, by_acceleration = _steps(durations_s, noise)
+    variances = noise.acceleration_m_s2**2 + (noise.bend_rad_s * speeds_m_s) ** 2
+    return forward[places], other[places] + variances[:, None, None] * by_acceleration[places]
+
+
+def _steps(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array, Array]:
+    """Return transitions, and covariances: of turn rate and climb, and of an acceleration of 1 m/s^2.
+
+    All are (k, 10, 10).
+    """
+    forward, other, by_acceleration = np.zeros((3, len(durations_s), MOTION, MOTION))
     diagonal = np.arange(8)
     forward[:, diagonal, diagonal] = 1.0
     forward[:, diagonal[:4], diagonal[4:]] = durations_s[:, None]
     by_position, by_velocity, rest = _of_acceleration(durations_s, noise.hold_s)
+    unit = _acceleration_noise(durations_s, noise.hold_s)
     for axis in (0, 1):
         own = 8 + axis
-        forward[:, axis, own], forward[:, 4 + axis, own], forward[:, own, own] = (
-            by_position,
-            by_velocity,
-            rest,
-        )
-        columns = np.array([axis, 4 + axis, own])
-        spread[:, columns[:, None], columns] = _acceleration_noise(durations_s, speeds_m_s, noise)
+        forward[:, axis, own], forward[:, 4 + axis, own] = by_position, by_velocity
+        forward[:, own, own] = rest
+        by_acceleration[:, axis : own + 1 : 4, axis : own + 1 : 4] = unit
     for axis, density in ((2, noise.climb_m_s2**2), (3, noise.turn_rad_s2**2)):
-        spread[:, axis, axis] = density * durations_s**3 / 3
-        spread[:, axis, 4 + axis] = spread[:, 4 + axis, axis] = density * durations_s**2 / 2
-        spread[:, 4 + axis, 4 + axis] = density * durations_s
-    return forward, spread
+        other[:, axis, axis] = density * durations_s**3 / 3
+        other[:, axis, 4 + axis] = other[:, 4 + axis, axis] = density * durations_s**2 / 2
+        other[:, 4 + axis, 4 + axis] = density * durations_s
+    return forward, other, by_acceleration
 
 
 def _of_acceleration(durations_s: Array, hold_s: float) -> tuple[Array, Array, Array]:
@@ -94,10 +102,9 @@ def _of_acceleration(durations_s: Array, hold_s: float) -> tuple[Array, Array, A
     return hold_s**2 * (share - lost), hold_s * lost, 1.0 - lost
 
 
-def _acceleration_noise(durations_s: Array, speeds_m_s: Array, noise: MotionNoise) -> Array:
-    """Return the covariance (k, 3, 3) of position, velocity and acceleration by the noise of the latter."""
-    effects = np.stack(_of_acceleration(durations_s[:, None] * _NODES, noise.hold_s), axis=1)
-    variances = noise.acceleration_m_s2**2 + (noise.bend_rad_s * speeds_m_s) ** 2
-    weights = (2 / noise.hold_s * variances * durations_s)[:, None] * _WEIGHTS
+def _acceleration_noise(durations_s: Array, hold_s: float) -> Array:
+    """Return the covariances (k, 3, 3) of position, velocity and an acceleration of 1 m/s^2."""
+    effects = np.stack(_of_acceleration(durations_s[:, None] * _NODES, hold_s), axis=1)
+    weights = (2 / hold_s * durations_s)[:, None] * _WEIGHTS
     covariance: Array = (effects * weights[:, None]) @ effects.swapaxes(1, 2)
     return covariance

@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import Position
-from ipsys_log.tracking.bias_modes import BiasModes
+from ipsys_log.messages import Model, Position, Rig
+from ipsys_log.tracking.frame_reader import FrameReader
 from ipsys_log.tracking.history import History
-from ipsys_log.tracking.position_sightings import read_sightings
-from ipsys_log.tracking.smoother import smooth
+from ipsys_log.tracking.smoother import smooth_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings, gather_sightings
 from ipsys_log.units import NS_PER_S
 
@@ -20,13 +19,12 @@ __all__ = ["Frame", "SmoothedPose", "smooth_positions"]
 
 
 class Frame(NamedTuple):
-    """The positions of one frame, with the robot of each position."""
+    """The positions of one frame of a camera."""
 
     time_ns: int
     camera: str
     log_time_ns: int
     positions: Sequence[Position]
-    robots: Sequence[Hashable]
 
 
 class SmoothedPose(NamedTuple):
@@ -36,8 +34,12 @@ class SmoothedPose(NamedTuple):
     pose: Pose
 
 
+# By the identity of the sightings of a frame: its log time, and flags of known covariances.
+_Sources = dict[int, tuple[int, Sequence[bool]]]
+
+
 def smooth_positions(
-    frames: Sequence[Frame], modes: BiasModes, settings: TrackSettings | None = None
+    frames: Sequence[Frame], rig: Rig, model: Model | None, settings: TrackSettings | None = None
 ) -> list[SmoothedPose]:
     """Return the smoothed poses of all robots, one for each instant of a sighting, in order of time.
 
@@ -47,50 +49,45 @@ def smooth_positions(
     Parameters
     ----------
     frames : of all cameras, in any order.
-    modes : the errors of the calibration.
-    settings : limits of the tracks.
+    rig : the markers of the robots.
+    model : the model of the positions; None for positions of another program.
+    settings : the limits of tracks.
     """
-    limits = settings or TrackSettings()
-    tracks = RobotTracks(limits, complete=True)
-    # The sightings of a frame are one object: by its identity, the records find their frames again.
-    sources: dict[int, _Source] = {}
-    for frame in sorted((one for one in frames if one.positions), key=lambda one: (one.time_ns, one.camera)):
-        sightings, rest_m2 = read_sightings(frame.camera, frame.positions, modes)
-        known = [position.covariance_m2 is not None for position in frame.positions]
-        sources[id(sightings)] = _Source(frame.log_time_ns, rest_m2, known)
-        times_ns = [frame.time_ns + (position.time_offset_ns or 0) for position in frame.positions]
-        inside = [position.inside for position in frame.positions]
-        tracks.observe(frame.camera, frame.robots, times_ns, sightings, rest_m2, inside, known)
+    limits, reader = settings or TrackSettings(), FrameReader(model)
+    reader.use_rig(rig)
+    tracks, sources = RobotTracks(limits, reader.modes.fade_m, complete=True), _Sources()
+    for frame in sorted(frames, key=lambda one: (one.time_ns, one.camera, one.log_time_ns)):
+        seen = reader.read(frame.camera, frame.time_ns, frame.positions)
+        if seen is not None:
+            sources[id(seen.sightings)] = frame.log_time_ns, seen.has_covariance
+            tracks.observe(
+                seen.camera, seen.robots, seen.times_ns, seen.sightings, seen.inside, seen.has_covariance
+            )
     poses = [
         pose
         for robot, history in tracks.histories()
-        for pose in _smooth_track(robot, history, sources, limits)
+        for pose in _smooth_track(robot, history, sources, limits, reader.modes.fade_m)
     ]
     return sorted(poses, key=lambda one: (one.pose.time_ns, str(one.pose.robot)))
 
 
-class _Source(NamedTuple):
-    """What a track needs of a frame beside its sightings."""
-
-    log_time_ns: int
-    rest_m2: NDArray[np.float64]
-    has_covariance: Sequence[bool]
-
-
 def _smooth_track(
-    robot: Hashable, history: History, sources: dict[int, _Source], settings: TrackSettings
+    robot: Hashable,
+    history: History,
+    sources: _Sources,
+    settings: TrackSettings,
+    fade_m: NDArray[np.float64],
 ) -> Iterator[SmoothedPose]:
     records = history.records
     times_ns = [record.time_ns for record in records]
-    states = smooth(gather_sightings(records), np.diff(times_ns) / NS_PER_S, settings.motion)
+    durations_s = np.diff(times_ns) / NS_PER_S
+    states = smooth_track(gather_sightings(records), durations_s, settings.motion, fade_m)
     for row, record in enumerate(records):
         # Sightings of one instant have equal states: the last one has the pose.
         if row + 1 == len(records) or times_ns[row + 1] > times_ns[row]:
-            source, recent = (
-                sources[id(record.sightings)],
-                history.recent(record.time_ns, settings.window_ns),
-            )
+            recent = history.recent(record.time_ns, settings.window_ns)
             flags = [one.inside for one in recent if one.inside is not None]
+            log_time_ns, known = sources[id(record.sightings)]
             pose = Pose(
                 robot,
                 record.time_ns,
@@ -98,8 +95,7 @@ def _smooth_track(
                 row,
                 tuple(sorted({one.camera for one in recent})),
                 any(flags) if flags else None,
-                source.rest_m2[record.sighting],
-                source.has_covariance[record.sighting],
+                known[record.sighting],
                 age_ns=record.time_ns - times_ns[0],
             )
-            yield SmoothedPose(source.log_time_ns, pose)
+            yield SmoothedPose(log_time_ns, pose)

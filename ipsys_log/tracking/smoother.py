@@ -1,9 +1,9 @@
 """Smoothing of a whole track: the motion at each instant, by the sightings before and after it.
 
 The state is the motion (:mod:`ipsys_log.tracking.motion`) and the m amplitudes of the calibration
-(:mod:`ipsys_log.tracking.bias_modes`). The amplitudes are constant over the track. The sightings determine
-their differences between cameras and places, and leave the error that all sightings share. A filter that
-only considers the amplitudes has no optimal smoother, so this one estimates them.
+(:mod:`ipsys_log.tracking.bias_modes`), which are constant or fade with the way. The sightings determine their
+differences between cameras and places, and leave the error that all sightings share. A filter that only
+considers the amplitudes has no optimal smoother, so this one estimates them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings, States, start
 from ipsys_log.tracking.motion import MOTION, POSE, RATES, MotionNoise, transition
 
-__all__ = ["smooth"]
+__all__ = ["smooth_track"]
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,9 @@ _HEADING = 3
 _SPEED_S = 0.1
 
 
-def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> States:
+def smooth_track(
+    sightings: Sightings, durations_s: Array, noise: MotionNoise, fade_m: Array | None = None
+) -> States:
     """Return the motion of one robot by all sightings of its track.
 
     Parameters
@@ -31,6 +33,7 @@ def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> Stat
     sightings : n of one robot, in order of time.
     durations_s : (n - 1,), times between the sightings, at least 0.
     noise : the usual motion.
+    fade_m : (m,), of the amplitudes, see :class:`~ipsys_log.tracking.filter.States`.
 
     Returns
     -------
@@ -41,18 +44,16 @@ def smooth(sightings: Sightings, durations_s: Array, noise: MotionNoise) -> Stat
     Rauch, Tung and Striebel, AIAA Journal 1965. Covariances are sums of squares, as in the form of Joseph.
     """
     speeds_m_s = _speeds(sightings.poses[:, :2], durations_s)
-    forward, spread = transition(durations_s, speeds_m_s, noise)
+    forward, spread = _transition(durations_s, speeds_m_s, noise, fade_m, sightings.sensitivities.shape[2])
     means, covariances = _filter(sightings, forward, spread, noise)
     gains, rest = _gains(covariances[:-1], forward, spread)
     for n in range(len(durations_s) - 1, -1, -1):
-        ahead = means[n].copy()
-        ahead[:MOTION] = forward[n] @ means[n, :MOTION]
-        change = means[n + 1] - ahead
+        change = means[n + 1] - forward[n] @ means[n]
         change[_HEADING] = _wrap(change[_HEADING])
         means[n] += gains[n] @ change
         covariances[n] = rest[n] + gains[n] @ covariances[n + 1] @ gains[n].T
     covariances = (covariances + covariances.swapaxes(1, 2)) / 2
-    return States(means[:, :MOTION], covariances[:, :MOTION, :MOTION], covariances[:, :MOTION, MOTION:])
+    return States(means[:, :MOTION], covariances[:, :MOTION, :MOTION], -covariances[:, :MOTION, MOTION:])
 
 
 def _speeds(points_m: Array, durations_s: Array) -> Array:
@@ -71,15 +72,13 @@ def _filter(sightings: Sightings, forward: Array, spread: Array, noise: MotionNo
     count, m = len(sightings.poses), sightings.sensitivities.shape[2]
     means, covariances = np.zeros((count, MOTION + m)), np.zeros((count, MOTION + m, MOTION + m))
     means[0, :MOTION], covariances[0, :MOTION, :MOTION] = first.means[0], first.covariances[0]
-    covariances[0, :MOTION, MOTION:] = first.cross[0]
-    covariances[0, MOTION:, :MOTION] = first.cross[0].T
+    # The errors of the filter are estimates minus truths.
+    covariances[0, :MOTION, MOTION:] = -first.cross[0]
+    covariances[0, MOTION:, :MOTION] = -first.cross[0].T
     covariances[0, MOTION:, MOTION:] = np.eye(m)
     for n in range(1, count):
-        mean, covariance = means[n - 1].copy(), covariances[n - 1].copy()
-        mean[:MOTION] = forward[n - 1] @ mean[:MOTION]
-        covariance[:MOTION] = forward[n - 1] @ covariance[:MOTION]
-        covariance[:, :MOTION] = covariance[:, :MOTION] @ forward[n - 1].T
-        covariance[:MOTION, :MOTION] += spread[n - 1]
+        mean = forward[n - 1] @ means[n - 1]
+        covariance = forward[n - 1] @ covariances[n - 1] @ forward[n - 1].T + spread[n - 1]
         means[n], covariances[n] = _update(mean, covariance, sightings, n)
     return means, covariances
 
@@ -99,23 +98,33 @@ def _update(mean: Array, covariance: Array, sightings: Sightings, n: int) -> tup
     return mean + gain @ difference, (after + after.T) / 2
 
 
+def _transition(
+    durations_s: Array, speeds_m_s: Array, noise: MotionNoise, fade_m: Array | None, count: int
+) -> tuple[Array, Array]:
+    """Return the transitions (k, s, s) of motion and amplitudes, and the covariances of their noise."""
+    forward = np.broadcast_to(
+        np.eye(MOTION + count), (len(durations_s), MOTION + count, MOTION + count)
+    ).copy()
+    spread = np.zeros_like(forward)
+    own = slice(0, MOTION)
+    forward[:, own, own], spread[:, own, own] = transition(durations_s, speeds_m_s, noise)
+    if fade_m is not None:
+        kept = np.exp(-(speeds_m_s * durations_s)[:, None] / fade_m)
+        amplitudes = np.arange(MOTION, MOTION + count)
+        forward[:, amplitudes, amplitudes], spread[:, amplitudes, amplitudes] = kept, 1 - kept**2
+    return forward, spread
+
+
 def _gains(covariances: Array, forward: Array, spread: Array) -> tuple[Array, Array]:
     """Return the gains (k, s, s) of states by the next ones, and their covariances if the next are known."""
-    cross = covariances.copy()
-    cross[:, :, :MOTION] = covariances[:, :, :MOTION] @ forward.swapaxes(1, 2)
-    ahead = cross.copy()
-    ahead[:, :MOTION] = forward @ cross[:, :MOTION]
-    ahead[:, :MOTION, :MOTION] += spread
+    cross = covariances @ forward.swapaxes(1, 2)
+    ahead = forward @ cross + spread
     # Units differ by many orders of magnitude: with a diagonal of 1, the inverse loses no digits.
     units = np.sqrt(np.diagonal(ahead, axis1=1, axis2=2))
     scaled = ahead / units[:, :, None] / units[:, None]
     gains = np.linalg.solve(scaled, (cross / units[:, None]).swapaxes(1, 2)).swapaxes(1, 2) / units[:, None]
-    own = gains[:, :, :MOTION]
-    kept = np.eye(gains.shape[1]) - gains
-    kept[:, :, :MOTION] = -own @ forward
-    diagonal = np.arange(MOTION)
-    kept[:, diagonal, diagonal] += 1.0
-    rest = kept @ covariances @ kept.swapaxes(1, 2) + own @ spread @ own.swapaxes(1, 2)
+    kept = np.eye(gains.shape[1]) - gains @ forward
+    rest = kept @ covariances @ kept.swapaxes(1, 2) + gains @ spread @ gains.swapaxes(1, 2)
     return gains, rest
 
 

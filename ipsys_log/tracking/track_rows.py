@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
+from math import pi, sqrt
 
 from ipsys_log.messages import Track
 from ipsys_log.tracking.tracks import Pose
@@ -16,25 +16,26 @@ _UNKNOWN_HEADING_RAD = 2.0
 def make_track(pose: Pose) -> Track:
     """Return the row of a pose; its robot is a pair of the name and the marker id."""
     mean, covariance = pose.states.means[pose.state], pose.states.covariances[pose.state]
+    assert isinstance(pose.robot, tuple)
     robot, marker_id = pose.robot
     x_m, y_m, z_m, heading_rad, _, _, _, turn_rate, _, _ = mean.tolist()
-    sigmas = np.sqrt(covariance.diagonal()).tolist()
-    has_heading = sigmas[3] < _UNKNOWN_HEADING_RAD
+    heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance[3, 3]), sqrt(covariance[7, 7])
+    has_heading = heading_sigma_rad < _UNKNOWN_HEADING_RAD
     return Track(
         robot,
         marker_id,
         x_m,
         y_m,
         z_m,
-        (heading_rad + np.pi) % (2 * np.pi) - np.pi if has_heading else None,
-        covariance[:3, :3] + pose.rest_m2 if pose.has_covariance else None,
+        (heading_rad + pi) % (2 * pi) - pi if has_heading else None,
+        covariance[:3, :3] if pose.has_covariance else None,
         pose.cameras,
         pose.inside,
         mean[4:7],
         covariance[4:7, 4:7] if pose.has_covariance else None,
-        sigmas[3] if has_heading and pose.has_covariance else None,
+        heading_sigma_rad if has_heading and pose.has_covariance else None,
         turn_rate if has_heading else None,
-        sigmas[7] if has_heading and pose.has_covariance else None,
+        turn_sigma_rad_s if has_heading and pose.has_covariance else None,
         pose.coasting_ns,
         pose.age_ns,
     )

@@ -31,7 +31,7 @@ class TrackSettings:
         exceeded by chance once in 200,000 sightings.
     slack_m, slack_rad : errors that the covariances do not contain; they widen the gate.
     restart : a track starts again after this number of consecutive sightings that contradict it and agree
-        with one another.
+        with one another, or are too late.
     gap_ns : a robot that is unseen for longer is coasting.
     coast_ns : a track ends when its robot is unseen for longer.
     window_ns : the cameras of a pose are those of the sightings in this time.
@@ -51,8 +51,7 @@ class TrackSettings:
 class Pose:
     """The pose of one robot at one instant: a row of ``states``.
 
-    The covariance of its position is that of the state plus ``rest_m2`` (3, 3). It means nothing without
-    ``has_covariance``: a position of the track has none.
+    Its covariance means nothing without ``has_covariance``: the position has none.
 
     ``cameras`` are those of the recent sightings, ``newest`` the last sighting; ``coasting_ns`` is the time
     since then if the robot is unseen, otherwise None.
@@ -64,7 +63,6 @@ class Pose:
     state: int
     cameras: tuple[str, ...]
     inside: bool | None
-    rest_m2: Array
     has_covariance: bool
     coasting_ns: int | None = None
     age_ns: int | None = None
@@ -72,13 +70,16 @@ class Pose:
 
 @dataclass(slots=True)
 class _Track:
-    """A track, and the sightings that contradict it: a rival track of the same robot."""
+    """A track, and the sightings that contradict it: a rival track of the same robot.
+
+    ``hits`` is the number of consecutive sightings of the rival, ``late`` that of those that are too late.
+    """
 
     history: History
-    rest_m2: Array
     has_covariance: bool = True
     rival: History | None = None
     hits: int = 0
+    late: int = 0
 
 
 @dataclass(slots=True)
@@ -87,7 +88,6 @@ class _Batch:
 
     camera: str
     sightings: Sightings
-    rest_m2: Array
     times_ns: Sequence[int]
     inside: Sequence[bool | None]
     has_covariance: Sequence[bool]
@@ -105,12 +105,15 @@ class RobotTracks:
 
     Parameters
     ----------
-    settings : limits of the tracks.
+    settings : the limits of tracks.
+    fade_m : (m,), of the amplitudes of the calibration, see :class:`~ipsys_log.tracking.filter.States`.
     complete : keep all sightings of all tracks, for their smoothing.
     """
 
-    def __init__(self, settings: TrackSettings | None = None, complete: bool = False) -> None:
-        self._settings = settings or TrackSettings()
+    def __init__(
+        self, settings: TrackSettings | None = None, fade_m: Array | None = None, complete: bool = False
+    ) -> None:
+        self._settings, self._fade_m = settings or TrackSettings(), fade_m
         self._complete = complete
         self._tracks: dict[Hashable, _Track] = {}
         self._ended: list[tuple[Hashable, History]] = []
@@ -125,7 +128,6 @@ class RobotTracks:
         robots: Sequence[Hashable],
         times_ns: Sequence[int],
         sightings: Sightings,
-        rest_m2: Array,
         inside: Sequence[bool | None],
         has_covariance: Sequence[bool],
     ) -> list[Pose]:
@@ -137,7 +139,6 @@ class RobotTracks:
         robots : (k,), one sighting of each robot.
         times_ns : (k,), capture times.
         sightings : (k,).
-        rest_m2 : (k, 3, 3), covariances of errors that are neither noise nor modes of the calibration.
         inside : (k,), flags of the positions.
         has_covariance : (k,), False for a position whose covariance is unknown.
 
@@ -145,7 +146,7 @@ class RobotTracks:
         -------
         The poses at the instants of the sightings. An instant of a robot that already has a pose gets none.
         """
-        batch = _Batch(camera, sightings, rest_m2, times_ns, inside, has_covariance)
+        batch = _Batch(camera, sightings, times_ns, inside, has_covariance)
         # A frame can show the same marker twice: one sighting of each robot after the other.
         poses, waiting = [], list(range(len(robots)))
         while waiting:
@@ -179,7 +180,6 @@ class RobotTracks:
                 row,
                 (),
                 track.history.newest.inside,
-                track.rest_m2,
                 track.has_covariance,
                 age_ns,
                 time_ns - track.history.began_ns,
@@ -191,12 +191,11 @@ class RobotTracks:
         rows, tracks, places = [], [], []
         for row in all_rows:
             time_ns = batch.times_ns[row]
-            track = self._track_of(robots[row], batch, row)
-            records = track.history.records
-            if not records or time_ns >= records[-1].time_ns - HISTORY_NS:
+            track = self._track_of(robots[row], time_ns)
+            if track is not None:
                 rows.append(row)
                 tracks.append(track)
-                places.append(track.history.place_of(time_ns) if records else 0)
+                places.append(track.history.place_of(time_ns) if track.history.records else 0)
         if not rows:
             return []
         accepted = self._filter(batch, robots, np.array(rows), tracks, places)
@@ -206,15 +205,21 @@ class RobotTracks:
             if is_accepted and (pose := self._pose(robots[row], track, batch, row))
         ]
 
-    def _track_of(self, robot: Hashable, batch: _Batch, row: int) -> _Track:
+    def _track_of(self, robot: Hashable, time_ns: int) -> _Track | None:
+        """Return the track for a sighting, a new one if there is none; None for a sighting that is too late.
+
+        After a sighting with a time in the future, all others are too late: then the track starts again.
+        """
         track = self._tracks.get(robot)
-        ended = track is not None and (
-            batch.times_ns[row] - track.history.newest.time_ns > self._settings.coast_ns
-        )
-        if track is not None and ended:
+        if track is not None and time_ns < track.history.newest.time_ns - HISTORY_NS:
+            track.late += 1
+            if track.late < self._settings.restart:
+                return None
+        elif track is not None and time_ns - track.history.newest.time_ns <= self._settings.coast_ns:
+            return track
+        if track is not None:
             self._end(robot, track.history)
-        if track is None or ended:
-            track = self._tracks[robot] = _Track(History(complete=self._complete), batch.rest_m2[row])
+        track = self._tracks[robot] = _Track(History(complete=self._complete))
         return track
 
     def _end(self, robot: Hashable, history: History) -> None:
@@ -230,33 +235,41 @@ class RobotTracks:
         places: list[int],
     ) -> NDArray[np.bool_]:
         """Filter the sightings of some rows, and the later ones again; return a mask of the accepted rows."""
-        sightings = batch.sightings.take(rows)
-        states, accepted = start(sightings, self._settings.motion), np.ones(len(rows), dtype=bool)
-        known = np.flatnonzero(places)
-        if len(known):
-            before = [tracks[n].history.records[places[n] - 1] for n in known.tolist()]
-            times_ns = [batch.times_ns[row] for row in rows[known].tolist()]
-            predicted = self._predicted(before, times_ns)
-            seen = sightings.take(known)
-            innovations = compare(predicted, seen)
-            accepted[known] = self._agrees(innovations, batch.rest_m2[rows[known]])
-            after = update(predicted, seen, innovations)
-            states.means[known], states.covariances[known] = after.means, after.covariances
-            states.cross[known] = after.cross
+        states, accepted = self._states_after(batch, rows, tracks, places)
         later = []
         for number, (row, track, place) in enumerate(zip(rows.tolist(), tracks, places, strict=True)):
             record = Record(
                 batch.times_ns[row], batch.camera, batch.inside[row], batch.sightings, row, states, number
             )
             if not accepted[number]:
-                accepted[number] = self._contradict(robots[row], track, record, batch.rest_m2[row])
+                accepted[number] = self._contradict(robots[row], track, record)
                 continue
-            track.rival, track.hits = None, 0
+            track.rival, track.hits, track.late = None, 0, 0
             later.append((track, place, [record, *track.history.records[place:]]))
             if place == len(track.history.records):
-                track.rest_m2, track.has_covariance = batch.rest_m2[row], batch.has_covariance[row]
+                track.has_covariance = batch.has_covariance[row]
         self._filter_again(later)
         return accepted
+
+    def _states_after(
+        self, batch: _Batch, rows: NDArray[np.intp], tracks: list[_Track], places: list[int]
+    ) -> tuple[States, NDArray[np.bool_]]:
+        """Return the states after sightings, and a mask of those within the gate; new tracks have no gate."""
+        known = np.flatnonzero(places)
+        states, accepted = None, np.ones(len(rows), dtype=bool)
+        if len(known) < len(rows):
+            states = start(batch.sightings.take(rows), self._settings.motion, self._fade_m)
+        if len(known):
+            before = [tracks[n].history.records[places[n] - 1] for n in known.tolist()]
+            rows = rows[known]
+            predicted = self._predicted(before, [batch.times_ns[row] for row in rows.tolist()])
+            sightings = batch.sightings.take(rows)
+            innovations = compare(predicted, sightings)
+            accepted[known] = self._agrees(innovations)
+            after = update(predicted, sightings, innovations)
+            states = after if states is None else states.replace(known, after)
+        assert states is not None
+        return states, accepted
 
     def _filter_again(self, changed: list[tuple[_Track, int, list[Record]]]) -> None:
         """Filter the records after the first of each list again, and put the lists into the histories."""
@@ -277,23 +290,20 @@ class RobotTracks:
         durations_s = np.array([t - r.time_ns for t, r in zip(times_ns, before, strict=True)]) / NS_PER_S
         return predict(_gather(before), durations_s, self._settings.motion)
 
-    def _agrees(self, innovations: Innovations, rest_m2: Array) -> NDArray[np.bool_]:
+    def _agrees(self, innovations: Innovations) -> NDArray[np.bool_]:
         """Return a mask (k,) of the sightings within the gate."""
-        settings, wide = self._settings, innovations.covariances.copy()
-        wide[:, :3, :3] += rest_m2 + settings.slack_m**2 * np.eye(3)
-        wide[:, 3, 3] += settings.slack_rad**2
-        solved = np.linalg.solve(wide, innovations.differences[:, :, None])
-        chi2 = (innovations.differences[:, None] @ solved)[:, 0, 0]
-        return np.asarray(chi2 < settings.gate)
+        settings = self._settings
+        slack = np.diag([settings.slack_m**2] * 3 + [settings.slack_rad**2])
+        return np.asarray(innovations.chi2(slack) < settings.gate)
 
-    def _contradict(self, robot: Hashable, track: _Track, record: Record, rest_m2: Array) -> bool:
+    def _contradict(self, robot: Hashable, track: _Track, record: Record) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
         seen, rival = record.sightings.take(_ONE + record.sighting), track.rival
-        states, hits = start(seen, self._settings.motion), 1
+        states, hits = start(seen, self._settings.motion, self._fade_m), 1
         if rival is not None and rival.newest.time_ns <= record.time_ns:
             predicted = self._predicted([rival.newest], [record.time_ns])
             innovations = compare(predicted, seen)
-            if self._agrees(innovations, rest_m2[None])[0]:
+            if self._agrees(innovations)[0]:
                 states, hits = update(predicted, seen, innovations), track.hits + 1
         own = record._replace(states=states, state=0)
         if hits == 1 or rival is None:
@@ -304,7 +314,7 @@ class RobotTracks:
             return False
         self._end(robot, track.history)
         rival.rows_ns = track.history.rows_ns
-        track.history, track.rest_m2, track.rival, track.hits = rival, rest_m2, None, 0
+        track.history, track.rival, track.hits = rival, None, 0
         return True
 
     def _pose(self, robot: Hashable, track: _Track, batch: _Batch, row: int) -> Pose | None:
@@ -322,7 +332,6 @@ class RobotTracks:
             recent[-1].state,
             tuple(sorted({record.camera for record in recent})),
             any(flags) if flags else None,
-            batch.rest_m2[row],
             batch.has_covariance[row],
             age_ns=time_ns - track.history.began_ns,
         )
@@ -334,6 +343,7 @@ def _gather(records: Sequence[Record]) -> States:
         np.array([record.states.means[record.state] for record in records]),
         np.array([record.states.covariances[record.state] for record in records]),
         np.array([record.states.cross[record.state] for record in records]),
+        records[0].states.fade_m,
     )
 
 

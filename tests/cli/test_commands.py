@@ -19,7 +19,7 @@ from tests.conftest import ROOT, Ipsys
 COMMANDS = [
     "init", "simulate", "cameras", "calibrate", "align", "import imsel", "import images", "import videos",
     "record", "live", "measure", "replay", "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
-    "report", "plan", "info", "runs", "repair", "verify", "diff", "latency", "view", "stream",
+    "smooth", "report", "plan", "info", "runs", "repair", "verify", "diff", "latency", "view", "stream",
 ]  # fmt: skip
 
 
@@ -91,7 +91,7 @@ def test_info_says_what_is_in_a_log(ipsys: Ipsys, replayed_lab: Path) -> None:
     assert images["gaps"] > 5
     assert images["longest_gap_s"] == pytest.approx(3.0, abs=0.5)
     assert [run["stage"] for run in found["runs"]] == [
-        "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
+        "detect", "camera-frame", "fit", "evaluate", "locate", "fuse", "smooth",
     ]  # fmt: skip
 
 

@@ -11,7 +11,15 @@ import pytest
 
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RawImage, Tracks, channels
-from ipsys_log.messages.channels import CHANNELS, IMAGES, RUN_EVENTS, TRACKS, TRUTH, channel_of
+from ipsys_log.messages.channels import (
+    CHANNELS,
+    IMAGES,
+    RUN_EVENTS,
+    SMOOTHED_TRACKS,
+    TRACKS,
+    TRUTH,
+    channel_of,
+)
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import graph
 from ipsys_log.runs.graph import STAGES, stages_until
@@ -70,6 +78,7 @@ def test_stage_writes_a_payload_type_to_one_channel() -> None:
     ("topic", "payload", "channel"),
     [
         ("/runs/poly/tracks", Tracks, TRACKS),
+        ("/runs/poly/smoothed_tracks", Tracks, SMOOTHED_TRACKS),
         ("/runs/poly/damped_tracks", Tracks, None),
         ("/truth/tracks", Tracks, TRUTH),
         ("/robot/truth", Tracks, TRUTH),
@@ -89,13 +98,14 @@ def test_stages_until_gives_the_needed_stages() -> None:
     assert names("detect") == ["detect"]
     assert names("locate") == ["detect", "camera-frame", "fit", "locate"]
     assert names("evaluate") == ["detect", "camera-frame", "fit", "evaluate"]
-    # No other stage reads the results of fuse and of evaluate, which comes before it.
-    assert names("fuse") == names(None) == [stage.name for stage in STAGES]
+    # No other stage reads the results of smooth, and of fuse and evaluate, which come before it.
+    assert names("smooth") == names(None) == [stage.name for stage in STAGES]
+    assert names("fuse") == names(None)[:-1]
 
 
 def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, whole: Path, with_damping: None) -> None:
     outcomes = replay([whole], Request())
-    assert [(one.stage, one.run) for one in outcomes[-2:]] == [("fuse", "poly"), ("damp", "poly")]
+    assert [(one.stage, one.run) for one in outcomes[-2:]] == [("smooth", "poly"), ("damp", "poly")]
     with Session([whole]) as session:
         tracks = session.payloads(session.topics(TRACKS, "poly"))
         damped = session.payloads(session.topics(DAMPED_TRACKS, "poly"))

@@ -83,19 +83,19 @@ def at(x_m: float, variance: float | None, heading_rad: float | None = None) -> 
     return Position(3, x_m, 0.0, 0.0, heading_rad, covariance)
 
 
-def fused(*sent: tuple[str, int, Position]) -> list[Any]:
+def fused(*sent: tuple[str, float, Position]) -> list[Any]:
     """Return the payloads of fuse for positions of cameras at times in ms."""
     fuse = Fuse("poly")
     list(fuse(RIG))
     made = []
     for camera, time_ms, position in sent:
-        time_ns = time_ms * 1_000_000
+        time_ns = round(time_ms * 1_000_000)
         made += fuse(Message("t", time_ns, time_ns, Positions(time_ns, (position,)), camera))
     return made
 
 
 def test_track_lies_between_positions_by_their_weights() -> None:
-    made = fused(("red", 0, at(0.0, 1e-6)), ("white", 0, at(0.001, 3e-6)), ("red", 1, at(0.0, 1.0)))
+    made = fused(("red", 0, at(0.0, 1e-6)), ("white", 0, at(0.001, 3e-6)), ("red", 0.001, at(0.0, 1.0)))
     track = made[2].tracks[0]
     assert track.x_m == pytest.approx(0.00025, abs=2e-5)
     assert track.covariance_m2[0, 0] == pytest.approx(0.75e-6, rel=0.1)
@@ -132,6 +132,26 @@ def test_unseen_robot_coasts_at_the_instants_of_other_frames() -> None:
     assert 1.2e9 < coasting[-1][0] < 1.3e9
     assert coasting[-1][1].x_m > 0.15
     assert coasting[-1][1].cameras == ()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Position(3, float("nan"), 0.0, 0.0),
+        Position(3, 1e300, 0.0, 0.0),
+        Position(3, 0.0, 0.0, 0.0, float("inf"), -np.eye(3)),
+        Position(3, 0.0, 0.0, 0.0, 0.1, np.full((3, 3), np.nan), noise_m2=np.full((3, 3), np.inf)),
+        Position(3, 0.0, 0.0, 0.0, 0.1, 1e-6 * np.eye(3), heading_noise_rad=float("nan")),
+    ],
+)
+def test_impossible_numbers_of_a_log_do_not_spread(wrong: Position) -> None:
+    good = at(0.0, 1e-6, 0.1)
+    made = fused(("red", 0, wrong), ("red", 33, good), ("red", 66, wrong), ("red", 99, good))
+    track = made[-2].tracks[0]
+    assert made[-2].timestamp == 99_000_000
+    assert abs(track.x_m) < 1e-3
+    assert track.heading_rad == pytest.approx(0.1, abs=1e-3)
+    assert np.linalg.eigvalsh(track.covariance_m2)[0] > 0
 
 
 def test_no_marker_no_track() -> None:

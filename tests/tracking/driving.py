@@ -71,10 +71,7 @@ def follow(
 
 def observe(tracks: RobotTracks, one: Sighting) -> Iterator[Pose]:
     """Yield the poses that one sighting gives: its own, and those of robots that are not seen."""
-    rest_m2 = np.zeros((1, 3, 3))
-    yield from tracks.observe(
-        one.camera, [one.robot], [one.time_ns], arrays([one.pose]), rest_m2, [True], [True]
-    )
+    yield from tracks.observe(one.camera, [one.robot], [one.time_ns], arrays([one.pose]), [True], [True])
     yield from tracks.coast(one.time_ns)
 
 

@@ -16,7 +16,7 @@ from ipsys_log.joint.payload import joint_payload, restore_joint
 from ipsys_log.messages import Model, Pair, Rig
 from ipsys_log.models.table import AppliedModel
 from ipsys_log.stages.fit import fit_model
-from ipsys_log.tracking.bias_modes import BiasModes, Grid, NodeModes, reduce_modes
+from ipsys_log.tracking.bias_modes import LOCAL_M, BiasModes, Grid, NodeModes, reduce_modes
 from ipsys_log.tracking.calibration_modes import calibration_modes
 from tests.joint.small_lab import LENGTH_M, make_lab
 
@@ -38,7 +38,7 @@ def test_plane_of_sensitivities_is_exact_between_nodes() -> None:
     modes = reduce_modes(GRID, {"red": nodes}, 4)
     points_m = rng.uniform([-1, 0], [1, 1.5], (30, 2))
     headings = rng.uniform(-3, 3, 30)
-    sensitivities, rest_m2 = modes.at("red", points_m, headings)
+    sensitivities = modes.at("red", points_m, headings)
     terms = np.column_stack([np.ones(30), points_m])
     wanted = np.einsum("nt,tam->nam", terms, planes)
     # The amplitudes are turned; covariances do not change.
@@ -48,14 +48,13 @@ def test_plane_of_sensitivities_is_exact_between_nodes() -> None:
     np.testing.assert_allclose(
         sensitivities[0, :3] @ sensitivities[9, :3].T, wanted[0] @ wanted[9].T, atol=1e-9
     )
-    np.testing.assert_allclose(rest_m2, 0.0, atol=1e-12)
 
 
 def test_turn_of_the_camera_turns_all_headings_alike() -> None:
     turn = np.zeros((20, 3, 1))
     turn[:, 0, 0], turn[:, 1, 0] = -0.01 * GRID.points_m[:, 1], 0.01 * GRID.points_m[:, 0]
     modes = reduce_modes(GRID, {"red": NodeModes(turn, np.zeros((20, 3, 3)), np.zeros(1))}, 1)
-    sensitivities, _ = modes.at("red", np.full((5, 2), 0.3), np.linspace(-3, 3, 5))
+    sensitivities = modes.at("red", np.full((5, 2), 0.3), np.linspace(-3, 3, 5))
     np.testing.assert_allclose(np.abs(sensitivities[:, 3, 0]), 0.01, rtol=1e-9)
 
 
@@ -65,9 +64,10 @@ def test_modes_left_out_stay_in_the_covariance() -> None:
         name: NodeModes(rng.standard_normal((20, 3, 9)), np.zeros((20, 3, 3)), np.zeros(9)) for name in "ab"
     }
     modes = reduce_modes(GRID, nodes, 4)
-    assert modes.count == 4
-    sensitivities, rest_m2 = modes.at("b", GRID.points_m, np.zeros(20))
-    total = sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2) + rest_m2
+    assert modes.count == 4 + 3 * 2
+    assert modes.fade_m.tolist() == [np.inf] * 4 + [LOCAL_M] * 6
+    sensitivities = modes.at("b", GRID.points_m, np.zeros(20))
+    total = sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2)
     np.testing.assert_allclose(total, nodes["b"].modes_m @ nodes["b"].modes_m.swapaxes(1, 2), atol=1e-9)
 
 
@@ -76,14 +76,13 @@ def test_node_that_a_camera_cannot_see_has_the_nearest_value() -> None:
     values[GRID.points_m[:, 0] > 0.2] = np.nan
     values[GRID.points_m[:, 0] < -0.7] = 5.0
     modes = reduce_modes(GRID, {"red": NodeModes(values, np.zeros((20, 3, 3)), np.zeros(1))}, 1)
-    sensitivities, _ = modes.at("red", np.array([[1.0, 1.0], [40.0, 1.0], [-1.0, 0.5]]), np.zeros(3))
+    sensitivities = modes.at("red", np.array([[1.0, 1.0], [40.0, 1.0], [-1.0, 0.5]]), np.zeros(3))
     np.testing.assert_allclose(np.abs(sensitivities[:, 0, 0]), [1.0, 1.0, 5.0])
 
 
 def test_unknown_camera_has_no_errors() -> None:
-    sensitivities, rest_m2 = BiasModes.none().at("red", np.zeros((2, 3)), np.zeros(2))
+    sensitivities = BiasModes.none().at("red", np.zeros((2, 3)), np.zeros(2))
     assert sensitivities.shape == (2, 4, 0)
-    assert not rest_m2.any()
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +94,7 @@ def test_joint_modes_are_the_covariance_of_located_markers(joint: Model) -> None
     """The part of the calibration in the covariance of real sightings, against the table."""
     rig = Rig("lab", "DICT_4X4_100", LENGTH_M, marker_height_m=0.1)
     modes = calibration_modes(joint, rig)
-    assert modes.count == 12
+    assert modes.count == 12 + 3 * len(joint.cameras)
     rng = np.random.default_rng(5)
     for camera in joint.cameras:
         model = restore_joint(camera)
@@ -105,12 +104,10 @@ def test_joint_modes_are_the_covariance_of_located_markers(joint: Model) -> None
         noise = np.broadcast_to(0.012**2 * np.eye(8), (20, 8, 8))
         located = locate_markers(model, corners_px, noise, np.full(20, 0.1), np.full(20, LENGTH_M))
         wanted = (located.covariances_m2 - located.noise_m2)[:, :2, :2]
-        sensitivities, rest_m2 = modes.at(camera.camera, located.points_m, located.headings_rad)
-        by_modes = sensitivities[:, :2] @ sensitivities[:, :2].swapaxes(1, 2)
-        total = by_modes + rest_m2[:, :2, :2]
-        sizes = np.trace(wanted, axis1=1, axis2=2)
-        assert np.abs(np.trace(total, axis1=1, axis2=2) / sizes - 1).max() < 0.1
-        assert (np.trace(by_modes, axis1=1, axis2=2) / sizes).min() > 0.7
+        sensitivities = modes.at(camera.camera, located.points_m, located.headings_rad)
+        total = sensitivities[:, :2] @ sensitivities[:, :2].swapaxes(1, 2)
+        ratio = np.trace(total, axis1=1, axis2=2) / np.trace(wanted, axis1=1, axis2=2)
+        assert np.abs(ratio - 1).max() < 0.1
 
 
 def level_corners(model: JointModel, places_m: Array, headings_rad: Array) -> Array:
@@ -146,7 +143,7 @@ def test_modes_of_a_table_model_are_its_covariance(name: str) -> None:
     wanted = applied.covariances(points_m, heights_m)
     assert wanted is not None
     places_m = applied.predict(points_m, heights_m)
-    sensitivities, rest_m2 = modes.at("red", places_m, np.zeros(15))
-    total = sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2) + rest_m2
+    sensitivities = modes.at("red", places_m, np.zeros(15))
+    total = sensitivities[:, :3] @ sensitivities[:, :3].swapaxes(1, 2)
     ratio = np.trace(total, axis1=1, axis2=2) / np.trace(wanted, axis1=1, axis2=2)
     assert np.abs(ratio - 1).max() < 0.15

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.tracking.filter import Sightings, start
 from ipsys_log.tracking.motion import MOTION, POSE, MotionNoise, transition
-from ipsys_log.tracking.smoother import smooth
+from ipsys_log.tracking.smoother import smooth_track
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Arra
     count, size = len(durations_s) + 1, MOTION + MODES
     means, joint = np.zeros((count, size)), np.zeros((count, size, count, size))
     means[0, :MOTION] = first.means[0]
-    joint[0, :, 0] = np.block([[first.covariances[0], first.cross[0]], [first.cross[0].T, np.eye(MODES)]])
+    joint[0, :, 0] = np.block([[first.covariances[0], -first.cross[0]], [-first.cross[0].T, np.eye(MODES)]])
     for n, duration_s in enumerate(durations_s):
         (motion,), (spread,) = transition(np.array([duration_s]), np.zeros(1), NOISE)
         forward = np.eye(size)
@@ -66,7 +66,7 @@ def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Arra
 @pytest.mark.parametrize("seed", range(3))
 def test_smoothed_track_equals_a_batch_solution(seed: int) -> None:
     durations_s, sightings = make_sightings(seed, 12)
-    smoothed = smooth(sightings, durations_s, NOISE)
+    smoothed = smooth_track(sightings, durations_s, NOISE)
     means, covariances = condition_all(durations_s, sightings)
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     # In units of the standard deviations: the state has metres, radians and amplitudes.
@@ -83,7 +83,7 @@ def test_heading_is_smoothed_across_the_turn_of_pi() -> None:
     wrapped[:, 3] = (turned[:, 3] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(np.diff(wrapped[:, 3])).max() > 6
     results = [
-        smooth(one, durations_s, NOISE).means[:, 3]
+        smooth_track(one, durations_s, NOISE).means[:, 3]
         for one in (
             Sightings(poses, sightings.noise, sightings.sensitivities, sightings.clock_s)
             for poses in (turned, wrapped)
@@ -100,7 +100,7 @@ def test_common_error_is_not_reduced_by_smoothing() -> None:
     modes[:, 0, 0] = 0.002  # the same error of x everywhere
     noise = np.broadcast_to(np.diag([1e-8, 1e-8, 1e-8, 1e-8]), (count, 4, 4))
     sightings = Sightings(poses, noise, modes, np.zeros((count, MODES)))
-    smoothed = smooth(sightings, durations_s, NOISE)
+    smoothed = smooth_track(sightings, durations_s, NOISE)
     sigmas_m = np.sqrt(np.diagonal(smoothed.covariances, axis1=1, axis2=2))
     assert sigmas_m[:, 0] == pytest.approx(0.002, rel=0.02)
     assert sigmas_m[:, 1].max() < 1e-4

@@ -13,6 +13,7 @@ import numpy as np
 from geometric_labs import Scene, Session, fit_session, make_session
 from numpy.typing import NDArray
 
+from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.payload import JOINT, joint_payload
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Rig
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
@@ -21,7 +22,7 @@ from ipsys_log.simulation.geometric_sightings import start_ns
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate, LocateCorners
+from ipsys_log.stages.locate import Locate
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["CALIBRATIONS", "Condition", "SeenDrive", "Truth", "calibrate", "cover", "drive_through"]

@@ -19,8 +19,8 @@ from ipsys_log.messages.channels import EVENTS, MARKERS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
 from ipsys_log.units import NS_PER_S
+from tests.live_recordings import lenses, sent
 from tests.playing import SteppedClock, cameras, playing
-from tests.test_live import lenses, sent
 
 CAMERA, RATE_HZ = "white", 10.0
 BEFORE, AFTER = 14, 10

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ipsys_log.analysis.knocks import KnockMonitor
-from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recorder import Source
 from ipsys_log.messages import CAMERA_MOVED, Message, Rig
 
 __all__ = ["KnockEvents"]
@@ -19,7 +19,7 @@ class KnockEvents:
     cameras : the source of the recording; it gets the events.
     """
 
-    def __init__(self, cameras: LiveCameras) -> None:
+    def __init__(self, cameras: Source) -> None:
         self._cameras = cameras
         self._monitor: KnockMonitor | None = None
 

@@ -70,7 +70,7 @@ def drift(
     if plot is not None:
         check_figure_file(plot, "--plot", logs)
     lab = load_rig(rig) if rig is not None else None
-    with progress_bar(lambda _: False) as progress:
+    with progress_bar(()) as progress:
         reading = read_drift(
             logs, baseline, model_from, lab, lambda done, total: progress("logs", done, total)
         )

@@ -119,8 +119,9 @@ class _Parts:
         with ExitStack() as stack:
             streams: list[Stream] = []
             for robots, settings in run.streams(ports[1:]):
+                heights_m = {robot: self.rig.robot_heights_m().get(robot) for robot in robots}
                 opened = open_streams(
-                    settings, [self.topic], cameras.clock.now_ns, cameras.add_event, robots=robots
+                    settings, [self.topic], cameras.clock.now_ns, cameras.add_event, heights_m=heights_m
                 )
                 streams += stack.enter_context(opened)
             programs: list[Programs] = []

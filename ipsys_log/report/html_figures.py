@@ -200,10 +200,10 @@ def tracks_picture(session: Session, run: str | None) -> Picture | None:
     tracks = read_drawn_tracks(session, run) if run is not None else {}
     if not tracks:
         return None
-    figure, axes = _figure(5.4)
+    figure, axes = new_figure(5.4)
     enlarged = draw_tracks(axes, tracks)
     figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=8)
-    return _picture(
+    return picture(
         figure,
         f"Tracks of run {run}, seen from above. Ellipses: regions that hold 95 % of the errors, "
         f"{enlarged} times as large. White dots: other cameras see the robot from there on",

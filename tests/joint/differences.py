@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ def descend(problem: Problem, start: State) -> State:
     state = start
     for ease in (*_PLAIN_STEPS, *_ROBUST_STEPS):
         residuals = residuals_of(problem, state, ease)
-        jacobian = jacobian_of(problem, state, lambda one, ease=ease: residuals_of(problem, one, ease))
+        jacobian = jacobian_of(problem, state, partial(residuals_of, problem, ease=ease))
         scales = np.linalg.norm(jacobian, axis=0)
         step = lstsq(jacobian / scales, -residuals, cond=1e-14)[0] / scales
         state = state.moved(problem.layout, *split_step(problem, step))

@@ -26,11 +26,11 @@ from ipsys_log.messages.channels import EVENTS, TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
+from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
 from tests.sinks.test_ros2_stream import free_port
 from tests.sinks.test_vrpn_stream import Reader
 from tests.sinks.zenoh_listener import ZenohListener, wait_for
-from tests.test_live import RATE_HZ, lenses, sent
 
 _LIMIT_S = 240.0
 _TOPIC = TRACKS.topic_of("poly")

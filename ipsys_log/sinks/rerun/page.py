@@ -59,7 +59,7 @@ class ViewerPage:
         source = f"rerun%2Bhttp%3A%2F%2F{_LOOPBACK}%3A{self._data_port}%2Fproxy"
         return f"Rerun: only this machine; open http://{_LOOPBACK}:{self._page_port}/?url={source}"
 
-    def show(self, feed: Callable[[Callable[[bytes], object]], None]) -> None:
+    def show(self, feed: Callable[[Callable[[bytes], object]], object]) -> None:
         """Feed the viewer; `feed` is called with a function that takes the bytes of a recording.
 
         Raises

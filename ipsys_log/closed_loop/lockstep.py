@@ -132,9 +132,9 @@ class LockstepCameras:
     def confirm(self, message: Message, fault: OSError | None) -> None:
         """Do nothing: nobody waits for the disk."""
 
-    def add_event(self, kind: str, text: str) -> None:
-        """Add an event to the messages, and show its text."""
-        self._events.append(Event(self.clock.now_ns(), kind, text))
+    def add_event(self, kind: str, text: str, camera: str | None = None) -> None:
+        """Add an event, of a camera if there is one, to the messages, and show its text."""
+        self._events.append(Event(self.clock.now_ns(), kind, text, camera))
         self.say(text)
 
     def now_ns(self) -> int:

@@ -72,7 +72,7 @@ class Sent:
     def confirm(self, message: Message, fault: OSError | None) -> None:
         self.confirmed.append((message, fault))
 
-    def add_event(self, kind: str, text: str) -> None:
+    def add_event(self, kind: str, text: str, camera: str | None = None) -> None:
         self.warned.append((kind, text))
 
 

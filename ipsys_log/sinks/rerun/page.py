@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 import rerun as rr
 
@@ -45,10 +46,14 @@ class ViewerPage:
             stdout=subprocess.DEVNULL,
             stderr=self._complaints,
             env={"RUST_LOG": "error", **os.environ},
+            start_new_session=True,  # Ctrl-C ends this program first
         )
         try:
             # The viewer opens its ports only after the first bytes.
-            self.show(lambda write: write(_header()))
+            assert self._process.stdin is not None
+            with suppress(BrokenPipeError):  # the process has ended; the next line gives the reason
+                self._process.stdin.write(_header())
+                self._process.stdin.flush()
             self._wait()
         except BaseException:
             self.close()

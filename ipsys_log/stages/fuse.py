@@ -28,7 +28,7 @@ from ipsys_log.messages.channels import EVENTS, MODEL, POSES, POSITIONS, RIG, TR
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.bodies import Bodies
-from ipsys_log.tracking.position_sightings import has_covariance, is_usable, read_sightings
+from ipsys_log.tracking.position_sightings import is_usable, read_sightings
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
 __all__ = ["STAGE", "Fuse"]
@@ -94,13 +94,14 @@ class Fuse:
         positions = [position for position in message.payload.positions if is_usable(position)]
         poses: list[Pose] = []
         if positions:
-            sightings = read_sightings(camera, positions, self._modes)
+            sightings, has_covariance = read_sightings(camera, positions, self._modes)
             robots = [(rig.robot_of(position.id), position.id) for position in positions]
             if self._has_bodies:
                 self._bodies.learn(robots, sightings)
                 rows = [row for row, robot in enumerate(robots) if self._bodies.knows(*robot)]
                 positions, robots = [positions[row] for row in rows], [robots[row] for row in rows]
                 sightings = self._bodies.move(robots, sightings.take(np.array(rows, dtype=np.intp)))
+                has_covariance = has_covariance[rows]
                 robots = [(name, self._bodies.reference(name, number)) for name, number in robots]
             poses = self._tracks.observe(
                 camera,
@@ -108,7 +109,7 @@ class Fuse:
                 [message.publish_time_ns + (position.time_offset_ns or 0) for position in positions],
                 sightings,
                 [position.inside for position in positions],
-                [has_covariance(position) for position in positions],
+                has_covariance.tolist(),
             )
         return poses + self._tracks.coast(message.publish_time_ns)
 

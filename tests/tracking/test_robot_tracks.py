@@ -143,8 +143,9 @@ def test_robot_put_down_elsewhere_is_tracked_again_at_once() -> None:
 def test_robot_lifted_slowly_and_put_down_is_never_lost() -> None:
     def drive(time_ns: int) -> Array:
         since_s = (time_ns - START_NS) / NS_PER_S
-        lift = np.clip(min(since_s - 1, 3 - since_s), 0, 0.5)
-        return circle(START_NS) + np.array([0.8 * np.clip(since_s - 1, 0, 2), 0.3 * lift, lift, 0.0])
+        lift_m = min(max(min(since_s - 1, 3 - since_s), 0.0), 0.5)
+        way_m = 0.8 * min(max(since_s - 1, 0.0), 2.0)
+        return circle(START_NS) + np.array([way_m, 0.3 * lift_m, lift_m, 0.0])
 
     poses = follow(sight(drive, 4.0))
     times_ns = [pose.time_ns for pose in poses]

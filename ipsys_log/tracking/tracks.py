@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +16,8 @@ from ipsys_log.units import NS_PER_S
 __all__ = ["Pose", "RobotTracks", "TrackSettings"]
 
 Array = NDArray[np.float64]
+# The name of a robot, and the id of its reference marker.
+Robot = tuple[str, int]
 
 _ONE = np.zeros(1, dtype=np.intp)
 
@@ -57,7 +59,7 @@ class Pose:
     since then if the robot is unseen, otherwise None.
     """
 
-    robot: Hashable
+    robot: Robot
     time_ns: int
     states: States
     state: int
@@ -110,12 +112,12 @@ class RobotTracks:
 
     def __init__(self, settings: TrackSettings | None = None, fade_m: Array | None = None) -> None:
         self._settings, self._fade_m = settings or TrackSettings(), fade_m
-        self._tracks: dict[Hashable, _Track] = {}
+        self._tracks: dict[Robot, _Track] = {}
 
     def observe(
         self,
         camera: str,
-        robots: Sequence[Hashable],
+        robots: Sequence[Robot],
         times_ns: Sequence[int],
         sightings: Sightings,
         inside: Sequence[bool | None],
@@ -175,7 +177,7 @@ class RobotTracks:
             for row, (robot, track, age_ns) in enumerate(coasting)
         ]
 
-    def _observe(self, batch: _Batch, robots: Sequence[Hashable], all_rows: list[int]) -> list[Pose]:
+    def _observe(self, batch: _Batch, robots: Sequence[Robot], all_rows: list[int]) -> list[Pose]:
         rows, tracks, places = [], [], []
         for row in all_rows:
             time_ns = batch.times_ns[row]
@@ -193,7 +195,7 @@ class RobotTracks:
             if is_accepted and (pose := self._pose(robots[row], track, batch, row))
         ]
 
-    def _track_of(self, robot: Hashable, time_ns: int) -> _Track | None:
+    def _track_of(self, robot: Robot, time_ns: int) -> _Track | None:
         """Return the track for a sighting, a new one if there is none; None for a sighting that is too late.
 
         After a sighting with a time in the future, all others are too late: then the track starts again.
@@ -293,7 +295,7 @@ class RobotTracks:
         track.history, track.rival, track.hits = rival, None, 0
         return True
 
-    def _pose(self, robot: Hashable, track: _Track, batch: _Batch, row: int) -> Pose | None:
+    def _pose(self, robot: Robot, track: _Track, batch: _Batch, row: int) -> Pose | None:
         """Return the pose at the instant of a sighting; None if there is one already."""
         time_ns = batch.times_ns[row]
         if time_ns in track.history.rows_ns:

@@ -33,8 +33,10 @@ def test_heading_under_a_tilted_camera_is_that_of_a_level_marker(model: str, mos
     near, ahead = (transform(camera_from_world, points_m) for points_m in (places_m, places_m + steps_m))
     du, dv = (ahead[:, :2] / ahead[:, 2:] - near[:, :2] / near[:, 2:]).T
     seen = [
-        CameraPoint(n, *point_m, angle)
-        for n, (point_m, angle) in enumerate(zip(near.tolist(), (-np.arctan2(dv, du)).tolist(), strict=True))
+        CameraPoint(n, x_m, y_m, z_m, angle)
+        for n, ((x_m, y_m, z_m), angle) in enumerate(
+            zip(near.tolist(), (-np.arctan2(dv, du)).tolist(), strict=True)
+        )
     ]
     (made,) = locate(Message("t", 1, 1, CameraPoints(1, tuple(seen)), "red"))
     found = np.array([position.heading_rad for position in made.positions])

@@ -145,7 +145,8 @@ def test_robot_lifted_slowly_and_put_down_is_never_lost() -> None:
         since_s = (time_ns - START_NS) / NS_PER_S
         lift_m = min(max(min(since_s - 1, 3 - since_s), 0.0), 0.5)
         way_m = 0.8 * min(max(since_s - 1, 0.0), 2.0)
-        return circle(START_NS) + np.array([way_m, 0.3 * lift_m, lift_m, 0.0])
+        pose: Array = circle(START_NS) + np.array([way_m, 0.3 * lift_m, lift_m, 0.0])
+        return pose
 
     poses = follow(sight(drive, 4.0))
     times_ns = [pose.time_ns for pose in poses]

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 # A clock error counts like an error of 1 mm for each of these times.
 _CLOCK_S = 0.001
-# Distance over which local errors change: the correlation length of a floor. From 0.3 to 1 m, tracks are alike.
+# Local errors change over this distance: the correlation length of a floor. Tracks are alike with 0.3 to 1 m.
 LOCAL_M = 0.5
 
 

@@ -11,7 +11,7 @@ from ipsys_log.messages import Model, Position, Rig
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.bodies import Bodies
 from ipsys_log.tracking.filter import Sightings
-from ipsys_log.tracking.position_sightings import has_covariance, is_usable, read_sightings
+from ipsys_log.tracking.position_sightings import is_usable, read_sightings
 
 __all__ = ["FrameReader", "FrameSightings"]
 
@@ -61,13 +61,14 @@ class FrameReader:
         positions = [position for position in positions if is_usable(position)]
         if not positions:
             return None
-        sightings = read_sightings(camera, positions, self.modes)
+        sightings, has_covariance = read_sightings(camera, positions, self.modes)
         robots = [(self._rig.robot_of(position.id), position.id) for position in positions]
         if self._has_bodies:
             self._bodies.learn(robots, sightings)
             rows = [row for row, robot in enumerate(robots) if self._bodies.knows(*robot)]
             positions, robots = [positions[row] for row in rows], [robots[row] for row in rows]
             sightings = self._bodies.move(robots, sightings.take(np.array(rows, dtype=np.intp)))
+            has_covariance = has_covariance[rows]
             robots = [(name, self._bodies.reference(name, number)) for name, number in robots]
         return FrameSightings(
             camera,
@@ -75,5 +76,5 @@ class FrameReader:
             [time_ns + (position.time_offset_ns or 0) for position in positions],
             sightings,
             [position.inside for position in positions],
-            [has_covariance(position) for position in positions],
+            has_covariance.tolist(),
         )

@@ -162,7 +162,7 @@ class _Weights:
     slope_rates: Array
 
     @classmethod
-    def of(cls, elapsed_s: Array, whole_s: Array, with_rates: NDArray[np.bool_]) -> _Weights:
+    def of(cls, elapsed_s: Array, whole_s: Array, with_rates: np.bool_ | NDArray[np.bool_]) -> _Weights:
         length_s = np.where(whole_s > 0, whole_s, 1.0)
         u = elapsed_s / length_s
         later = np.where(with_rates, u**2 * (3 - 2 * u), u)

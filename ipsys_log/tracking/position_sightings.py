@@ -12,7 +12,7 @@ from ipsys_log.messages import Position
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings
 
-__all__ = ["has_covariance", "is_usable", "read_sightings"]
+__all__ = ["is_usable", "read_sightings"]
 
 Array = NDArray[np.float64]
 
@@ -24,20 +24,21 @@ _USUAL_M, _USUAL_RAD = 3e-4, 3e-3
 _UNKNOWN_M = 0.005
 # No lab is larger, and no heading has a larger error.
 _FARTHEST_M, _LARGEST_RAD = 1e6, 10.0
-_PLACE = np.arange(3)
+_PLACE, _UNKNOWN = np.arange(3), np.full((3, 3), np.nan)
 
 
 def is_usable(position: Position) -> bool:
     """Return whether a position is a place; the log of another program may hold other numbers."""
-    return all(abs(value_m) < _FARTHEST_M for value_m in (position.x_m, position.y_m, position.z_m))
+    return (
+        -_FARTHEST_M < position.x_m < _FARTHEST_M
+        and -_FARTHEST_M < position.y_m < _FARTHEST_M
+        and -_FARTHEST_M < position.z_m < _FARTHEST_M
+    )
 
 
-def has_covariance(position: Position) -> bool:
-    """Return whether the covariance of a position is known and positive definite."""
-    return position.covariance_m2 is not None and _is_covariance(position.covariance_m2)
-
-
-def read_sightings(camera: str, positions: Sequence[Position], modes: BiasModes) -> Sightings:
+def read_sightings(
+    camera: str, positions: Sequence[Position], modes: BiasModes
+) -> tuple[Sightings, NDArray[np.bool_]]:
     """Return the sightings of positions of one camera.
 
     Parameters
@@ -45,43 +46,47 @@ def read_sightings(camera: str, positions: Sequence[Position], modes: BiasModes)
     camera : its name.
     positions : (k,), at least one, all of them usable.
     modes : the errors of the calibration.
+
+    Returns
+    -------
+    sightings : (k,).
+    has_covariance : (k,), whether the covariance of a position is known and positive definite.
     """
     count = len(positions)
-    noise = np.zeros((count, 4, 4))
-    headings = np.zeros(count)
+    noise, headings = np.zeros((count, 4, 4)), np.zeros(count)
     for row, position in enumerate(positions):
-        noise[row, :3, :3] = _position_noise(position, camera in modes.tables)
         headings[row], noise[row, 3, 3] = _heading(position)
+    noise[:, :3, :3], has_covariance = _position_noise(positions, camera in modes.tables)
     noise[:, _PLACE, _PLACE] += _LEAST_M**2
     poses = np.column_stack([[(p.x_m, p.y_m, p.z_m) for p in positions], headings])
     clock_s = np.broadcast_to(modes.clock_of(camera), (count, modes.count))
-    return Sightings(poses, noise, modes.at(camera, poses, headings), clock_s)
+    return Sightings(poses, noise, modes.at(camera, poses, headings), clock_s), has_covariance
 
 
-def _position_noise(position: Position, has_modes: bool) -> Array:
-    """Return the covariance (3, 3) of the noise. Without modes, all errors of a position count as noise."""
-    covariance_m2, noise_m2 = position.covariance_m2, position.noise_m2
-    if covariance_m2 is None or not _is_covariance(covariance_m2):
-        return _UNKNOWN_M**2 * np.eye(3)
-    if not has_modes:
-        return covariance_m2
-    # The noise of a marker on a flat floor has no vertical part.
-    if noise_m2 is None or not _is_covariance(noise_m2 + _LEAST_M**2 * np.eye(3)):
-        return _USUAL_M**2 * np.eye(3)
-    return noise_m2
+def _position_noise(positions: Sequence[Position], has_modes: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the covariances (k, 3, 3) of the noise, and a mask of the positions with a covariance.
+
+    Without modes, all errors of a position count as noise.
+    """
+    covariances_m2 = np.array([_UNKNOWN if p.covariance_m2 is None else p.covariance_m2 for p in positions])
+    known = _are_covariances(covariances_m2)
+    noise_m2 = covariances_m2
+    if has_modes:
+        noise_m2 = np.array([_UNKNOWN if p.noise_m2 is None else p.noise_m2 for p in positions])
+        # The noise of a marker on a flat floor has no vertical part.
+        stated = _are_covariances(noise_m2 + _LEAST_M**2 * np.eye(3))
+        noise_m2 = np.where(stated[:, None, None], noise_m2, _USUAL_M**2 * np.eye(3))
+    return np.where(known[:, None, None], noise_m2, _UNKNOWN_M**2 * np.eye(3)), known
 
 
-def _is_covariance(covariance_m2: Array) -> bool:
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = covariance_m2.tolist()
-    minor = xx * yy - xy * xy
-    determinant = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
-    return (
-        0 < xx < _FARTHEST_M
-        and 0 < yy < _FARTHEST_M
-        and 0 < zz < _FARTHEST_M
-        and minor > 0
-        and determinant > 0
-    )
+def _are_covariances(matrices_m2: Array) -> NDArray[np.bool_]:
+    """Return a mask (k,) of the positive definite ones of matrices (k, 3, 3), by their minors."""
+    xx, xy, xz, _, yy, yz, _, _, zz = matrices_m2.reshape(-1, 9).T
+    usable = (np.abs(matrices_m2) < _FARTHEST_M).all(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        minor = xx * yy - xy * xy
+        determinant = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
+    return np.asarray(usable & (xx > 0) & (yy > 0) & (zz > 0) & (minor > 0) & (determinant > 0))
 
 
 def _heading(position: Position) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from ipsys_log.messages import Model, Position, Rig
 from ipsys_log.tracking.frame_reader import FrameReader
 from ipsys_log.tracking.history import History
 from ipsys_log.tracking.smoother import smooth_track
-from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings, gather_sightings
+from ipsys_log.tracking.tracks import Pose, Robot, RobotTracks, TrackSettings, gather_sightings
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Frame", "SmoothedPose", "smooth_positions"]
@@ -72,7 +72,7 @@ def smooth_positions(
 
 
 def _smooth_track(
-    robot: Hashable,
+    robot: Robot,
     history: History,
     sources: _Sources,
     settings: TrackSettings,

@@ -16,7 +16,6 @@ _UNKNOWN_HEADING_RAD = 2.0
 def make_track(pose: Pose) -> Track:
     """Return the row of a pose; its robot is a pair of the name and the marker id."""
     mean, covariance = pose.states.means[pose.state], pose.states.covariances[pose.state]
-    assert isinstance(pose.robot, tuple)
     robot, marker_id = pose.robot
     x_m, y_m, z_m, heading_rad, _, _, _, turn_rate, _, _ = mean.tolist()
     heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance[3, 3]), sqrt(covariance[7, 7])

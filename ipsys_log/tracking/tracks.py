@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,9 +13,11 @@ from ipsys_log.tracking.history import HISTORY_NS, History, Record
 from ipsys_log.tracking.motion import MotionNoise
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Pose", "RobotTracks", "TrackSettings", "gather_sightings"]
+__all__ = ["Pose", "Robot", "RobotTracks", "TrackSettings", "gather_sightings"]
 
 Array = NDArray[np.float64]
+# The name of a robot, and the id of its reference marker.
+Robot = tuple[str, int]
 
 _ONE = np.zeros(1, dtype=np.intp)
 
@@ -57,7 +59,7 @@ class Pose:
     since then if the robot is unseen, otherwise None.
     """
 
-    robot: Hashable
+    robot: Robot
     time_ns: int
     states: States
     state: int
@@ -115,17 +117,17 @@ class RobotTracks:
     ) -> None:
         self._settings, self._fade_m = settings or TrackSettings(), fade_m
         self._complete = complete
-        self._tracks: dict[Hashable, _Track] = {}
-        self._ended: list[tuple[Hashable, History]] = []
+        self._tracks: dict[Robot, _Track] = {}
+        self._ended: list[tuple[Robot, History]] = []
 
-    def histories(self) -> list[tuple[Hashable, History]]:
+    def histories(self) -> list[tuple[Robot, History]]:
         """Return all tracks with their robots, ended ones first; only if the histories are ``complete``."""
         return [*self._ended, *((robot, track.history) for robot, track in self._tracks.items())]
 
     def observe(
         self,
         camera: str,
-        robots: Sequence[Hashable],
+        robots: Sequence[Robot],
         times_ns: Sequence[int],
         sightings: Sightings,
         inside: Sequence[bool | None],
@@ -187,7 +189,7 @@ class RobotTracks:
             for row, (robot, track, age_ns) in enumerate(coasting)
         ]
 
-    def _observe(self, batch: _Batch, robots: Sequence[Hashable], all_rows: list[int]) -> list[Pose]:
+    def _observe(self, batch: _Batch, robots: Sequence[Robot], all_rows: list[int]) -> list[Pose]:
         rows, tracks, places = [], [], []
         for row in all_rows:
             time_ns = batch.times_ns[row]
@@ -205,7 +207,7 @@ class RobotTracks:
             if is_accepted and (pose := self._pose(robots[row], track, batch, row))
         ]
 
-    def _track_of(self, robot: Hashable, time_ns: int) -> _Track | None:
+    def _track_of(self, robot: Robot, time_ns: int) -> _Track | None:
         """Return the track for a sighting, a new one if there is none; None for a sighting that is too late.
 
         After a sighting with a time in the future, all others are too late: then the track starts again.
@@ -222,14 +224,14 @@ class RobotTracks:
         track = self._tracks[robot] = _Track(History(complete=self._complete))
         return track
 
-    def _end(self, robot: Hashable, history: History) -> None:
+    def _end(self, robot: Robot, history: History) -> None:
         if self._complete:
             self._ended.append((robot, history))
 
     def _filter(
         self,
         batch: _Batch,
-        robots: Sequence[Hashable],
+        robots: Sequence[Robot],
         rows: NDArray[np.intp],
         tracks: list[_Track],
         places: list[int],
@@ -296,7 +298,7 @@ class RobotTracks:
         slack = np.diag([settings.slack_m**2] * 3 + [settings.slack_rad**2])
         return np.asarray(innovations.chi2(slack) < settings.gate)
 
-    def _contradict(self, robot: Hashable, track: _Track, record: Record) -> bool:
+    def _contradict(self, robot: Robot, track: _Track, record: Record) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
         seen, rival = record.sightings.take(_ONE + record.sighting), track.rival
         states, hits = start(seen, self._settings.motion, self._fade_m), 1
@@ -317,7 +319,7 @@ class RobotTracks:
         track.history, track.rival, track.hits = rival, None, 0
         return True
 
-    def _pose(self, robot: Hashable, track: _Track, batch: _Batch, row: int) -> Pose | None:
+    def _pose(self, robot: Robot, track: _Track, batch: _Batch, row: int) -> Pose | None:
         """Return the pose at the instant of a sighting; None if there is one already."""
         time_ns = batch.times_ns[row]
         if time_ns in track.history.rows_ns:

@@ -51,7 +51,7 @@ def test_version_is_named_from_the_second_on(monkeypatch: pytest.MonkeyPatch) ->
     assert version_parameters("fit", "rigid+kriging") == {}
     monkeypatch.setitem(VERSIONS, "kriging", 3)
     assert version_parameters("fit", "rigid+kriging") == {"kriging": "3"}
-    assert version_parameters("fuse") == {}
+    assert version_parameters("detect") == {}
 
 
 def test_current_runs_are_found_again(ipsys: Ipsys, log: Path) -> None:

@@ -87,7 +87,7 @@ def fused(*sent: tuple[str, float, Position]) -> list[Any]:
     """Return the payloads of fuse for positions of cameras at times in ms."""
     fuse = Fuse("poly")
     list(fuse(RIG))
-    made = []
+    made: list[Any] = []
     for camera, time_ms, position in sent:
         time_ns = round(time_ms * 1_000_000)
         made += fuse(Message("t", time_ns, time_ns, Positions(time_ns, (position,)), camera))

@@ -71,7 +71,7 @@ def follow(
 
 def observe(tracks: RobotTracks, one: Sighting) -> Iterator[Pose]:
     """Yield the poses that one sighting gives: its own, and those of robots that are not seen."""
-    yield from tracks.observe(one.camera, [one.robot], [one.time_ns], arrays([one.pose]), [True], [True])
+    yield from tracks.observe(one.camera, [(one.robot, 0)], [one.time_ns], arrays([one.pose]), [True], [True])
     yield from tracks.coast(one.time_ns)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -25,10 +28,10 @@ def positions_at(time_ns: int, ids: tuple[int, ...]) -> Positions:
     )
 
 
-def tracks_of(frames: list[tuple[int, ...]]) -> list[tuple[int, Track]]:
+def tracks_of(frames: Sequence[tuple[int, ...]]) -> list[tuple[int, Track]]:
     fuse = Fuse("poly")
     list(fuse(Message("/rig", 0, 0, RIG)))
-    made = []
+    made: list[Any] = []
     for number, ids in enumerate(frames):
         time_ns = number * 33_000_000
         made += fuse(Message("t", time_ns, time_ns, positions_at(time_ns, ids), "red"))

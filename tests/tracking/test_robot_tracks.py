@@ -143,8 +143,10 @@ def test_robot_put_down_elsewhere_is_tracked_again_at_once() -> None:
 def test_robot_lifted_slowly_and_put_down_is_never_lost() -> None:
     def drive(time_ns: int) -> Array:
         since_s = (time_ns - START_NS) / NS_PER_S
-        lift = np.clip(min(since_s - 1, 3 - since_s), 0, 0.5)
-        return circle(START_NS) + np.array([0.8 * np.clip(since_s - 1, 0, 2), 0.3 * lift, lift, 0.0])
+        lift_m = min(max(min(since_s - 1, 3 - since_s), 0.0), 0.5)
+        way_m = 0.8 * min(max(since_s - 1, 0.0), 2.0)
+        pose: Array = circle(START_NS) + np.array([way_m, 0.3 * lift_m, lift_m, 0.0])
+        return pose
 
     poses = follow(sight(drive, 4.0))
     times_ns = [pose.time_ns for pose in poses]
@@ -168,7 +170,7 @@ def with_another(sightings: list[Sighting]) -> list[Sighting]:
 
 def test_covered_robot_coasts_with_growing_covariance_and_ends() -> None:
     sightings = with_another([one for one in sight(circle, 6.0) if covered(3.0)(one)])
-    poses = [pose for pose in follow(sightings) if pose.robot == "ada"]
+    poses = [pose for pose in follow(sightings) if pose.robot[0] == "ada"]
     coasting = [pose for pose in poses if pose.coasting_ns is not None]
     sizes = [np.trace(pose.states.covariances[pose.state, :2, :2]) for pose in coasting]
     assert (np.diff(sizes) > 0).all()
@@ -214,7 +216,7 @@ def test_two_robots_that_pass_at_25_cm_keep_their_tracks() -> None:
     apart_m = min(np.linalg.norm((circle(t.time_ns) - other(t.time_ns))[:2]) for t in poses)
     assert 0.2 < apart_m < 0.27
     for robot, drive in drives.items():
-        assert errors_m([pose for pose in poses if pose.robot == robot], drive).max() < 6e-4
+        assert errors_m([pose for pose in poses if pose.robot[0] == robot], drive).max() < 6e-4
 
 
 def test_knocked_camera_is_left_out_beside_another_one() -> None:
@@ -249,6 +251,6 @@ def test_same_marker_twice_in_a_frame_uses_the_one_on_the_track() -> None:
     follow(sight(circle, 1.0), tracks=tracks)
     time_ns = START_NS + NS_PER_S + 50 * MS
     twice = arrays([circle(time_ns) + np.array([1.0, 0.0, 0.0, 0.0]), circle(time_ns)])
-    poses = tracks.observe("red", ["ada", "ada"], [time_ns] * 2, twice, [None] * 2, [True] * 2)
+    poses = tracks.observe("red", [("ada", 0)] * 2, [time_ns] * 2, twice, [None] * 2, [True] * 2)
     assert len(poses) == 1
     assert errors_m(poses, circle)[0] < 1e-3

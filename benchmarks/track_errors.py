@@ -153,7 +153,8 @@ def _middles(times_ns: Times) -> Times:
     """Return the instants half-way between consecutive rows."""
     steps_ns = np.diff(times_ns)
     near = (steps_ns <= _MOST_GAP_NS) & (steps_ns > 1)
-    return times_ns[:-1][near] + steps_ns[near] // 2
+    middles: Times = times_ns[:-1][near] + steps_ns[near] // 2
+    return middles
 
 
 def _changes(seen_ns: Times, cameras: NDArray[np.str_], times_ns: Times) -> tuple[Mask, Mask]:
@@ -182,11 +183,11 @@ def summarize_labs(labs: Sequence[LabErrors]) -> Figures:
         return float(np.percentile(known, share)) if len(known) else float("nan")
 
     figures = {
-        "mean_mm": median([lab.error_2d_mm.mean() for lab in labs]),
+        "mean_mm": median([float(lab.error_2d_mm.mean()) for lab in labs]),
         "p95_mm": median([np.percentile(lab.error_2d_mm, 95) for lab in labs]),
         "median_3d_mm": median([np.median(lab.error_3d_mm) for lab in labs]),
         "p95_3d_mm": median([np.percentile(lab.error_3d_mm, 95) for lab in labs]),
-        "ratio": median([lab.error_2d_mm.mean() / lab.single_mm for lab in labs]),
+        "ratio": median([float(lab.error_2d_mm.mean()) / lab.single_mm for lab in labs]),
         "single_mm": median([lab.single_mm for lab in labs]),
         "grid_mm": median([np.nanmean(lab.grid_mm) for lab in labs]),
         "grid_p95_mm": median([np.nanpercentile(lab.grid_mm, 95) for lab in labs]),

@@ -83,7 +83,7 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
         (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0],
         modes_m,
         noise_m2,
-        np.asarray(np.sqrt(spread[:, 5, 5])),
+        np.asarray(np.sqrt(spread[:, 5, 5]), dtype=np.float64),
     )
 
 

@@ -55,7 +55,8 @@ def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
 class LocateCorners:
     """The step from markers to positions. A camera that is not in the model has no positions.
 
-    A marker whose height is in the rig is level, at this height. Other markers get their full pose.
+    A marker whose height is in the rig is level, at this height. Other markers get their full pose. Reference
+    markers are no robots: they have no positions.
     """
 
     def __init__(self, model: Model) -> None:
@@ -71,7 +72,9 @@ class LocateCorners:
             return
         camera = self._cameras.get(str(message.camera))
         if camera is not None:
-            yield Positions(message.publish_time_ns, self._positions(camera, message.payload.markers))
+            rig = self._rig
+            markers = [m for m in message.payload.markers if rig is None or not rig.is_reference(m.id)]
+            yield Positions(message.publish_time_ns, self._positions(camera, markers))
 
     def _positions(self, camera: JointModel, markers: Sequence[Marker]) -> tuple[Position, ...]:
         if markers and self._rig is None:

@@ -163,7 +163,8 @@ def _rig_part(rig: Rig, model: str) -> object:
     )
     if not reads_corners(model):
         return part
-    return part, rig.marker_length_m, {(m.id, m.length_m) for m in rig.markers}
+    references = {m.id for m in rig.reference_markers}
+    return part, rig.marker_length_m, {(m.id, m.length_m) for m in rig.markers}, references
 
 
 STAGE = Stage(

@@ -61,7 +61,7 @@ class Sent:
     def __init__(self, messages: Generator[Message | None, None, None]) -> None:
         self._messages, self.whys = messages, list[str | None]()
         self.confirmed: list[tuple[Message, OSError | None]] = []
-        self.warned: list[tuple[str, str]] = []
+        self.warned: list[tuple[str, ...]] = []
 
     def __iter__(self) -> Generator[Message | None, None, None]:
         return self._messages
@@ -73,7 +73,7 @@ class Sent:
         self.confirmed.append((message, fault))
 
     def add_event(self, kind: str, text: str, camera: str | None = None) -> None:
-        self.warned.append((kind, text))
+        self.warned.append((kind, text) if camera is None else (kind, text, camera))
 
 
 def backlog(source: Generator[Message | None, None, None], log: Recording) -> Backlog:

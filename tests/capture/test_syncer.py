@@ -151,7 +151,7 @@ def test_sync_error_is_reported_once_and_at_the_end(tmp_path: Path) -> None:
             for _ in write_each(sent, log):
                 pass
         disk.error = None
-    assert [kind for kind, _ in sent.warned] == ["disk_fault"]
+    assert [kind for kind, *_ in sent.warned] == ["disk_fault"]
     assert "the disk has failed (Input/output error)" in sent.warned[0][1]
     assert sent.confirmed[0][1] is not None
     with pytest.raises(IpsysError, match=r"Input/output error.*may be missing.*ipsys repair") as caught:

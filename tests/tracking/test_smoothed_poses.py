@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ STEP_NS, NOISE_M = 11_000_000, 0.002
 SIGMAS_M2 = NOISE_M**2 * np.eye(3)
 
 
-def drive(times_ns: Array, jump_ns: int | None = None) -> Array:
+def drive(times_ns: NDArray[Any], jump_ns: int | None = None) -> Array:
     """Return x and y (n, 2) on a circle of 1 m at 0.5 m/s; after the jump, the robot is 1.5 m away."""
     angles = 0.5 * times_ns / NS_PER_S
     points_m = np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -189,12 +189,12 @@ def summarize_labs(labs: Sequence[LabErrors]) -> Figures:
         "p95_3d_mm": median([np.percentile(lab.error_3d_mm, 95) for lab in labs]),
         "ratio": median([float(lab.error_2d_mm.mean()) / lab.single_mm for lab in labs]),
         "single_mm": median([lab.single_mm for lab in labs]),
-        "grid_mm": median([np.nanmean(lab.grid_mm) for lab in labs]),
+        "grid_mm": median([float(np.nanmean(lab.grid_mm)) for lab in labs]),
         "grid_p95_mm": median([np.nanpercentile(lab.grid_mm, 95) for lab in labs]),
         "hand_over_mm": pooled([lab.hand_over_mm for lab in labs]),
         "other_camera_mm": pooled([lab.other_camera_mm for lab in labs]),
         "velocity_m_s": pooled([lab.velocity_m_s for lab in labs]),
-        "heading_mean_deg": median([np.nanmean(lab.heading_deg) for lab in labs]),
+        "heading_mean_deg": median([float(np.nanmean(lab.heading_deg)) for lab in labs]),
         "heading_p95_deg": median([np.nanpercentile(lab.heading_deg, 95) for lab in labs]),
     }
     for name in ("at_rows", "between", "coasting"):

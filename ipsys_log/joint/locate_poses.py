@@ -76,6 +76,7 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
     count = now.by_camera.shape[2]
     modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes[:count]
     noise_m2 = spread[:, :3, :3]
+    heading_noise_rad: Array = np.sqrt(spread[:, 5, 5])
     return Poses(
         points_m,
         turns,
@@ -83,7 +84,7 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
         (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0],
         modes_m,
         noise_m2,
-        np.asarray(np.sqrt(spread[:, 5, 5]), dtype=np.float64),
+        heading_noise_rad,
     )
 
 

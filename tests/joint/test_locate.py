@@ -12,8 +12,11 @@ from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transf
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.locate_poses import locate_poses
+from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.parameters import State
+from ipsys_log.joint.payload import joint_payload
+from ipsys_log.messages import Marker, Markers, Message, ReferenceMarker, Rig, RigMarker
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 
 POSES = [(1.6, 1.2, 0.1, 0.3), (2.4, 2.2, 0.0, -2.0), (3.1, 1.9, 0.2, 1.5)]
@@ -156,3 +159,19 @@ def test_marker_beside_the_lens_has_no_position(model: JointModel) -> None:
         found = locate_markers(model, corners_px, noise(), HEIGHTS_M, LENGTHS_M)
     assert np.isnan(found.points_m[1]).all()
     assert np.isfinite(found.points_m[[0, 2]]).all()
+
+
+def test_reference_marker_has_no_position(fit: JointFit, model: JointModel) -> None:
+    rig = Rig(
+        name="lab",
+        dictionary="DICT_4X4_100",
+        marker_length_m=LENGTH_M,
+        marker_height_m=0.1,
+        markers=(RigMarker(0, robot="ada"),),
+        reference_markers=(ReferenceMarker(2),),
+    )
+    step = LocateCorners(joint_payload(fit, {}, 0))
+    assert not list(step(Message("/rig", 0, 0, rig)))
+    markers = [Marker(number, corners) for number, corners in enumerate(see(model, level_poses(model)))]
+    (found,) = step(Message("/markers", 1, 1, Markers(1, tuple(markers), 1920, 1080), "c0"))
+    assert [position.id for position in found.positions] == [0, 1]

@@ -75,7 +75,7 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
     left = now.residuals[:, :, None] - now.by_pose @ change[:, :, None]
     count = now.by_camera.shape[2]
     modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes[:count]
-    noise_m2 = spread[:, :3, :3]
+    noise_m2 = np.asarray(spread[:, :3, :3], dtype=np.float64)
     heading_noise_rad: Array = np.sqrt(spread[:, 5, 5])
     return Poses(
         points_m,

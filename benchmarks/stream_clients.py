@@ -123,7 +123,9 @@ def _ros2(port: int, arrivals: Arrivals) -> None:
         seconds, rest_ns = struct.unpack_from("<iI", sample.payload.to_bytes(), 4)
         arrivals.append((seconds * 1_000_000_000 + rest_ns, arrived_ns))
 
-    session.declare_subscriber("0/*/pose/**", take)
+    subscriber = session.declare_subscriber("0/*/pose/**", take)
+    while subscriber:  # as long as the session has a name, it is open
+        time.sleep(_TURN_S)
 
 
 def _foxglove(address: str, arrivals: Arrivals) -> None:

@@ -153,7 +153,8 @@ def _middles(times_ns: Times) -> Times:
     """Return the instants half-way between consecutive rows."""
     steps_ns = np.diff(times_ns)
     near = (steps_ns <= _MOST_GAP_NS) & (steps_ns > 1)
-    return times_ns[:-1][near] + steps_ns[near] // 2
+    middles: Times = times_ns[:-1][near] + steps_ns[near] // 2
+    return middles
 
 
 def _changes(seen_ns: Times, cameras: NDArray[np.str_], times_ns: Times) -> tuple[Mask, Mask]:
@@ -188,12 +189,12 @@ def summarize_labs(labs: Sequence[LabErrors]) -> Figures:
         "p95_3d_mm": median([np.percentile(lab.error_3d_mm, 95) for lab in labs]),
         "ratio": median([lab.error_2d_mm.mean() / lab.single_mm for lab in labs]),
         "single_mm": median([lab.single_mm for lab in labs]),
-        "grid_mm": median([np.nanmean(lab.grid_mm) for lab in labs]),
+        "grid_mm": median([float(np.nanmean(lab.grid_mm)) for lab in labs]),
         "grid_p95_mm": median([np.nanpercentile(lab.grid_mm, 95) for lab in labs]),
         "hand_over_mm": pooled([lab.hand_over_mm for lab in labs]),
         "other_camera_mm": pooled([lab.other_camera_mm for lab in labs]),
         "velocity_m_s": pooled([lab.velocity_m_s for lab in labs]),
-        "heading_mean_deg": median([np.nanmean(lab.heading_deg) for lab in labs]),
+        "heading_mean_deg": median([float(np.nanmean(lab.heading_deg)) for lab in labs]),
         "heading_p95_deg": median([np.nanpercentile(lab.heading_deg, 95) for lab in labs]),
     }
     for name in ("at_rows", "between", "coasting"):

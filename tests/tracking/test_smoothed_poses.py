@@ -21,7 +21,7 @@ STEP_NS, NOISE_M = 11_000_000, 0.002
 SIGMAS_M2 = NOISE_M**2 * np.eye(3)
 
 
-def drive(times_ns: NDArray[Any], jump_ns: int | None = None) -> Array:
+def drive(times_ns: NDArray[np.int64], jump_ns: int | None = None) -> Array:
     """Return x and y (n, 2) on a circle of 1 m at 0.5 m/s; after the jump, the robot is 1.5 m away."""
     angles = 0.5 * times_ns / NS_PER_S
     points_m = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -33,7 +33,7 @@ def drive(times_ns: NDArray[Any], jump_ns: int | None = None) -> Array:
 def make_frames(count: int, seed: int = 1, jump_ns: int | None = None) -> tuple[list[Frame], Array]:
     """Return frames of two cameras that take turns, with noise, and the true points."""
     rng = np.random.default_rng(seed)
-    times_ns = STEP_NS * np.arange(count)
+    times_ns = STEP_NS * np.arange(count, dtype=np.int64)
     points_m = drive(times_ns, jump_ns)
     frames = []
     for n, time_ns in enumerate(times_ns.tolist()):

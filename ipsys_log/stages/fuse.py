@@ -186,7 +186,6 @@ STAGE = Stage(
         {(m.id, m.robot, m.height_m, m.height_sigma_m) for m in rig.markers},
         rig.marker_height_m,
         rig.marker_height_sigma_m,
-        rig.marker_length_m,
     ),
     per_camera=False,
 )

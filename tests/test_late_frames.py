@@ -116,7 +116,7 @@ def test_runs_of_logs_without_late_frames_read_no_events(overloaded: Path) -> No
     with Session([overloaded]) as session:
         assert session.count("/events") > 0
         read = {read.topic for run in session.runs() for read in run.inputs if run.stage == "fuse"}
-    assert read == {"/rig"} | {topic for topic in read if topic.endswith("/positions")}
+    assert read == {"/rig", "/runs/poly/model"} | {topic for topic in read if topic.endswith("/positions")}
 
 
 def test_slow_machine_records_and_names_skipped_frames(

@@ -16,7 +16,9 @@ Array = NDArray[np.float64]
 # The number of modes, the distance of the nodes, and their reach beyond the calibration points.
 MODES = 12
 _SPACING_M, _MARGIN_M = 0.2, 0.5
-_ROBOT_HEIGHT_M, _ROBOT_LENGTH_M = 0.1, 0.2
+_ROBOT_HEIGHT_M = 0.1
+# The sensitivity of a centre hardly depends on the side of its marker.
+_MARKER_M = 0.2
 # Standard deviation of a corner of detect: a weight of corners without noise.
 _USUAL_PX = 0.012
 _HEIGHT_SIGMA_M = 0.001
@@ -30,7 +32,7 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     Parameters
     ----------
     model : a fitted model of all cameras.
-    rig : the heights and sides of the markers on robots.
+    rig : the heights of the markers on robots.
     count : the number of modes.
 
     Returns
@@ -45,8 +47,7 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     usual_m = rig.marker_height_m if rig and rig.marker_height_m is not None else _ROBOT_HEIGHT_M
     height_m = float(np.median(known_m)) if known_m else usual_m
     if reads_corners(model.name):
-        length_m = rig.marker_length_m if rig else _ROBOT_LENGTH_M
-        nodes = {camera.camera: _joint_nodes(camera, grid, height_m, length_m) for camera in model.cameras}
+        nodes = {camera.camera: _joint_nodes(camera, grid, height_m, _MARKER_M) for camera in model.cameras}
     else:
         separate = {
             camera.camera: _table_nodes(model.name, camera, grid, height_m) for camera in model.cameras

@@ -28,10 +28,9 @@ def track_reads(view: StageView) -> tuple[Channel, ...]:
 
 
 def tracked_part(rig: Rig, _method: str) -> object:
-    """Return the part of the rig on which tracks depend: robots, and sizes and heights of their markers."""
+    """Return the part of the rig on which tracks depend: robots, and heights of their markers."""
     return (
         {(m.id, m.robot, m.height_m, m.height_sigma_m) for m in rig.markers},
         rig.marker_height_m,
         rig.marker_height_sigma_m,
-        rig.marker_length_m,
     )

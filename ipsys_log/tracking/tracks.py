@@ -36,6 +36,7 @@ class TrackSettings:
         with one another, or are too late.
     gap_ns : a robot that is unseen for longer is coasting.
     coast_ns : a track ends when its robot is unseen for longer.
+    coast_m : a prediction with a larger standard deviation is left out, as in a track of one sighting.
     window_ns : the cameras of a pose are those of the sightings in this time.
     """
 
@@ -46,6 +47,7 @@ class TrackSettings:
     restart: int = 3
     gap_ns: int = NS_PER_S // 10
     coast_ns: int = NS_PER_S
+    coast_m: float = 0.6
     window_ns: int = NS_PER_S // 10
 
 
@@ -172,6 +174,7 @@ class RobotTracks:
         last = _gather([track.history.newest for _, track, _ in coasting])
         ages_s = np.array([age_ns for _, _, age_ns in coasting]) / NS_PER_S
         states = predict(last, ages_s, settings.motion)
+        spreads_m2 = states.covariances[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1)
         for _, track, _ in coasting:
             track.history.rows_ns.add(time_ns)
         return [
@@ -187,6 +190,7 @@ class RobotTracks:
                 time_ns - track.history.began_ns,
             )
             for row, (robot, track, age_ns) in enumerate(coasting)
+            if spreads_m2[row] < settings.coast_m**2
         ]
 
     def _observe(self, batch: _Batch, robots: Sequence[Robot], all_rows: list[int]) -> list[Pose]:

@@ -188,9 +188,16 @@ def test_covered_robot_coasts_with_growing_covariance_and_ends() -> None:
     assert errors_m(after[3:], circle).max() < 1e-3
 
 
+def test_robot_seen_once_is_not_predicted_for_long() -> None:
+    (first, *_) = sight(circle, 1.0)
+    rows = follow(with_another([first]))
+    ages_ns = [pose.coasting_ns or 0 for pose in rows if pose.robot[0] == "ada"]
+    assert 0.4 * NS_PER_S < max(ages_ns) < 0.65 * NS_PER_S
+
+
 def test_coasting_time_is_a_setting() -> None:
     sightings = with_another([one for one in sight(circle, 6.0) if covered(3.0)(one)])
-    poses = follow(sightings, TrackSettings(coast_ns=2 * NS_PER_S))
+    poses = follow(sightings, TrackSettings(coast_ns=2 * NS_PER_S, coast_m=5.0))
     assert max(pose.coasting_ns or 0 for pose in poses) > 1.97 * NS_PER_S
 
 

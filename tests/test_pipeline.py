@@ -39,6 +39,7 @@ RIG_TOML = """
 name = "simulated"
 dictionary = "DICT_4X4_100"
 marker_length_m = {length}
+marker_height_m = 0.1
 [[reference_points]]
 name = "A"
 x_m = 1.2192
@@ -159,7 +160,6 @@ def test_each_result_is_computed_once(ipsys: Ipsys, lab: Path) -> None:
         "evaluate": ("poly", True),
         "locate": ("poly", True),
         "fuse": ("poly", True),
-        "smooth": ("poly", True),
     }
     after = lab.read_bytes()
     assert after.startswith(recorded)
@@ -284,7 +284,8 @@ def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) 
     assert list(json.loads(done.out)["models"]["poly"]["cameras"]) == [camera]
     with Session([alone]) as session:
         tracks = session.payloads(session.topics(TRACKS, "poly"))
-    assert {track.cameras for message in tracks for track in message.tracks} == {(camera,)}
+    # Predicted poses have no camera.
+    assert {track.cameras for message in tracks for track in message.tracks} - {()} == {(camera,)}
 
 
 def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, replayed_lab: Path) -> None:

@@ -103,6 +103,7 @@ class Stage:
     per_camera : a step sees the messages of one camera only, so that cameras can be processed in parallel.
     in_threads : it works outside of Python: one thread for each camera is faster.
     of_model : each model has its own run of this stage, and of the stages that read it.
+    on_demand : it runs only if the user names it, or a stage that needs it.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Stage:
     per_camera: bool = True
     in_threads: bool = False
     of_model: bool = False
+    on_demand: bool = False
 
     def __repr__(self) -> str:
         return f"<stage {self.name}>"

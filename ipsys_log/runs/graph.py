@@ -52,12 +52,14 @@ def stage_named(name: str) -> Stage | None:
 
 
 def stages_until(name: str | None) -> list[Stage]:
-    """Return a stage and all those that it needs, in order; all stages for None.
+    """Return a stage and all those that it needs, in order; for None, all stages but those on demand.
 
     If no stage reads the result of this stage, the earlier stages of the table without readers are included:
     fuse also evaluates.
     """
-    last = STAGES[-1] if name is None else stage_named(name)
+    if name is None:
+        return [stage for stage in STAGES if not stage.on_demand]
+    last = stage_named(name)
     if last is None:
         raise ValueError(f"no stage is named {name}")
     wanted = _with_needed(last)
@@ -65,7 +67,7 @@ def stages_until(name: str | None) -> list[Stage]:
         for stage in STAGES[: STAGES.index(last)]:
             if not _readers(stage):
                 wanted |= _with_needed(stage)
-    return [stage for stage in STAGES if stage in wanted or name is None]
+    return [stage for stage in STAGES if stage in wanted]
 
 
 def _with_needed(stage: Stage) -> set[Stage]:

@@ -78,4 +78,5 @@ STAGE = Stage(
     rig_part=tracked_part,
     causal=False,
     per_camera=False,
+    on_demand=True,
 )

@@ -39,7 +39,7 @@ class MotionNoise:
     hold_s: float = 0.4
     turn_rad_s2: float = 2.0
     climb_m_s2: float = 0.05
-    start_m_s: float = 1.0
+    start_m_s: float = 0.5
     start_climb_m_s: float = 0.05
     start_rad_s: float = 2.0
     start_acceleration_m_s2: float = 1.5

@@ -33,8 +33,9 @@ class TrackSettings:
         exceeded by chance once in 200,000 sightings.
     slack_m, slack_rad : errors that the covariances do not contain; they widen the gate.
     restart : a track starts again after this number of consecutive sightings that contradict it and agree
-        with one another, or are too late.
-    gap_ns : a robot that is unseen for longer is coasting.
+        with one another, or are too late. A younger track starts again after as many as it has itself.
+    gap_ns : a robot that is unseen for longer is coasting. A track with fewer sightings than ``restart``
+        does not: its velocity is not certain.
     coast_ns : a track ends when its robot is unseen for longer.
     coast_m : a prediction with a larger standard deviation is left out, as in a track of one sighting.
     window_ns : the cameras of a pose are those of the sightings in this time.
@@ -76,10 +77,12 @@ class Pose:
 class _Track:
     """A track, and the sightings that contradict it: a rival track of the same robot.
 
-    ``hits`` is the number of consecutive sightings of the rival, ``late`` that of those that are too late.
+    ``sightings`` counts those of the track, ``hits`` the consecutive ones of the rival, and ``late`` those
+    that are too late.
     """
 
     history: History
+    sightings: int = 0
     has_covariance: bool = True
     rival: History | None = None
     hits: int = 0
@@ -167,7 +170,7 @@ class RobotTracks:
             if age_ns > settings.coast_ns:
                 self._end(robot, track.history)
                 del self._tracks[robot]
-            elif age_ns > settings.gap_ns and time_ns not in track.history.rows_ns:
+            elif age_ns > settings.gap_ns and self._can_coast(track) and time_ns not in track.history.rows_ns:
                 coasting.append((robot, track, age_ns))
         if not coasting:
             return []
@@ -192,6 +195,10 @@ class RobotTracks:
             for row, (robot, track, age_ns) in enumerate(coasting)
             if spreads_m2[row] < settings.coast_m**2
         ]
+
+    def _can_coast(self, track: _Track) -> bool:
+        """Return whether the velocity is known, and the robot is not seen at another place."""
+        return track.rival is None and track.sightings >= self._settings.restart
 
     def _observe(self, batch: _Batch, robots: Sequence[Robot], all_rows: list[int]) -> list[Pose]:
         rows, tracks, places = [], [], []
@@ -251,6 +258,7 @@ class RobotTracks:
                 accepted[number] = self._contradict(robots[row], track, record)
                 continue
             track.rival, track.hits, track.late = None, 0, 0
+            track.sightings += 1
             later.append((track, place, [record, *track.history.records[place:]]))
             if place == len(track.history.records):
                 track.has_covariance = batch.has_covariance[row]
@@ -316,11 +324,11 @@ class RobotTracks:
             rival = History(complete=self._complete)
         rival.replace_from(len(rival.records), [own])
         track.rival, track.hits = rival, hits
-        if hits < self._settings.restart:
+        if hits < min(self._settings.restart, track.sightings):
             return False
         self._end(robot, track.history)
         rival.rows_ns = track.history.rows_ns
-        track.history, track.rival, track.hits = rival, None, 0
+        track.history, track.sightings, track.rival, track.hits = rival, hits, None, 0
         return True
 
     def _pose(self, robot: Robot, track: _Track, batch: _Batch, row: int) -> Pose | None:

@@ -91,7 +91,7 @@ def test_info_says_what_is_in_a_log(ipsys: Ipsys, replayed_lab: Path) -> None:
     assert images["gaps"] > 5
     assert images["longest_gap_s"] == pytest.approx(3.0, abs=0.5)
     assert [run["stage"] for run in found["runs"]] == [
-        "detect", "camera-frame", "fit", "evaluate", "locate", "fuse", "smooth",
+        "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
     ]  # fmt: skip
 
 

@@ -281,8 +281,9 @@ def test_info_has_one_line_per_channel_and_no_event_rates(
     found = json.loads(ipsys("info", detected_lab.name, "--json").out)
     rates = {topic: row["rate_hz"] for topic, row in found["channels"].items()}
     assert rates["/cameras/red/image"] == pytest.approx(5.0)
-    # Three cameras with two frames at each point: 5 steps in 0.22 s.
-    assert rates["/runs/poly/tracks"] == pytest.approx(22.5)
+    # Three cameras with two frames at each point: at most 5 steps in 0.22 s. A frame has no new tracks if
+    # other cameras have seen all its robots at the same instant.
+    assert 15 < rates["/runs/poly/tracks"] <= 22.5
     for topic in ("/measurements", "/rig", "/cameras/red/calibration", "/runs/poly/record"):
         assert rates[topic] is None
     assert found["cameras"]["red"]["lens"]["width"] == 960

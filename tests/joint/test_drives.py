@@ -81,7 +81,7 @@ def test_exchanged_robots_are_named() -> None:
     )
     faults = find_faults(fit_jointly(replace(observations, bodies=wrong), COARSE))
     assert {(fault.kind, fault.subject) for fault in faults} == {("robot_height", "0"), ("robot_height", "1")}
-    assert "at 100 mm, not at 150 mm" in "".join(fault.text for fault in faults)
+    assert "at 10.0 cm, not at 15.0 cm" in "".join(fault.text for fault in faults)
 
 
 def test_slopes_of_paths_match_differences() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Track, Tracks
@@ -41,7 +42,9 @@ def test_drawn_track_has_breaks_regions_and_hand_overs(tmp_path: Path) -> None:
     enlarged = draw_tracks(axes, tracks)
     # The region of 95 % has a radius of 4.9 mm: ten times that is visible, twenty times is too large.
     assert enlarged == 10
-    np.testing.assert_allclose(axes.patches[0].get_width() / enlarged, 2 * np.sqrt(-2 * np.log(0.05)) * 0.002)
+    ellipse = axes.patches[0]
+    assert isinstance(ellipse, Ellipse)
+    np.testing.assert_allclose(ellipse.get_width() / enlarged, 2 * np.sqrt(-2 * np.log(0.05)) * 0.002)
 
 
 def test_log_without_tracks_has_none_to_draw(tmp_path: Path) -> None:

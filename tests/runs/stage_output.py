@@ -58,7 +58,7 @@ def computed(corners: str, method: str) -> Channels:
         log = Path(shutil.copy(LOG, folder))
         request = Request(models=(*MODELS, *CORNER_MODELS), corners=corners, method=method)
         pipeline.replay([log], request, "locate")
-        pipeline.replay([log], dataclasses.replace(request, models=("poly", *CORNER_MODELS)))
+        pipeline.replay([log], dataclasses.replace(request, models=("poly", *CORNER_MODELS)), "smooth")
         with Session([log]) as session:
             topics = sorted(
                 topic

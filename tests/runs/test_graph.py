@@ -98,14 +98,15 @@ def test_stages_until_gives_the_needed_stages() -> None:
     assert names("detect") == ["detect"]
     assert names("locate") == ["detect", "camera-frame", "fit", "locate"]
     assert names("evaluate") == ["detect", "camera-frame", "fit", "evaluate"]
-    # No other stage reads the results of smooth, and of fuse and evaluate, which come before it.
-    assert names("smooth") == names(None) == [stage.name for stage in STAGES]
-    assert names("fuse") == names(None)[:-1]
+    # No other stage reads the results of fuse, and of evaluate, which comes before it.
+    assert names("fuse") == names(None)
+    # Smoothing runs on demand only, after all others.
+    assert names("smooth") == [*names(None), "smooth"] == [stage.name for stage in STAGES]
 
 
 def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, whole: Path, with_damping: None) -> None:
     outcomes = replay([whole], Request())
-    assert [(one.stage, one.run) for one in outcomes[-2:]] == [("smooth", "poly"), ("damp", "poly")]
+    assert [(one.stage, one.run) for one in outcomes[-2:]] == [("fuse", "poly"), ("damp", "poly")]
     with Session([whole]) as session:
         tracks = session.payloads(session.topics(TRACKS, "poly"))
         damped = session.payloads(session.topics(DAMPED_TRACKS, "poly"))
@@ -171,4 +172,4 @@ def test_command_of_an_added_stage_gets_its_parameters(whole: Path) -> None:
 
 def test_replay_command_runs_an_added_stage(log: Path) -> None:
     stages = json.loads(ipsys_with_damping("replay", log, "--json"))["stages"]
-    assert [stage["stage"] for stage in stages] == [*(stage.name for stage in STAGES), "damp"]
+    assert [stage["stage"] for stage in stages] == [*names(None), "damp"]

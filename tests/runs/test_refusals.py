@@ -253,6 +253,7 @@ _JOINT = "the fit of joint is appended whole or not at all; only the stages befo
 _CHECKED = "the checks of the input have refused such a log"
 RAISES: dict[str, tuple[str, ...] | str] = {
     "analysis.joint_calibration.observe": _CHECKED,
+    "analysis.joint_evaluation._learning.predict": "the learning curve leaves out such a subset",
     "analysis.pairs._check_duplicates": ("duplicate",),
     "analysis.pairs.active_measurements": ("two_of_one_id", "no_marker", "evaluate_two_of_one_id"),
     "analysis.pairs.build_pairs": ("unknown_marker", "unseen_marker", "evaluate_unknown_marker"),
@@ -283,6 +284,7 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "images.video.decode_keyframe": _FRAME,
     "joint.from_messages._point": _CHECKED,
     "joint.from_messages.gather_observations": _CHECKED,
+    "joint.locate_step.LocateCorners._positions": _CHECKED,
     "joint.payload.restore_joint": _CHECKED,
     "joint.refusals.check_observations": _JOINT,
     "joint.refusals.check_spread": _JOINT,
@@ -315,6 +317,7 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "stages.fit.check_pairs": ("unseen",),
     "stages.fuse.Fuse.__call__": ("no_rig",),
     "stages.locate._height": ("no_height",),
+    "stages.smooth._compute": ("no_rig",),
 }
 
 

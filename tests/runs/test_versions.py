@@ -158,7 +158,6 @@ def test_changed_model_leaves_the_detection_alone(
         "evaluate": True,
         "locate": True,
         "fuse": True,
-        "smooth": True,
     }
     assert found["fuse"][0] == "poly_2"
 

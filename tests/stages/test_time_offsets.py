@@ -89,7 +89,8 @@ def test_zero_time_offsets_do_not_change_the_result() -> None:
     made = fused(frame(100, "red", None, None))
     still_m_s = np.zeros(3)
     tracks = tuple(
-        Track(f"marker_{n}", n, 0.0, 0.0, 0.0, cameras=("red",), velocity_m_s=still_m_s) for n in range(2)
+        Track(f"marker_{n}", n, 0.0, 0.0, 0.0, cameras=("red",), velocity_m_s=still_m_s, age_ns=0)
+        for n in range(2)
     )
     still = Quaternion(0.0, 0.0, 0.0, 1.0)
     transforms = tuple(

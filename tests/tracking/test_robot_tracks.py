@@ -188,11 +188,22 @@ def test_covered_robot_coasts_with_growing_covariance_and_ends() -> None:
     assert errors_m(after[3:], circle).max() < 1e-3
 
 
-def test_robot_seen_once_is_not_predicted_for_long() -> None:
-    (first, *_) = sight(circle, 1.0)
-    rows = follow(with_another([first]))
+@pytest.mark.parametrize(("seen", "longest_s"), [(1, 0.0), (2, 0.0), (3, 1.0)])
+def test_robot_seen_once_or_twice_is_not_predicted(seen: int, longest_s: float) -> None:
+    rows = follow(with_another(sight(circle, 1.0)[:seen]))
     ages_ns = [pose.coasting_ns or 0 for pose in rows if pose.robot[0] == "ada"]
-    assert 0.4 * NS_PER_S < max(ages_ns) < 0.65 * NS_PER_S
+    assert max(ages_ns) == pytest.approx(longest_s * NS_PER_S, abs=0.04 * NS_PER_S)
+
+
+def test_young_track_gives_way_to_the_next_sighting_elsewhere() -> None:
+    """A marker that is carried between points, with two frames at each, is never seen between them."""
+    frames = [one for one in sight(circle, 4.0) if one.camera == "red"][:4]
+    moved = [
+        replace(one, pose=one.pose + np.array([1.5 * (n // 2), 0, 0, 0])) for n, one in enumerate(frames)
+    ]
+    xs_m = [pose.states.means[pose.state, 0] for pose in follow(moved)]
+    assert len(xs_m) == 3
+    assert xs_m == pytest.approx([one.pose[0] for one in (moved[0], moved[1], moved[3])], abs=0.01)
 
 
 def test_coasting_time_is_a_setting() -> None:

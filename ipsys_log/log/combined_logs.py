@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import Measurement
+from ipsys_log.messages import Measurement, Run
 
-__all__ = ["check_overlaps", "find_new_ids", "rename_ids"]
+__all__ = ["check_overlaps", "check_same_parameters", "find_new_ids", "rename_ids"]
 
 
 def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) -> None:
@@ -44,6 +45,29 @@ def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) 
 def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
     first, second = one.times(topic), other.times(topic)
     return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])
+
+
+def check_same_parameters(logs: Iterable[tuple[Path, Iterable[Run]]]) -> None:
+    """Refuse logs in which a stage made a run of the same name in different ways.
+
+    Parameters
+    ----------
+    logs : the path of each log, and the records of its runs.
+
+    Raises
+    ------
+    LogError
+        The text names the run and both logs.
+    """
+    known: dict[tuple[str, str], tuple[Path, Mapping[str, str]]] = {}
+    for path, runs in logs:
+        for run in runs:
+            other, parameters = known.setdefault((run.run, run.stage), (path, run.parameters))
+            if other != path and parameters != run.parameters:
+                raise LogError(
+                    f"run {run.run} has other parameters of {run.stage} in {other} than in {path}; leave one "
+                    "of them out, or compute the run again with --run and another name"
+                )
 
 
 def find_new_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:

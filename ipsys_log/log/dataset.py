@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
-from ipsys_log.log.combined_logs import check_overlaps, find_new_ids, rename_ids
+from ipsys_log.log.combined_logs import check_overlaps, check_same_parameters, find_new_ids, rename_ids
 from ipsys_log.log.contents import (
     RawMessage,
     StoredChannel,
@@ -75,6 +75,7 @@ class Session:
             }
             self._ids: dict[LogReader, dict[str, str]] = {}
             self._ids = self._find_new_ids()
+            self._check_same_parameters()
         except BaseException:
             self._stack.close()
             raise
@@ -266,6 +267,13 @@ class Session:
         ]
         runs = [message.payload for message in self._decoded(reader, items, topics, None, None)]
         return sorted(runs, key=lambda run: run.number)
+
+    def _check_same_parameters(self) -> None:
+        names = [{run_of_topic(topic) for topic in reader.channels} - {None} for reader in self.readers]
+        if sum(map(len, names)) > len(set().union(*names)):  # the records are read only if runs have one name
+            check_same_parameters(
+                (reader.path, self._runs_in(reader, items)) for reader, items in self._items()
+            )
 
     def _find_new_ids(self) -> dict[LogReader, dict[str, str]]:
         """Return the ids of measurements that an earlier log has too, and their new ids."""

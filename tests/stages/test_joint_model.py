@@ -201,6 +201,17 @@ def test_logs_with_runs_of_one_name_are_fitted_together(ipsys: Ipsys, fitted: Pa
         assert counts
         for topic, count in counts.items():
             assert count == sum(r.channels[topic].message_count for r in session.readers[:2])
+    other = tmp_path / "other.mcap"
+    changed = [
+        replace(m, payload=replace(m.payload, parameters={"format": "other"}))
+        if isinstance(m.payload, Run)
+        else m
+        for m in hour_later(simulate_session(lab(4, 8.0)))
+    ]
+    write_log(other, [m for m in changed if m.topic != MEASUREMENTS_TOPIC])
+    refused = ipsys("fit", fitted, other, "--model", "joint")
+    assert (refused.code, refused.err.count("\n")) == (1, 1)
+    assert "run geometric has other parameters of import in" in refused.err
     same_time = tmp_path / "same_time.mcap"
     same_time.write_bytes(fitted.read_bytes())
     refused = ipsys("fit", fitted, same_time, "--model", "joint")

@@ -85,7 +85,7 @@ def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement
 
     Examples
     --------
-    >>> from ipsys_log.messages import Distance, Measurement, ReferencePoint
+    >>> from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig
     >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
     >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points, tape_sigma_m=0.003)
     >>> seen, places = {}, []

@@ -178,7 +178,7 @@ def _rows(pairs: list[tuple[_Run, _Run]], report: Report) -> None:
 
 def _table(pairs: list[tuple[_Run, _Run]]) -> str:
     """Return the table of medians and 99 % in ms: capture, received, position, client."""
-    lines = [f"{'median / 99 %, ms':<12}{'to received':>16}{'to position':>16}{'to client':>16}{'whole':>16}"]
+    lines = [f"{'median / 99 %, ms':<12}{'to received':>15}{'to position':>15}{'to client':>15}{'whole':>15}"]
     for stream in CLIENTS:
         cells: list[list[NDArray[np.float64]]] = [[], [], [], []]
         for _, run in pairs:
@@ -197,8 +197,8 @@ def _table(pairs: list[tuple[_Run, _Run]]) -> str:
 
 def _cell(values: NDArray[np.float64]) -> str:
     if not len(values):
-        return f"{'-':>16}"
-    return f"{f'{np.percentile(values, 50):.1f} / {np.percentile(values, 99):.1f}':>16}"
+        return f"{'-':>15}"
+    return f"{f'{np.percentile(values, 50):.1f} / {np.percentile(values, 99):.1f}':>15}"
 
 
 def _costs(rounds: int) -> list[Row]:

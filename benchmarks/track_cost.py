@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 _SEED = 3900
 _ROBOTS, _STEP_NS, _LATE_NS = 20, 11_000_000, 490_000_000
 _WARM_UP, _EVERY = 60, 20
+# With three late messages after the first ones.
+_SMOKE = 130
 _NOISE_M = 0.0003
 _MS = 1000.0
 
@@ -41,7 +43,7 @@ _MS = 1000.0
 def measure(options: argparse.Namespace) -> Report:
     """Track 20 robots, and time each message."""
     report = Report("track_cost")
-    count = 80 if options.smoke else options.messages
+    count = _SMOKE if options.smoke else options.messages
     model = calibrate(Condition("cost", 0.5), options.calibration, _SEED)
     usual, late = [], []
     with threadpool_limits(1):

@@ -145,8 +145,8 @@ def test_commands_need_only_their_own_extra(folder: Path) -> None:
     page = [name for name in HIDDEN if name not in ("jinja2", "markupsafe", "matplotlib", "PIL")]
     viewer = [name for name in HIDDEN if name not in ("rerun", "pyarrow", "PIL")]
     for hidden, command in (
-        (figures, "replay lab.mcap model.mcap --plot x.png"),
-        (page, "report lab.mcap model.mcap --model poly"),
+        (figures, "replay lab.mcap --plot x.png"),
+        (page, "report lab.mcap --model poly"),
         (viewer, "view lab.mcap --save x.rrd"),
     ):
         ((code, _, err),) = run_without(folder, command.split(), hidden=hidden)

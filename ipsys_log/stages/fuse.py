@@ -81,10 +81,10 @@ class Fuse:
         return start_ns is not None and start_ns <= time_ns and (end_ns is None or time_ns <= end_ns)
 
     def _poses(self, message: Message) -> list[Pose]:
-        poses: list[Pose] = []
+        poses = self._tracks.coast_before(message.publish_time_ns)
         frame = self._reader.read(str(message.camera), message.publish_time_ns, message.payload.positions)
         if frame is not None:
-            poses = self._tracks.observe(
+            poses += self._tracks.observe(
                 frame.camera,
                 frame.robots,
                 frame.times_ns,
@@ -92,7 +92,7 @@ class Fuse:
                 frame.inside,
                 frame.has_covariance,
             )
-        return poses + self._tracks.coast(message.publish_time_ns)
+        return poses
 
     def _messages(self, poses: list[Pose]) -> Iterator[Any]:
         tracks_by_time: dict[int, list[Track]] = defaultdict(list)

@@ -123,6 +123,8 @@ class RobotTracks:
         self._settings, self._fade_m = settings or TrackSettings(), fade_m
         self._complete = complete
         self._tracks: dict[Robot, _Track] = {}
+        # Instants at which another frame may still show a robot.
+        self._instants_ns: set[int] = set()
         self._ended: list[tuple[Robot, History]] = []
 
     def histories(self) -> list[tuple[Robot, History]]:
@@ -161,6 +163,16 @@ class RobotTracks:
             poses += self._observe(batch, robots, sorted(first.values()))
             waiting = [row for row in waiting if first[robots[row]] != row]
         return poses
+
+    def coast_before(self, time_ns: int) -> list[Pose]:
+        """Return the predicted poses at the instants of earlier frames; a frame of this instant has arrived.
+
+        Synchronised cameras have frames of one instant: a robot that one of them does not see is predicted
+        only after all of them.
+        """
+        due_ns = sorted(own_ns for own_ns in self._instants_ns if own_ns < time_ns)
+        self._instants_ns = {time_ns, *self._instants_ns}.difference(due_ns)
+        return [pose for own_ns in due_ns for pose in self.coast(own_ns)]
 
     def coast(self, time_ns: int) -> list[Pose]:
         """Return the predicted poses of unseen robots at an instant, and end the tracks that are too old."""

@@ -66,7 +66,7 @@ def test_current_runs_are_found_again(ipsys: Ipsys, log: Path) -> None:
 def test_changed_stage_is_done_again_beside_the_old_run(
     changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(VERSIONS, changed, 2)
+    monkeypatch.setitem(VERSIONS, changed, VERSIONS[changed] + 1)
     rows = states(ipsys, log)
     reason = f"out of date: made by {changed} 1, this is {changed} 2"
     assert rows["edges", "detect"]["state"] == reason
@@ -92,7 +92,7 @@ def test_changed_stage_is_done_again_beside_the_old_run(
 def test_replay_leaves_its_runs_current(
     changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(VERSIONS, changed, 2)
+    monkeypatch.setitem(VERSIONS, changed, VERSIONS[changed] + 1)
     before = states(ipsys, log)
     used = made(ipsys, log)
     rows = states(ipsys, log)

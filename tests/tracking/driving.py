@@ -70,9 +70,9 @@ def follow(
 
 
 def observe(tracks: RobotTracks, one: Sighting) -> Iterator[Pose]:
-    """Yield the poses that one sighting gives: its own, and those of robots that are not seen."""
+    """Yield the poses that one sighting gives: those of robots that were not seen before, and its own."""
+    yield from tracks.coast_before(one.time_ns)
     yield from tracks.observe(one.camera, [(one.robot, 0)], [one.time_ns], arrays([one.pose]), [True], [True])
-    yield from tracks.coast(one.time_ns)
 
 
 def place_of(pose: Pose) -> Array:

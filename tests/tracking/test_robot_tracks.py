@@ -272,3 +272,15 @@ def test_same_marker_twice_in_a_frame_uses_the_one_on_the_track() -> None:
     poses = tracks.observe("red", [("ada", 0)] * 2, [time_ns] * 2, twice, [None] * 2, [True] * 2)
     assert len(poses) == 1
     assert errors_m(poses, circle)[0] < 1e-3
+
+
+def test_slow_synchronised_cameras_predict_no_robot_that_one_of_them_sees() -> None:
+    """The frame of the camera that does not see the robot arrives first, at each instant."""
+    tracks = RobotTracks()
+    poses: list[Pose] = []
+    for number in range(12):
+        time_ns = START_NS + number * NS_PER_S // 4
+        poses += tracks.coast_before(time_ns)
+        poses += observe(tracks, Sighting(time_ns, "red", circle(time_ns, 0.26)))
+    assert len(poses) == 12
+    assert {pose.coasting_ns for pose in poses} == {None}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from math import inf
 from pathlib import Path
@@ -41,11 +41,27 @@ def lenses(lab: Path) -> dict[str, CameraCalibration]:
 
 
 def attached_to(lab: Path, rate_hz: float) -> tuple[LiveCameras, list[Message]]:
+    """Return cameras that play a log in real time, and the first messages of their recording."""
     frames = sent(lab)
+    attached = LiveCameras(cameras(*frames), playing(frames, rate_hz), Clock())
+    return attached, settings_of(lab, attached)
+
+
+def attached_in_steps(
+    lab: Path, frames: Mapping[str, Sequence[bytes]] | None = None
+) -> tuple[LiveCameras, list[Message], SteppedClock]:
+    """Return the same with a stepped clock; its ``watch`` must see the frames before other consumers."""
+    frames = frames or sent(lab)
+    clock = SteppedClock(list(frames), RATE_HZ)
+    attached = LiveCameras(cameras(*frames), playing(frames, inf, before=clock.before), clock)
+    return attached, settings_of(lab, attached), clock
+
+
+def settings_of(lab: Path, attached: LiveCameras) -> list[Message]:
+    """Return the first messages of a recording with the rig and the intrinsics of a log."""
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
-    attached = LiveCameras(cameras(*frames), playing(frames, rate_hz), Clock())
-    return attached, first_messages(rig, lenses(lab), attached.now_ns)
+    return first_messages(rig, lenses(lab), attached.now_ns)
 
 
 def go_live(lab: Path, calibration: Path, target: Path, rate_hz: float) -> None:
@@ -57,12 +73,7 @@ def go_live(lab: Path, calibration: Path, target: Path, rate_hz: float) -> None:
 
 def record_every_frame(lab: Path, calibration: Path, target: Path) -> None:
     """Record on a fast machine: no frame is skipped."""
-    frames = sent(lab)
-    clock = SteppedClock(list(frames), RATE_HZ)
-    with Session([lab]) as session:
-        (rig,) = session.payloads(["/rig"])
-    attached = LiveCameras(cameras(*frames), playing(frames, inf, before=clock.before), clock)
-    settings = first_messages(rig, lenses(lab), attached.now_ns)
+    attached, settings, clock = attached_in_steps(lab)
     with attached:
         pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
 

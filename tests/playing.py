@@ -12,9 +12,9 @@ from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.messages import CompressedImage, Message, RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["SteppedClock", "cameras", "playing"]
+__all__ = ["WAIT_LIMIT_S", "SteppedClock", "cameras", "playing"]
 
-_LIMIT_S = 240.0
+WAIT_LIMIT_S = 240.0
 _READING_NS = 1000
 
 
@@ -75,7 +75,7 @@ class SteppedClock(Clock):
         """Wait until frame ``number`` may be sent, and advance the clock to its time."""
         with self._changed:
             looked_at = self._changed.wait_for(
-                lambda: all(self._seen[name] >= number for name in self._names), _LIMIT_S
+                lambda: all(self._seen[name] >= number for name in self._names), WAIT_LIMIT_S
             )
             assert looked_at, f"frames {number - 1} were not looked at: {self._seen}"
             self._now_ns = max(self._now_ns, self._start_ns + number * self._step_ns)

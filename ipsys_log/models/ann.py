@@ -205,7 +205,6 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
     True
     """
 
-    min_pairs: ClassVar[int] = 10
     fitted: ClassVar[tuple[str, ...]] = ("centre_", "scale_", "target_centre_", "target_scale_", "weights_")
 
     def __init__(self, seed: int = 0) -> None:

@@ -156,7 +156,6 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
     True
     """
 
-    min_pairs: ClassVar[int] = 6
     fitted: ClassVar[tuple[str, ...]] = (
         "points_",
         "centre_",

@@ -63,7 +63,6 @@ class PolynomialRegression(MultiOutputMixin, RegressorMixin, BaseEstimator):  # 
     coefficients_ : (terms, outputs), for the centred and scaled inputs.
     """
 
-    min_pairs: ClassVar[int] = 10
     fitted: ClassVar[tuple[str, ...]] = ("centre_", "scale_", "coefficients_")
 
     def fit(self, X: Any, y: Any) -> PolynomialRegression:

@@ -32,9 +32,7 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     lens_ : (3,), see :func:`ipsys_log.models.rays.directions`.
     """
 
-    min_pairs: ClassVar[int] = 5
     fitted: ClassVar[tuple[str, ...]] = ("rotation_", "origin_", "lens_")
-    reads_height: ClassVar[bool] = True
 
     def fit(self, X: Any, y: Any) -> RayPlane:
         X, y = validate_data(self, X, y, multi_output=True, dtype=np.float64)
@@ -84,7 +82,6 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         height from a depth, at the principal point.
     """
 
-    min_pairs: ClassVar[int] = 5
     fitted: ClassVar[tuple[str, ...]] = ("rotation_", "origin_", "lens_", "depth_", "heights_")
 
     def fit(self, X: Any, y: Any) -> RayDepth:

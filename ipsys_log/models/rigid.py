@@ -66,7 +66,6 @@ class RigidTransform(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     translation_ : (3,)
     """
 
-    min_pairs: ClassVar[int] = 3
     fitted: ClassVar[tuple[str, ...]] = ("rotation_", "translation_")
 
     def fit(self, X: Any, y: Any) -> RigidTransform:

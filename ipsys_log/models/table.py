@@ -6,7 +6,7 @@ A log stores a fitted model as named arrays (:func:`parameters`, :func:`restore`
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,10 @@ from ipsys_log.models.uncertainty import Uncertainty, Volume
 __all__ = [
     "CORNER_MODELS",
     "MODELS",
-    "MODEL_VERSIONS",
+    "MODEL_PARTS",
     "AppliedModel",
     "CalibrationPoints",
+    "ModelPart",
     "check_name",
     "create",
     "fit_cameras",
@@ -75,45 +76,54 @@ def _ray_depth() -> Any:
     return RayDepth()
 
 
-def _after_rigid(name: str, second: Any) -> Any:
-    from sklearn.pipeline import Pipeline
+@dataclass(frozen=True, slots=True)
+class ModelPart:
+    """A model, or one of the two parts of a hybrid model.
 
-    return Pipeline([("rigid", _rigid()), (name, second)])
+    Attributes
+    ----------
+    create : returns an unfitted estimator; None for a model of corners. It imports the model late:
+        scikit-learn takes 1.5 s, and most commands use no model.
+    version : version of the model; it rises by one with each change of the fitted parameters.
+    min_pairs : least number of calibration points.
+    reads_height : True if the model needs the height of a marker above the floor.
+    """
+
+    create: Callable[[], Any] | None
+    version: int
+    min_pairs: int
+    reads_height: bool = False
 
 
-# Each function imports its model late: scikit-learn takes 1.5 s, and most commands use no model.
+MODEL_PARTS = {
+    "rigid": ModelPart(_rigid, version=1, min_pairs=3),
+    "poly": ModelPart(_poly, version=1, min_pairs=10),
+    "ann": ModelPart(_ann, version=1, min_pairs=10),
+    "kriging": ModelPart(_kriging, version=1, min_pairs=6),
+    "kriging-regression": ModelPart(lambda: _kriging(noisy=True), version=1, min_pairs=6),
+    "rayplane": ModelPart(_ray_plane, version=2, min_pairs=5, reads_height=True),
+    "best": ModelPart(_ray_depth, version=1, min_pairs=5),
+    "joint": ModelPart(None, version=2, min_pairs=0, reads_height=True),
+}
+
 # First the models of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR.
 # In a hybrid, the output of the first model is the input of the second.
-MODELS: dict[str, Callable[[], Any]] = {
-    "rigid": _rigid,
-    "poly": _poly,
-    "rigid+poly": lambda: _after_rigid("poly", _poly()),
-    "ann": _ann,
-    "rigid+ann": lambda: _after_rigid("ann", _ann()),
-    "kriging": _kriging,
-    "rigid+kriging": lambda: _after_rigid("kriging", _kriging()),
-    "kriging-regression": lambda: _kriging(noisy=True),
-    "rigid+kriging-regression": lambda: _after_rigid("kriging-regression", _kriging(noisy=True)),
-    "rayplane": _ray_plane,
-    "best": _ray_depth,
-}
+MODELS = (
+    "rigid",
+    "poly",
+    "rigid+poly",
+    "ann",
+    "rigid+ann",
+    "kriging",
+    "rigid+kriging",
+    "kriging-regression",
+    "rigid+kriging-regression",
+    "rayplane",
+    "best",
+)
 
-# The versions of the parts of models; one rises by one with each change of the fitted parameters.
-MODEL_VERSIONS = {
-    "rigid": 1,
-    "poly": 1,
-    "ann": 1,
-    "kriging": 1,
-    "kriging-regression": 1,
-    "rayplane": 2,
-    "best": 1,
-    "joint": 2,
-}
-
-
-# Models of the corners of markers, and the least number of calibration points of each. The fit estimates all
-# cameras together, see ipsys_log.joint.
-CORNER_MODELS: dict[str, int] = {"joint": 0}
+# Models of the corners of markers. The fit estimates all cameras together, see ipsys_log.joint.
+CORNER_MODELS = ("joint",)
 
 
 def is_known(name: str) -> bool:
@@ -130,7 +140,7 @@ def check_name(name: str) -> None:
         This version does not have the model.
     """
     if not is_known(name):
-        known = ", ".join((*MODELS, *CORNER_MODELS))
+        known = ", ".join(MODELS + CORNER_MODELS)
         raise IpsysError(f"model {name!r} is not known; use one of {known}")
 
 
@@ -145,7 +155,7 @@ def create(name: str) -> Any:
     Raises
     ------
     IpsysError
-        The name is not in the table.
+        The model is unknown, or is a model of corners.
     """
     check_name(name)
     if reads_corners(name):
@@ -153,22 +163,30 @@ def create(name: str) -> Any:
             f"model {name} is fitted to the corners of markers, and cannot be used with camera points; use "
             "another model such as best"
         )
-    return MODELS[name]()
+    steps = [(part, _create_part(part)) for part in name.split("+")]
+    if len(steps) == 1:
+        return steps[0][1]
+    from sklearn.pipeline import Pipeline
+
+    return Pipeline(steps)
+
+
+def _create_part(name: str) -> Any:
+    create_estimator = MODEL_PARTS[name].create
+    assert create_estimator is not None, name
+    return create_estimator()
 
 
 def min_pairs(name: str) -> int:
     """Return the least number of calibration points that a model needs."""
-    if reads_corners(name):
-        return CORNER_MODELS[name]
-    return max(int(step.min_pairs) for _, step in _steps(create(name)))
+    check_name(name)
+    return max(MODEL_PARTS[part].min_pairs for part in name.split("+"))
 
 
-@cache
 def reads_height(name: str) -> bool:
     """Return whether a model needs the height of a marker above the floor."""
-    if reads_corners(name):
-        return True
-    return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
+    check_name(name)
+    return any(MODEL_PARTS[part].reads_height for part in name.split("+"))
 
 
 def needs_height(name: str) -> bool:
@@ -249,8 +267,8 @@ def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
         The model is unknown, or a parameter is missing.
     """
     estimator = create(name)
-    for prefix, step in _steps(estimator):
-        step.n_features_in_ = 4 if getattr(step, "reads_height", False) else 3
+    for part, (prefix, step) in zip(name.split("+"), _steps(estimator), strict=True):
+        step.n_features_in_ = 4 if MODEL_PARTS[part].reads_height else 3
         for attribute in step.fitted:
             key = prefix + attribute.rstrip("_")
             if key not in arrays:

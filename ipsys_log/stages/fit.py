@@ -23,7 +23,7 @@ from ipsys_log.errors import FitError
 from ipsys_log.messages import Model, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
-from ipsys_log.models.table import MODEL_VERSIONS, CalibrationPoints, min_pairs, reads_corners
+from ipsys_log.models.table import MODEL_PARTS, CalibrationPoints, min_pairs, reads_corners
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["BESIDE_LINE_M", "STAGE", "check_different", "check_pairs", "fit_model", "model_run"]
@@ -199,7 +199,7 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str
 
 STAGE = Stage(
     name="fit",
-    versions={"fit": 1, **MODEL_VERSIONS},
+    versions={"fit": 1} | {name: part.version for name, part in MODEL_PARTS.items()},
     reads=JOINT_READS,
     writes=(MODEL,),
     plan=_plan,

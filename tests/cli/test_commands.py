@@ -5,22 +5,34 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
+import click
 import pytest
+import typer.main
 
+from ipsys_log import pipeline
+from ipsys_log.cli.app import app
 from ipsys_log.cli.setup import SETTINGS
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.rig.file import check_rig, load_rig
+from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT, Ipsys
 
-COMMANDS = [
-    "init", "simulate", "cameras", "calibrate", "align", "import imsel", "import images", "import videos",
-    "record", "live", "measure", "replay", "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
-    "smooth", "report", "plan", "info", "runs", "repair", "verify", "diff", "latency", "view", "stream",
-]  # fmt: skip
+
+def command_names(command: click.Command, prefix: str = "") -> Iterator[str]:
+    """Yield the names of all commands, such as ``import imsel``."""
+    for name, child in getattr(command, "commands", {}).items():
+        if hasattr(child, "commands"):
+            yield from command_names(child, f"{prefix}{name} ")
+        else:
+            yield f"{prefix}{name}"
+
+
+COMMANDS = sorted(command_names(typer.main.get_command(app)))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -145,15 +157,19 @@ def test_runs_list_their_inputs(ipsys: Ipsys, replayed_lab: Path) -> None:
     assert {"numpy", "opencv-python-headless", "blas", "python"} <= set(runs["fit"]["fingerprint"])
 
 
+def print_of(program: str) -> str:
+    """Return what a Python program of this package prints."""
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    return done.stdout.strip()
+
+
 def test_help_imports_no_heavy_library() -> None:
     """The help and the shell completion appear at once."""
     program = (
         "import sys, ipsys_log.cli.app; print(sorted({'numpy', 'cv2', 'rerun', 'mcap'} & sys.modules.keys()))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
-    )
-    assert done.stdout.strip() == "[]"
+    assert print_of(program) == "[]"
 
 
 def test_pipeline_imports_no_library_that_only_models_need() -> None:
@@ -162,7 +178,16 @@ def test_pipeline_imports_no_library_that_only_models_need() -> None:
         "import sys, ipsys_log.pipeline, ipsys_log.restore, ipsys_log.runs.verify\n"
         "print(sorted({'sklearn', 'scipy', 'pandas', 'matplotlib'} & sys.modules.keys()))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
+    assert print_of(program) == "[]"
+
+
+def test_replay_that_is_done_imports_no_library_of_models(lab: Path) -> None:
+    """A command that finds everything up to date answers at once."""
+    pipeline.replay([lab], Request(models=("poly",)), "fit")
+    program = (
+        "import sys; from pathlib import Path; from ipsys_log import pipeline\n"
+        "from ipsys_log.runs.options import Request\n"
+        f"(*_, fit) = pipeline.replay([Path({str(lab)!r})], Request(models=('poly',)), 'fit')\n"
+        "print(fit.fresh, sorted({'sklearn', 'pandas', 'matplotlib'} & sys.modules.keys()))"
     )
-    assert done.stdout.strip() == "[]"
+    assert print_of(program) == "False []"

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors, mean_lengths
 from ipsys_log.analysis.plan import MeasurementPlan, PlannedPlace
-from ipsys_log.analysis.taped_points import TapeCovariances, choose_points
+from ipsys_log.analysis.tape import TapeCovariances
+from ipsys_log.analysis.taped_points import choose_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.model import JointModel
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,11 +21,13 @@ from ipsys_log.units import CM_PER_M
 
 __all__ = [
     "RiggedMeasurement",
+    "TapeCovariances",
     "TapePoint",
     "WeakPoint",
     "find_weak_points",
     "is_on_reference",
     "reference_points",
+    "tape_covariances",
     "with_usual_tape",
     "world_point",
 ]
@@ -38,6 +40,9 @@ _RULER_SIGMA_M = 0.001
 _FINEST_M = 0.0001
 _FLAT_RATIO = 3.0
 _FARTHEST_M = 10_000.0
+
+# A function from points (n, 2) to the covariances (n, 2, 2) of their positions by tape.
+TapeCovariances = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +59,29 @@ def with_usual_tape(rig: Rig) -> Rig:
     A small crossing angle of the tapes then excuses an error.
     """
     return replace(rig, tape_sigma_m=USUAL_TAPE_SIGMA_M) if rig.tape_sigma_m is None else rig
+
+
+def tape_covariances(rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_M) -> TapeCovariances:
+    """Return the covariances of points that are measured from all reference points of a rig.
+
+    With fewer than two reference points, a point is known as well as a tape measures a distance.
+
+    Parameters
+    ----------
+    usual_sigma_m : sigma of a distance, if the rig has none.
+    """
+    known_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points]).reshape(-1, 2)
+    sigma_m = rig.tape_sigma_m or usual_sigma_m
+    sigmas_m = np.full(len(known_m), sigma_m)
+
+    def covariances(points_m: Array) -> Array:
+        if len(known_m) < 2:
+            return np.broadcast_to(sigma_m**2 * np.eye(2), (len(points_m), 2, 2))
+        return np.array([tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m]).reshape(
+            -1, 2, 2
+        )
+
+    return covariances
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,17 +6,17 @@ more taped point on the whole floor follows from a small linear system, without 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.expected_error import ExpectedErrors, camera_modes, mean_lengths
+from ipsys_log.analysis.tape import TapeCovariances
 from ipsys_log.joint.model import JointModel
 
 __all__ = [
-    "TapeCovariances",
     "TapedPoint",
     "choose_points",
     "mean_error",
@@ -30,9 +30,6 @@ Array = NDArray[np.float64]
 _CORNER_SIGMA_M = 0.0003
 # So many camera-nodes give the mean error over the floor accurately enough for the choice of points.
 _ENOUGH_NODES = 800
-
-# A function from points (n, 2) to the covariances (n, 2, 2) of their tape readings.
-TapeCovariances = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

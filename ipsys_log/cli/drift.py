@@ -12,7 +12,7 @@ from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, RigFile
 
 if TYPE_CHECKING:
-    from ipsys_log.report.drift_reading import DriftReading
+    from ipsys_log.survey.drift_reading import DriftReading
 
 __all__ = ["add_commands"]
 
@@ -63,9 +63,9 @@ def drift(
     The command compares reference markers, which are fixed to the floor or to a wall, in logs of weeks. The
     rig lists them under reference_markers. It finds a mean shift of the floor map from 2 mm on.
     """
-    from ipsys_log.report.drift_reading import read_drift
     from ipsys_log.report.files import check_figure_file
     from ipsys_log.rig.file import load_rig
+    from ipsys_log.survey.drift_reading import read_drift
 
     if plot is not None:
         check_figure_file(plot, "--plot", logs)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from ipsys_log.analysis.drive_plan import PlannedDrive
     from ipsys_log.messages import Rig
-    from ipsys_log.report.plan import PlannedFloor
+    from ipsys_log.survey.floor_plan import PlannedFloor
 
 __all__ = ["add_commands"]
 
@@ -71,11 +71,11 @@ def plan(
     """
     from ipsys_log.messages.channels import MODEL, RIG
     from ipsys_log.report.files import check_figure_file
-    from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.graph import writes
     from ipsys_log.runs.select import copied_run
     from ipsys_log.sinks.selection import rig_in_force
+    from ipsys_log.survey.floor_plan import plan_floor
 
     given_rig = load_rig(rig) if rig else None
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
@@ -146,7 +146,7 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
 
 
 def _headline(found: PlannedFloor) -> str:
-    from ipsys_log.report.plan import means_cm
+    from ipsys_log.report.tables import means_cm
 
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
     subject = "this point" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} points"
@@ -156,7 +156,7 @@ def _headline(found: PlannedFloor) -> str:
 def _drive_line(drive: PlannedDrive) -> str:
     """Return the line of the drive that reduces the error most, with its effect without new points."""
     from ipsys_log.analysis.drive_plan import DRIVE_S
-    from ipsys_log.report.plan import means_cm
+    from ipsys_log.report.tables import means_cm
     from ipsys_log.units import CM_PER_M
 
     if not drive.is_useful:
@@ -172,7 +172,7 @@ def _drive_line(drive: PlannedDrive) -> str:
 def _table(found: PlannedFloor) -> Table:
     from rich.table import Table
 
-    from ipsys_log.report.plan import means_cm
+    from ipsys_log.report.tables import means_cm
     from ipsys_log.units import CM_PER_M
 
     title = f"Next points to measure, for the model {found.model} of run {found.run}"

@@ -9,8 +9,8 @@ from rich.table import Table
 
 from ipsys_log.analysis.camera_moves import CameraState, MarkerMove, Move
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Motion
-from ipsys_log.report.drift_reading import DriftReading
 from ipsys_log.report.tables import name_cell, plain_table, wrap_text
+from ipsys_log.survey.drift_reading import DriftReading
 from ipsys_log.units import MM_PER_M, format_time
 
 __all__ = ["drift_json", "drift_lines", "drift_table"]

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 
 from ipsys_log.analysis.camera_moves import CameraState
 from ipsys_log.analysis.drift import LEAST_SHIFT_M
-from ipsys_log.report.drift_reading import DriftReading
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
+from ipsys_log.survey.drift_reading import DriftReading
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
 __all__ = ["draw_drift"]

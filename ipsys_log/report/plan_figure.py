@@ -17,8 +17,9 @@ from scipy.ndimage import gaussian_filter
 from ipsys_log.analysis.drive_plan import PlannedDrive
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
-from ipsys_log.report.plan import PlannedFloor, means_cm, mesh
 from ipsys_log.report.styles import NOTE, REST, camera_styles
+from ipsys_log.report.tables import means_cm
+from ipsys_log.survey.floor_plan import PlannedFloor, mesh
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["draw_plan"]

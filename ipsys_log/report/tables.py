@@ -19,7 +19,7 @@ from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import GROUPS, HEIGHT_NOTE, Advice, Choice, advise, label, uses_height
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["accuracy_tables", "format_interval", "name_cell", "plain_table", "wrap_text"]
+__all__ = ["accuracy_tables", "format_interval", "means_cm", "name_cell", "plain_table", "wrap_text"]
 
 _WIDTH = 80
 
@@ -54,6 +54,21 @@ def format_interval(errors: ErrorStatistics) -> str:
         return "-"
     digits = 2 if errors.mean_high_m * CM_PER_M < 100 else 0
     return f"{errors.mean_low_m * CM_PER_M:.{digits}f}-{errors.mean_high_m * CM_PER_M:.{digits}f}"
+
+
+def means_cm(*means_m: float) -> list[str]:
+    """Format mean errors in cm with two decimals; with three if some values look equal otherwise.
+
+    Examples
+    --------
+    >>> means_cm(0.0062, 0.0051), means_cm(0.00184, 0.00177, 0.00176)
+    (['0.62', '0.51'], ['0.184', '0.177', '0.176'])
+    """
+    short, long = (
+        [f"{mean_m * CM_PER_M:.{digits}f}" if mean_m < 1 else "over 100" for mean_m in means_m]
+        for digits in (2, 3)
+    )
+    return short if len(set(short)) == len(set(long)) else long
 
 
 # A longer model name continues in the next line, if there is one.

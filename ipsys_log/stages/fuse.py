@@ -9,7 +9,6 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
-    STAMP_UNRELIABLE,
     Event,
     FrameTransform,
     FrameTransforms,
@@ -25,7 +24,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import POSES, POSITIONS, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.frame_reader import FrameReader
-from ipsys_log.tracking.track_inputs import TRACK_READS, model_of, track_reads, tracked_part
+from ipsys_log.tracking.track_inputs import TRACK_READS, LateFrames, model_of, track_reads, tracked_part
 from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
@@ -49,15 +48,14 @@ class Fuse:
         self._run, self._reader = run, FrameReader(model)
         self._rig: Rig | None = None
         self._settings, self._tracks = settings, RobotTracks(settings)
-        # By camera, the start and end time of its last late frames; None if there is no end yet.
-        self._late_ns: dict[str, tuple[int, int | None]] = {}
+        self._late_frames = LateFrames()
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
             self._use_rig(message.payload)
         elif isinstance(message.payload, Event):
-            self._note_late(message.payload)
-        elif isinstance(message.payload, Positions) and not self._is_late(message):
+            self._late_frames.note(message.payload)
+        elif isinstance(message.payload, Positions) and not self._late_frames.has(message):
             if self._rig is None:
                 raise IpsysError(
                     "the log has no rig (robots and their markers): give one with --rig lab.toml"
@@ -70,15 +68,6 @@ class Fuse:
         self._reader.use_rig(rig)
         if count != self._reader.modes.count:
             self._tracks = RobotTracks(self._settings, self._reader.modes.fade_m)
-
-    def _note_late(self, event: Event) -> None:
-        if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
-            self._late_ns[event.camera] = event.start, event.end
-
-    def _is_late(self, message: Message) -> bool:
-        start_ns, end_ns = self._late_ns.get(str(message.camera), (None, None))
-        time_ns = message.publish_time_ns
-        return start_ns is not None and start_ns <= time_ns and (end_ns is None or time_ns <= end_ns)
 
     def _poses(self, message: Message) -> list[Pose]:
         poses = self._tracks.coast_before(message.publish_time_ns)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import STAMP_UNRELIABLE, Event, Track, Tracks
+from ipsys_log.messages import Track, Tracks
 from ipsys_log.messages.channels import EVENTS, POSITIONS, RIG, SMOOTHED_TRACKS
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, Timed
 from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
-from ipsys_log.tracking.track_inputs import TRACK_READS, model_of, track_reads, tracked_part
+from ipsys_log.tracking.track_inputs import TRACK_READS, LateFrames, model_of, track_reads, tracked_part
 from ipsys_log.tracking.track_rows import make_track
 
 __all__ = ["STAGE"]
@@ -29,20 +29,11 @@ def _compute(view: StageView, progress: Progress) -> list[Timed]:
 
 def _frames(view: StageView) -> Iterator[Frame]:
     """Yield the positions of all frames, without late frames: these have wrong times."""
-    late_ns = _late_intervals(view.payloads(EVENTS))
+    late_frames = LateFrames(view.payloads(EVENTS))
     for message in view.messages(POSITIONS):
-        camera, time_ns, positions = str(message.camera), message.publish_time_ns, message.payload.positions
-        if not any(start <= time_ns and (end is None or time_ns <= end) for start, end in late_ns[camera]):
-            yield Frame(time_ns, camera, message.log_time_ns, positions)
-
-
-def _late_intervals(events: Iterable[Event]) -> Mapping[str, list[tuple[int, int | None]]]:
-    """Return the intervals of late frames by camera; the last event of an interval has its end."""
-    ends: dict[str, dict[int, int | None]] = defaultdict(dict)
-    for event in events:
-        if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
-            ends[event.camera][event.start] = event.end
-    return defaultdict(list, {camera: list(own.items()) for camera, own in ends.items()})
+        if not late_frames.has(message):
+            camera, time_ns = str(message.camera), message.publish_time_ns
+            yield Frame(time_ns, camera, message.log_time_ns, message.payload.positions)
 
 
 def _messages(poses: list[SmoothedPose]) -> list[Timed]:

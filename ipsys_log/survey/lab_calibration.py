@@ -17,9 +17,9 @@ from ipsys_log.analysis.expected_error import (
     find_gaps,
 )
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
-from ipsys_log.analysis.taped_points import TapeCovariances, TapedPoint, choose_points
+from ipsys_log.analysis.tape import tape_covariances
+from ipsys_log.analysis.taped_points import TapedPoint, choose_points
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, tape_covariance
 from ipsys_log.joint.diagnosis import Finding, find_faults
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.locate import locate_markers
@@ -222,7 +222,7 @@ def describe_fit(
         sizes_px,
         expected,
         _candidates(rig, low_m, high_m, step_m),
-        _tape(rig),
+        tape_covariances(rig),
         length_m,
         goal_m if max(c.mean_m for c in cameras if len(c.expected.errors_m)) > goal_m else np.inf,
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,
@@ -345,18 +345,6 @@ def _candidates(rig: Rig, low_m: Array, high_m: Array, step_m: float) -> Array:
     apart_m = np.linalg.norm(points_m[:, None] - known_m, axis=2)
     free: Array = points_m[(apart_m > _STEP_M).all(axis=1)]
     return free
-
-
-def _tape(rig: Rig) -> TapeCovariances:
-    known_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points]).reshape(-1, 2)
-    sigmas_m = np.full(len(known_m), rig.tape_sigma_m or USUAL_TAPE_SIGMA_M)
-
-    def covariances(points_m: Array) -> Array:
-        if len(known_m) < 2:
-            return np.broadcast_to(USUAL_TAPE_SIGMA_M**2 * np.eye(2), (len(points_m), 2, 2))
-        return np.array([tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m])
-
-    return covariances
 
 
 def _notes(

@@ -18,8 +18,8 @@ from ipsys_log.geometry.trilateration import tape_covariance
 from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models.table import CalibrationPoints, fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.report.plan import view_of_model
 from ipsys_log.stages.fit import fit_model
+from ipsys_log.survey.floor_plan import view_of_model
 
 Array = NDArray[np.float64]
 

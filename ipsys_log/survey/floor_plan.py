@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, plan_points
+from ipsys_log.analysis.tape import TapeCovariances, tape_covariances
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
-from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, are_collinear, tape_covariance
+from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, are_collinear
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.units import CM_PER_M
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.drive_plan import PlannedDrive
 
-__all__ = ["PlannedFloor", "means_cm", "mesh", "plan_floor", "view_of_model"]
+__all__ = ["PlannedFloor", "mesh", "plan_floor", "view_of_model"]
 
 Array = NDArray[np.float64]
 Lenses = Mapping[str, CameraCalibration]
@@ -267,24 +267,11 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
     return variances
 
 
-def _tape_covariances(session: Session, rig: Rig) -> Callable[[Array], Array]:
-    """Return a function for the covariances (n, 2, 2) of tape measurements at points (n, 2).
-
-    Without two reference points, a point is known as well as a tape measures a distance.
-    """
-    known_m = _references(rig)
+def _tape_covariances(session: Session, rig: Rig) -> TapeCovariances:
+    """Return the covariances of tape measurements with the usual sigma of the measurements in a log."""
     payloads = session.payloads(session.topics(MEASUREMENTS)) if rig.tape_sigma_m is None else []
     named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
-    sigma_m = rig.tape_sigma_m or float(np.median(named_m or USUAL_TAPE_SIGMA_M))
-
-    def covariances(points_m: Array) -> Array:
-        if len(known_m) < 2:
-            return np.broadcast_to(sigma_m**2 * np.eye(2), (len(points_m), 2, 2))
-        sigmas_m = np.full(len(known_m), sigma_m)
-        each_m2 = [tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m]
-        return np.array(each_m2).reshape(-1, 2, 2)
-
-    return covariances
+    return tape_covariances(rig, float(np.median(named_m or USUAL_TAPE_SIGMA_M)))
 
 
 def _joint_notes(rig: Rig, fitted: set[str]) -> Iterator[str]:
@@ -325,18 +312,3 @@ def _notes(model: Model, rig: Rig, lenses: Lenses, plan: MeasurementPlan) -> Ite
     yield from _rig_notes(rig)
     if plan.places[-1].mean_after_m > (1 - _LITTLE) * plan.places[0].mean_before_m:
         yield "these points change little: most of the predicted error is camera noise, not fit error"
-
-
-def means_cm(*means_m: float) -> list[str]:
-    """Format mean errors in cm with two decimals; with three if some values look equal otherwise.
-
-    Examples
-    --------
-    >>> means_cm(0.0062, 0.0051), means_cm(0.00184, 0.00177, 0.00176)
-    (['0.62', '0.51'], ['0.184', '0.177', '0.176'])
-    """
-    short, long = (
-        [f"{mean_m * CM_PER_M:.{digits}f}" if mean_m < 1 else "over 100" for mean_m in means_m]
-        for digits in (2, 3)
-    )
-    return short if len(set(short)) == len(set(long)) else long

@@ -153,7 +153,10 @@ def test_skipped_frames_are_processed_by_a_replay(
     share: float,
 ) -> None:
     """The kill is between two writes: frames are there, but no results of the last frames."""
-    images = [chunk for chunk in _chunks(recorded) if not chunk.compression]
+    chunks = sorted(_chunks(recorded), key=lambda chunk: chunk.offset)
+    # The first small chunk has the settings of the recording, the second has results.
+    _, results, *_ = (chunk for chunk in chunks if chunk.compression)
+    images = [chunk for chunk in chunks if not chunk.compression and chunk.offset > results.offset]
     last = images[int(share * len(images))]
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(recorded.read_bytes()[: last.end])

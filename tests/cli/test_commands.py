@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
-import click
 import pytest
 import typer.main
 
@@ -23,7 +23,7 @@ from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT, Ipsys
 
 
-def command_names(command: click.Command, prefix: str = "") -> Iterator[str]:
+def command_names(command: Any, prefix: str = "") -> Iterator[str]:
     """Yield the names of all commands, such as ``import imsel``."""
     for name, child in getattr(command, "commands", {}).items():
         if hasattr(child, "commands"):

@@ -27,7 +27,7 @@ MODELS = ("poly", "joint")
 def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a log with both models."""
     path = tmp_path_factory.mktemp("models") / "calibration.mcap"
-    pipeline.replay([lab_log], Request(models=MODELS), output=path)
+    pipeline.replay([lab_log], Request(models=MODELS), "fit", output=path)
     return path
 
 

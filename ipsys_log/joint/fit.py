@@ -141,9 +141,9 @@ def _build(
             rows = trajectory >= 0
             if rows.any():
                 own = sightings.select(rows), trajectory[rows], kind
-                factors.append(
-                    make_sighting_factors(camera, *own, observations.bodies, settings.corner_floor_px)
-                )
+                # Only an average over many frames has less noise than the errors of print and lens.
+                floor_px = settings.corner_floor_px if kind is Kind.STATIONARY else 0.0
+                factors.append(make_sighting_factors(camera, *own, observations.bodies, floor_px))
     trajectories = Trajectories(
         len(observations.points), paths, settings.acceleration_sigma, settings.turn_sigma
     )

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 # Modes of the joint covariance below this share of a prior variance are left out.
 _LEAST_SHARE = 1e-10
+# Clock offsets and row times of fewer standard deviations than this may be 0.
+_SIGNIFICANT = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +38,7 @@ class JointModel:
     origin_m : (3,), position of the camera in the world.
     lens : (q,), intrinsics: fx, fy, cx, cy in px, and the coefficients of the distortion.
     edge_offset_px, clock_s, row_time_s : offset of edges; the time to add to the stamps of the camera; the
-        time between rows.
+        time between rows. Both times are 0 if the estimate does not differ significantly from 0.
     scale : factor on the nominal size of a marker: the mean of all bodies.
     floor : the field of the floor, and ``amplitudes`` (f,) of its modes.
     modes : (6 + q + 3 + 1 + f, m), by turn (3), origin (3), lens (q), edge offset, clock, row time, scale,
@@ -114,7 +116,8 @@ def build_models(fit: JointFit) -> dict[str, JointModel]:
     modes = covariance_modes(fit.covariance)
     models = {}
     for number, (camera, block) in enumerate(zip(fit.observations.cameras, layout.cameras, strict=True)):
-        edge_px, clock_s, row_s = state.values[block.edge : block.stop].tolist()
+        edge_px = float(state.values[block.edge])
+        clock_s, row_s = (_significant(fit, column) for column in range(block.edge + 1, block.stop))
         own = [modes[block.start : block.stop], modes[layout.scales].mean(axis=0)[None], modes[layout.modes]]
         models[camera.name] = JointModel(
             block.model,
@@ -131,6 +134,12 @@ def build_models(fit: JointFit) -> dict[str, JointModel]:
             fit.settings.corner_floor_px,
         )
     return models
+
+
+def _significant(fit: JointFit, column: int) -> float:
+    """Return a global unknown, or 0 if it may be 0: synchronised cameras then have common instants."""
+    value, sigma = float(fit.state.values[column]), float(np.sqrt(fit.covariance[column, column]))
+    return value if abs(value) > _SIGNIFICANT * sigma else 0.0
 
 
 def covariance_modes(covariance: Array) -> Array:

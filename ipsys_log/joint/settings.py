@@ -16,8 +16,8 @@ class JointSettings:
     floor_sigma_m, floor_length_m : standard deviation and correlation length of the floor's unevenness.
     floor_sigma_spread : uncertainty of this standard deviation, as that of its logarithm. The fit estimates
         it; 0 keeps it constant.
-    corner_floor_px : error of a corner that the covariance of the detection does not contain: the rest of the
-        lens distortion, and the print. An average over frames does not reduce it.
+    corner_floor_px : error of a corner of a stationary marker that the covariance of the detection does not
+        contain: the rest of the lens distortion, and the print. An average over frames does not reduce it.
     focal_sigma, centre_sigma, distortion_sigma : uncertainty of a chessboard calibration: focal length
         (relative), principal point (share of the width), coefficients of the lens distortion. A usual
         calibration is better than this by a factor of two or three, but its errors are correlated: a

@@ -49,3 +49,15 @@ def fit_clock(wobble_deg: float) -> tuple[float, float]:
 def test_wobble_of_a_robot_does_not_move_its_clocks() -> None:
     (level_s, sigma_s), (tilted_s, _) = fit_clock(0.0), fit_clock(0.1)
     assert abs(tilted_s - level_s) < 0.1 * sigma_s
+
+
+def test_cameras_without_clock_offsets_have_common_instants() -> None:
+    """Estimates of clocks and row times that may be 0 are 0 in the models, so that instants stay equal."""
+    lab = LabSettings(seed=3, rate_hz=10.0, drive_s=30.0, markers=1, cameras=("red", "white"))
+    fit = fit_jointly(observe(build_lab(GeometricSettings(lab=lab, points=8))))
+    edges = [block.edge for block in fit.problem.layout.cameras]
+    assert fit.state.values[[edge + 1 for edge in edges]].any()
+    assert {(model.clock_s, model.row_time_s) for model in build_models(fit).values()} == {(0.0, 0.0)}
+    offset = GeometricSettings(lab=lab, points=8, clock_offset_s=0.01)
+    clocks_s = [model.clock_s for model in build_models(fit_jointly(observe(build_lab(offset)))).values()]
+    assert np.count_nonzero(clocks_s) == 1

@@ -52,15 +52,13 @@ def environment() -> dict[str, str]:
 def computed(corners: str, method: str) -> Channels:
     """Compute all stages on the golden log with all models, and return the contents of their channels.
 
-    Models are evaluated with ``poly`` and with the models of corners only, and positions are fused with
-    ``poly`` only: the number of instants of ``joint`` depends on rounding.
+    Models are evaluated, and positions are fused, with ``poly`` and with the models of corners only.
     """
     with tempfile.TemporaryDirectory() as folder:
         log = Path(shutil.copy(LOG, folder))
         request = Request(models=(*MODELS, *CORNER_MODELS), corners=corners, method=method)
         pipeline.replay([log], request, "locate")
-        pipeline.replay([log], dataclasses.replace(request, models=(*CORNER_MODELS,)), "evaluate")
-        pipeline.replay([log], dataclasses.replace(request, models=("poly",)), "smooth")
+        pipeline.replay([log], dataclasses.replace(request, models=("poly", *CORNER_MODELS)), "smooth")
         with Session([log]) as session:
             topics = sorted(
                 topic

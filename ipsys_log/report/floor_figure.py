@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -33,7 +34,7 @@ from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
-from ipsys_log.report.styles import GRID, REST, camera_styles, robot_colour, shorten
+from ipsys_log.report.styles import GRID, REST, camera_styles, robot_colour, robot_line, shorten
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.units import CM_PER_M
@@ -47,6 +48,7 @@ __all__ = [
     "draw_ground",
     "draw_key",
     "draw_session",
+    "read_floor",
     "show_square",
     "square_around",
 ]
@@ -167,16 +169,16 @@ def _steps(half_m: float) -> MultipleLocator:
 
 
 def _draw_tracks(axes: Axes, scene: FloorData) -> None:
-    names = sorted({*scene.tracks, *scene.truth})
-    colours = {name: robot_colour(number) for number, name in enumerate(names)}
+    numbers = {name: number for number, name in enumerate(sorted({*scene.tracks, *scene.truth}))}
     for name, line in scene.truth.items():
         axes.plot(*line.T, "--", color="black", lw=0.8, zorder=2.5, label="_" + name)
     for name, line in scene.tracks.items():
-        axes.plot(*line.T, "-", color=colours[name], lw=1.6, zorder=2)
+        colour, style = robot_colour(numbers[name]), robot_line(numbers[name])
+        axes.plot(*line.T, style, color=colour, lw=1.6, zorder=2, label="_" + name)
         # The dots show a stationary robot, which has no visible line.
-        axes.plot(*line.T, ".", color=colours[name], ms=2.2, zorder=2)
+        axes.plot(*line.T, ".", color=colour, ms=2.2, zorder=2)
     for name in islice(scene.tracks, _MOST_ROBOTS):
-        axes.plot([], [], "-", color=colours[name], lw=1.6, label=name)
+        axes.plot([], [], robot_line(numbers[name]), color=robot_colour(numbers[name]), lw=1.6, label=name)
     if len(scene.tracks) > _MOST_ROBOTS:
         axes.plot([], [], "-", color=REST, label=f"{len(scene.tracks) - _MOST_ROBOTS} more robots")
     if scene.truth:
@@ -273,7 +275,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     IpsysError
         The session has no floor, no measured points and no tracks.
     """
-    scene = _gather(session, accuracies)
+    scene = read_floor(session, accuracies)
     rows = count_rows(accuracies)
     # Rows of text need some height. With more than about 28 rows, the figure grows.
     figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
@@ -292,7 +294,8 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
 
 
-def _gather(session: Session, accuracies: Sequence[Accuracy]) -> FloorData:
+def read_floor(session: Session, accuracies: Sequence[Accuracy]) -> FloorData:
+    """Return the data of a session to draw; raise IpsysError if there are none."""
     evaluated = [accuracy for accuracy in accuracies if accuracy.evaluation is not None]
     runs = [accuracy.run for accuracy in (evaluated or accuracies)]
     run = runs[0] if runs else newest_run(session, TRACKS)
@@ -315,12 +318,14 @@ def _gather(session: Session, accuracies: Sequence[Accuracy]) -> FloorData:
 
 def _lines(session: Session, topics: Sequence[str], rig: Rig | None) -> dict[str, NDArray[np.float64]]:
     """Return the tracks on the floor by robot, (n, 2) in m, one point per instant, NaN at a break."""
-    lines = {}
+    lines: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     for marker_id, track in sorted(gather_tracks(session.messages(topics)).items() if topics else ()):
         # A track may have several poses with the same time. The last of them uses all cameras.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
         points_m = track.points_m[::-1][last][:, :2]
         broken = (np.linalg.norm(np.diff(points_m, axis=0), axis=1) > _STEP_M) | (np.diff(times_ns) > _GAP_NS)
         name = rig.robot_of(marker_id) if rig else f"marker_{marker_id}"
-        lines[name] = np.insert(points_m, np.flatnonzero(broken) + 1, np.nan, axis=0)
-    return lines
+        # A robot may have several markers: the lines of all are one line with breaks.
+        breaks = (*np.flatnonzero(broken) + 1, len(points_m))
+        lines[name].append(np.insert(points_m, breaks, np.nan, axis=0))
+    return {name: np.concatenate(parts)[:-1] for name, parts in lines.items()}

@@ -20,6 +20,7 @@ __all__ = [
     "camera_styles",
     "model_styles",
     "robot_colour",
+    "robot_line",
     "shorten",
 ]
 
@@ -29,6 +30,7 @@ _NAMED = {"red": "#D55E00", "white": "#8C8C8C", "black": "#000000", "blue": "#00
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#8C8C8C")
 _SHAPES = "osD^vP*X"
 _ROBOTS = ("#56B4E9", "#E69F00", "#CC79A7", "#009E73", "#0072B2", "#9467BD")
+_LINES = ("-", "--", ":", "-.")
 _MODELS = {
     "rigid": ("#0072B2", "o"),
     "poly": ("#D55E00", "s"),
@@ -80,6 +82,11 @@ def model_styles(models: Iterable[str]) -> dict[str, ModelStyle]:
 def robot_colour(number: int) -> str:
     """Return the colour of a robot by its number, from 0."""
     return _ROBOTS[number % len(_ROBOTS)]
+
+
+def robot_line(number: int) -> str:
+    """Return the line style of a robot by its number, from 0; robots of one colour have different styles."""
+    return _LINES[number // len(_ROBOTS) % len(_LINES)]
 
 
 def shorten(name: str) -> str:

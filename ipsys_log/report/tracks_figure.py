@@ -17,7 +17,7 @@ from ipsys_log.messages import Track
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
-from ipsys_log.report.styles import robot_colour, shorten
+from ipsys_log.report.styles import robot_colour, robot_line, shorten
 
 __all__ = ["DrawnTrack", "draw_tracks", "plot_tracks", "read_drawn_tracks"]
 
@@ -88,7 +88,7 @@ def draw_tracks(axes: Axes, tracks: dict[str, DrawnTrack]) -> int:
     enlarged = larger[-1] if larger else 1
     for number, (robot, track) in enumerate(tracks.items()):
         colour = robot_colour(number)
-        axes.plot(*track.line_m.T, color=colour, lw=1.2, label=shorten(robot))
+        axes.plot(*track.line_m.T, robot_line(number), color=colour, lw=1.2, label=shorten(robot))
         for centre_m, covariance_m2 in zip(*track.regions, strict=True):
             axes.add_patch(_ellipse(centre_m, covariance_m2, enlarged, colour))
     hand_overs_m = np.concatenate([track.hand_overs_m for track in tracks.values()] or [np.empty((0, 2))])

@@ -28,6 +28,7 @@ from ipsys_log.messages import (
     ReferencePoint,
     Residual,
     Rig,
+    RigMarker,
     Run,
     Track,
     Tracks,
@@ -35,7 +36,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.floor_figure import FloorData, draw_floor, draw_session
+from ipsys_log.report.floor_figure import FloorData, draw_floor, draw_session, read_floor
 from ipsys_log.report.styles import camera_styles
 from ipsys_log.runs.output import write_log
 
@@ -117,6 +118,20 @@ def test_figure_without_a_rig_shows_points_and_tracks(tmp_path: Path) -> None:
     with Session([tmp_path / "lab.mcap"]) as session:
         draw_session(session, [], tmp_path / "lab.png")
     assert (tmp_path / "lab.png").stat().st_size > 1000
+
+
+def test_robot_with_two_markers_has_the_lines_of_both(tmp_path: Path) -> None:
+    rig = replace(RIG, markers=(RigMarker(0, robot="ada"), RigMarker(1, robot="ada")))
+    tracks = [Track("ada", n % 2, 1.0 + n % 2, 2 + 0.02 * n, 0.1) for n in range(10)]
+    written = [Message("/rig", T0, T0, rig)]
+    for n, track in enumerate(tracks):
+        time_ns = T0 + 100_000_000 * n
+        written.append(Message("/runs/poly/tracks", time_ns, time_ns, Tracks(time_ns, (track,))))
+    written.append(Message("/runs/poly/record", time_ns, time_ns, Run(time_ns, "poly", "fuse", number=1)))
+    write_log(tmp_path / "lab.mcap", written)
+    with Session([tmp_path / "lab.mcap"]) as session:
+        lines = read_floor(session, []).tracks
+    np.testing.assert_array_equal(lines["ada"][:, 0], [1, 1, 1, 1, 1, np.nan, 2, 2, 2, 2, 2])
 
 
 def test_log_without_data_to_draw_is_refused(tmp_path: Path) -> None:

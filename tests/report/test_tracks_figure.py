@@ -11,7 +11,7 @@ from matplotlib.patches import Ellipse
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.report.tracks_figure import draw_tracks, plot_tracks, read_drawn_tracks
+from ipsys_log.report.tracks_figure import DrawnTrack, draw_tracks, plot_tracks, read_drawn_tracks
 from ipsys_log.runs.output import write_log
 
 EPOCH_NS, STEP_NS = 1_700_000_000_000_000_000, 50_000_000
@@ -52,3 +52,12 @@ def test_log_without_tracks_has_none_to_draw(tmp_path: Path) -> None:
     with Session([tmp_path / "drive.mcap"]) as session:
         assert read_drawn_tracks(session, "best") == {}
     assert draw_tracks(Figure().add_subplot(), {}) >= 1
+
+
+def test_tracks_of_many_robots_look_different() -> None:
+    line_m, none_m = np.array([[0.0, 0.0], [1.0, 1.0]]), (np.empty((0, 2)), np.empty((0, 2, 2)))
+    tracks = {f"robot_{n}": DrawnTrack(line_m, none_m, np.empty((0, 2))) for n in range(20)}
+    axes = Figure().add_subplot()
+    draw_tracks(axes, tracks)
+    lines = [line for line in axes.lines if str(line.get_label()).startswith("robot")]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,18 @@ RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(0, robot="ada"), RigMarker(1, r
 def track(robot: str, x_m: float, heading_rad: float | None = 0.0, inside: bool | None = True) -> Track:
     number = {"ada": 0, "bob": 1}[robot]
     return Track(robot, number, x_m, 2.0, 0.1, heading_rad, np.eye(3) * 1e-4, ("red",), inside)
+
+
+def moving_track(robot: str, heading_rad: float) -> Track:
+    """Return a track with a velocity along x, and different uncertainties in all axes."""
+    return replace(
+        track(robot, 1.0, heading_rad),
+        velocity_m_s=np.array([0.5, 0.0, 0.0]),
+        velocity_covariance_m2_s2=np.diag([1e-4, 4e-4, 9e-4]),
+        heading_sigma_rad=0.02,
+        turn_rate_rad_s=0.1,
+        turn_rate_sigma_rad_s=0.03,
+    )
 
 
 def tracks(number: int, *rows: Track, late_ns: int = 30_000_000) -> Message:

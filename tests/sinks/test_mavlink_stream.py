@@ -17,7 +17,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
 
 _LIMIT_S = 60.0
 NOW_NS = START_NS + 7
@@ -120,6 +120,19 @@ def test_covariance_is_turned_and_unknown_values_are_nan(autopilot: Autopilot) -
     assert [first[n] for n in (0, 6, 11)] == pytest.approx([4e-4, 1e-4, 9e-4])
     assert all(isnan(first[n]) for n in (3, 15, 18, 20))
     assert all(map(isnan, second))
+
+
+def test_covariance_of_the_velocity_is_along_the_robot(autopilot: Autopilot) -> None:
+    """The robot faces along y, which is north: its velocity along x is to the right."""
+    with streaming(autopilot) as (stream, _):
+        stream.consume(iter([tracks(0, moving_track("ada", np.pi / 2))]))
+        last = autopilot.next("ODOMETRY")
+    assert [last.vx, last.vy] == pytest.approx([0.0, 0.5], abs=1e-6)
+    # The diagonal of the upper triangle by rows.
+    diagonal = [last.velocity_covariance[n] for n in (0, 6, 11, 20)]
+    assert diagonal == pytest.approx([4e-4, 1e-4, 9e-4, 0.03**2])
+    assert last.pose_covariance[20] == pytest.approx(0.02**2)
+    assert all(isnan(last.velocity_covariance[n]) for n in (3, 15, 18))
 
 
 def test_new_session_raises_the_reset_counter(autopilot: Autopilot) -> None:

@@ -24,7 +24,7 @@ from ipsys_log.sinks.streams.rmw_zenoh import Entity, Qos, attachment, gid, topi
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.units import NS_PER_S
 from tests.sinks.open_sockets import exposed
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
 from tests.sinks.zenoh_listener import ZenohListener, open_node, wait_for
 
 STRING = "std_msgs/msg/String"
@@ -147,6 +147,20 @@ def test_poses_arrive_with_stamps_frames_and_covariance() -> None:
     assert [row[0] for row in rows] == [1, 2, 3, 4]
     assert {(length, number) for *_, length, number in rows} == {(16, gid(token))}
     assert abs(rows[0][1] - time.time_ns()) < 60 * NS_PER_S
+
+
+def test_odometry_has_the_variances_along_the_robot() -> None:
+    """The robot faces along y: its velocity along x is to the right."""
+    topics = ("/ada/pose", "/ada/odom")
+    with streaming() as (stream, _), listening(stream, *topics) as listener:
+        stream.consume(iter([tracks(0, moving_track("ada", pi / 2))]))
+        (pose,), (odometry,) = listener.messages("/ada/pose"), listener.messages("/ada/odom")
+    twist = odometry.twist
+    assert [twist.twist.linear.x, twist.twist.linear.y] == pytest.approx([0.0, -0.5])
+    expected = [4e-4, 1e-4, 9e-4, 1e6, 1e6, 0.03**2]
+    assert np.diag(np.reshape(twist.covariance, (6, 6))) == pytest.approx(expected)
+    for one in (pose.pose, odometry.pose):
+        assert np.diag(np.reshape(one.covariance, (6, 6)))[5] == pytest.approx(0.02**2)
 
 
 def test_node_and_publishers_are_in_the_graph() -> None:

@@ -24,7 +24,7 @@ from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.udp import UdpStream, encode_pose
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks, write_tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks, write_tracks
 
 KEY = b"0123456789abcdef"
 Receive = Callable[[socket.socket, bytes], Iterator[Any]]
@@ -79,7 +79,7 @@ def test_receiver_gets_the_poses_of_a_played_log(tmp_path: Path, listening: sock
     assert [pose["x_m"] for pose in of_ada] == pytest.approx([1 + 0.01 * n for n in range(50)])
     assert of_ada[-1]["vx_m_s"] == pytest.approx(0.25, abs=1e-6)
     assert of_ada[0]["covariance_m2"] == pytest.approx((np.eye(3) * 1e-4).ravel().tolist())
-    assert (of_ada[0]["stale"], of_ada[0]["outside"]) == (False, False)
+    assert of_ada[0]["outside"] is False
 
 
 def test_receiver_drops_old_repeated_and_foreign_datagrams(listening: socket.socket) -> None:
@@ -161,6 +161,13 @@ def test_poses_without_numbers_are_not_sent() -> None:
     broken = replace(track("ada", 1.0), covariance_m2=np.full((3, 3), np.nan))
     (pose,) = poses_of([tracks(0, broken)])
     assert "covariance_m2" not in json.loads(encode_pose(pose))
+
+
+def test_uncertainty_of_velocity_and_heading_is_sent() -> None:
+    (pose,) = poses_of([tracks(0, moving_track("ada", 0.0))])
+    fields = json.loads(encode_pose(pose))
+    assert fields["velocity_covariance_m2_s2"] == pytest.approx(np.diag([1e-4, 4e-4, 9e-4]).ravel().tolist())
+    assert (fields["heading_sigma_rad"], fields["yaw_sigma_rad_s"]) == (0.02, 0.03)
 
 
 def test_velocity_is_the_slope_over_the_turn_of_a_heading() -> None:

@@ -140,7 +140,8 @@ def test_client_of_motioncapture_gets_the_poses() -> None:
     poses = dict(map(json.loads, lines))
     assert poses["ada"] == pytest.approx([1.25, 2.0, 0.1, 0, 0, sin(0.25), cos(0.25)], abs=1e-6)
     assert poses["bob"] == pytest.approx([3.0, 2.0, 0.1, 0, 0, sin(-1.0), cos(-1.0)], abs=1e-6)
-    assert served.events == []
+    # On a busy machine, the client may get too little time to read all messages.
+    assert all("is too slow" in event for event in served.events)
 
 
 def test_reports_have_capture_times_poses_and_velocities() -> None:

@@ -21,19 +21,22 @@ __all__ = ["NORTH_RAD", "encode_odometry", "encode_vision"]
 # The direction of north by default: the y axis of the lab.
 NORTH_RAD = pi / 2
 _NS_PER_US = 1000
-_UNKNOWN = [nan] * 21
 _RESETS = 256
 
 
 @dataclass(frozen=True, slots=True)
 class _LocalPose:
-    """A pose in the axes north, east, down, in m and rad; velocities along the axes of the robot."""
+    """A pose in the axes north, east, down, in m and rad; velocities along the axes of the robot.
+
+    Covariances are the upper triangles, row by row, of 6 x 6: along three axes, and about them.
+    """
 
     position_m: NDArray[np.float64]
     yaw_rad: float
     velocity_m_s: NDArray[np.float64]
     yaw_rad_s: float
     covariance: list[float]
+    velocity_covariance: list[float]
 
 
 def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> Any:
@@ -57,7 +60,7 @@ def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> A
         nan,
         local.yaw_rad_s,
         local.covariance,
-        _UNKNOWN,
+        local.velocity_covariance,
         pose.session % _RESETS,
         common.MAV_ESTIMATOR_TYPE_MOCAP,
     )
@@ -83,17 +86,36 @@ def _localize(pose: StreamPose, heading_rad: float, north_rad: float) -> _LocalP
         [[cos(north_rad), sin(north_rad), 0], [sin(north_rad), -cos(north_rad), 0], [0, 0, -1]]
     )
     yaw_rad = (north_rad - heading_rad + pi) % (2 * pi) - pi
-    velocity_m_s, yaw_rad_s = np.full(3, nan), nan
+    velocity_m_s, yaw_rad_s, velocity_covariance = np.full(3, nan), nan, _upper(None, None)
     if velocity is not None:
         body_from_local = np.array(
             [[cos(yaw_rad), sin(yaw_rad), 0], [-sin(yaw_rad), cos(yaw_rad), 0], [0, 0, 1]]
         )
-        in_world_m_s = np.array([velocity.x_m_s, velocity.y_m_s, velocity.z_m_s])
-        velocity_m_s = body_from_local @ local_from_world @ in_world_m_s
+        body_from_world = body_from_local @ local_from_world
+        velocity_m_s = body_from_world @ np.array([velocity.x_m_s, velocity.y_m_s, velocity.z_m_s])
         yaw_rad_s = nan if velocity.yaw_rad_s is None else -velocity.yaw_rad_s
-    covariance = np.full((6, 6), nan)
-    if pose.covariance_m2 is not None:
-        covariance[:3, :3] = local_from_world @ pose.covariance_m2 @ local_from_world.T
+        known = velocity.covariance_m2_s2
+        velocity_covariance = _upper(
+            None if known is None else body_from_world @ known @ body_from_world.T,
+            None if velocity.yaw_rad_s is None else velocity.yaw_sigma_rad_s,
+        )
+    known = pose.covariance_m2
+    covariance = _upper(
+        None if known is None else local_from_world @ known @ local_from_world.T, pose.heading_sigma_rad
+    )
     position_m = local_from_world @ np.array([track.x_m, track.y_m, track.z_m])
+    return _LocalPose(position_m, yaw_rad, velocity_m_s, yaw_rad_s, covariance, velocity_covariance)
+
+
+def _upper(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> list[float]:
+    """Return the upper triangle of a covariance of 6 x 6; unknown values are NaN.
+
+    ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z.
+    """
+    covariance = np.full((6, 6), nan)
+    if known is not None:
+        covariance[:3, :3] = known
+    if yaw_sigma is not None:
+        covariance[5, 5] = yaw_sigma**2
     upper: list[float] = covariance[np.triu_indices(6)].tolist()
-    return _LocalPose(position_m, yaw_rad, velocity_m_s, yaw_rad_s, upper)
+    return upper

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from math import isfinite
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,6 +24,8 @@ _WINDOW_NS, _SHORTEST_NS = NS_PER_S // 5, NS_PER_S // 20
 _FEWEST_POSES = 3
 _NS_PER_MS = NS_PER_S // 1000
 
+Number = TypeVar("Number", Mat33, float)
+
 
 @dataclass(frozen=True, slots=True)
 class NewSession:
@@ -38,12 +41,17 @@ def first_session(now_ns: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Velocity:
-    """The velocity of a robot in m/s, and the rate of its heading in rad/s (None: headings are missing)."""
+    """The velocity of a robot in m/s, and the rate of its heading in rad/s (None: headings are missing).
+
+    ``covariance_m2_s2`` (3, 3) and ``yaw_sigma_rad_s`` are their uncertainties; None if these are unknown.
+    """
 
     x_m_s: float
     y_m_s: float
     z_m_s: float
     yaw_rad_s: float | None
+    covariance_m2_s2: Mat33 | None = None
+    yaw_sigma_rad_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +85,11 @@ class StreamPose:
 
     @property
     def covariance_m2(self) -> Mat33 | None:
-        covariance_m2 = self.track.covariance_m2
-        return covariance_m2 if covariance_m2 is None or np.isfinite(covariance_m2).all() else None
+        return _finite(self.track.covariance_m2)
+
+    @property
+    def heading_sigma_rad(self) -> float | None:
+        return _finite(self.track.heading_sigma_rad)
 
 
 class PoseSource:
@@ -139,6 +150,11 @@ class PoseSource:
         )
 
 
+def _finite(value: Number | None) -> Number | None:
+    """Return a value; None if a part of it is no number: a log of another program may hold such values."""
+    return value if value is not None and np.isfinite(value).all() else None
+
+
 def _is_finite(track: Track) -> bool:
     """Return whether a pose is a number; a log of another program may hold others."""
     return all(map(isfinite, (track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0)))
@@ -168,7 +184,8 @@ class _Recent:
         if newest.velocity_m_s is None or not np.isfinite(newest.velocity_m_s).all():
             return self._slope()
         x_m_s, y_m_s, z_m_s = newest.velocity_m_s.tolist()
-        return Velocity(x_m_s, y_m_s, z_m_s, newest.turn_rate_rad_s)
+        sigmas = _finite(newest.velocity_covariance_m2_s2), _finite(newest.turn_rate_sigma_rad_s)
+        return Velocity(x_m_s, y_m_s, z_m_s, _finite(newest.turn_rate_rad_s), *sigmas)
 
     def _slope(self) -> Velocity | None:
         """Return the slope of the poses; None if the poses are too few, or their time is too short."""

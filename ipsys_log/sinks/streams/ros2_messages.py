@@ -117,12 +117,19 @@ def encode_pose(pose: StreamPose, heading_rad: float) -> bytes:
 
 def encode_odometry(pose: StreamPose, heading_rad: float, velocity: Velocity) -> bytes:
     """Return the message Odometry of a pose; the velocity is along the axes of the robot."""
-    ahead_m_s = cos(heading_rad) * velocity.x_m_s + sin(heading_rad) * velocity.y_m_s
-    left_m_s = cos(heading_rad) * velocity.y_m_s - sin(heading_rad) * velocity.x_m_s
-    linear = _make("geometry_msgs/Vector3", ahead_m_s, left_m_s, velocity.z_m_s)
+    body_from_map = np.array(
+        [[cos(heading_rad), sin(heading_rad), 0], [-sin(heading_rad), cos(heading_rad), 0], [0, 0, 1]]
+    )
+    in_map_m_s = np.array([velocity.x_m_s, velocity.y_m_s, velocity.z_m_s])
+    linear = _make("geometry_msgs/Vector3", *(body_from_map @ in_map_m_s).tolist())
     angular = _make("geometry_msgs/Vector3", 0.0, 0.0, velocity.yaw_rad_s or 0.0)
+    known = velocity.covariance_m2_s2
+    covariance = _covariance(
+        None if known is None else body_from_map @ known @ body_from_map.T,
+        None if velocity.yaw_rad_s is None else velocity.yaw_sigma_rad_s,
+    )
     twist = _make(
-        "geometry_msgs/TwistWithCovariance", _make("geometry_msgs/Twist", linear, angular), _covariance(None)
+        "geometry_msgs/TwistWithCovariance", _make("geometry_msgs/Twist", linear, angular), covariance
     )
     header = _header(pose.time_ns, MAP)
     message = _make("nav_msgs/Odometry", header, pose.track.robot, _pose(pose, heading_rad), twist)
@@ -133,14 +140,22 @@ def _pose(pose: StreamPose, heading_rad: float) -> Any:
     track = pose.track
     point = _make("geometry_msgs/Point", track.x_m, track.y_m, track.z_m)
     where = _make("geometry_msgs/Pose", point, _rotation(heading_rad))
-    return _make("geometry_msgs/PoseWithCovariance", where, _covariance(pose.covariance_m2))
+    return _make(
+        "geometry_msgs/PoseWithCovariance", where, _covariance(pose.covariance_m2, pose.heading_sigma_rad)
+    )
 
 
-def _covariance(known: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return a covariance of 6 x 6, row by row: the known block of 3 x 3, and unknown variances."""
+def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> NDArray[np.float64]:
+    """Return a covariance of 6 x 6, row by row.
+
+    ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z. All other
+    variances are unknown.
+    """
     covariance = np.eye(6) * _UNKNOWN
     if known is not None:
         covariance[:3, :3] = known
+    if yaw_sigma is not None:
+        covariance[5, 5] = yaw_sigma**2
     return covariance.ravel()
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
+from ipsys_log.messages.message import Mat33
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
@@ -48,8 +49,10 @@ def encode_pose(pose: StreamPose, key: bytes | None = None) -> bytes:
     if velocity is not None:
         fields |= {"vx_m_s": _rounded(velocity.x_m_s), "vy_m_s": _rounded(velocity.y_m_s)}
         fields |= {"vz_m_s": _rounded(velocity.z_m_s), "yaw_rad_s": _rounded(velocity.yaw_rad_s)}
-    if pose.covariance_m2 is not None:
-        fields["covariance_m2"] = [float(f"{value:.4g}") for value in pose.covariance_m2.ravel().tolist()]
+        fields |= {"velocity_covariance_m2_s2": _shortened(velocity.covariance_m2_s2)}
+        fields |= {"yaw_sigma_rad_s": _rounded(velocity.yaw_sigma_rad_s)}
+    fields |= {"covariance_m2": _shortened(pose.covariance_m2)}
+    fields |= {"heading_sigma_rad": _rounded(pose.heading_sigma_rad)}
     if track.cameras:
         fields["cameras"] = list(track.cameras)
     present = {name: value for name, value in fields.items() if value is not None}
@@ -57,6 +60,11 @@ def encode_pose(pose: StreamPose, key: bytes | None = None) -> bytes:
     if key is None:
         return body
     return body + b"\n" + hmac.new(key, body, hashlib.sha256).hexdigest().encode()
+
+
+def _shortened(covariance: Mat33 | None) -> list[float] | None:
+    """Return the 9 numbers of a covariance with 4 digits, row by row."""
+    return None if covariance is None else [float(f"{value:.4g}") for value in covariance.ravel().tolist()]
 
 
 def _rounded(value: float | None) -> float | None:

@@ -22,6 +22,13 @@ StreamOptions = dict[str, Any]
 
 _PANEL = "Streams of positions"
 
+
+def _port_option(name: str, text: str) -> Any:
+    """Return the type of an option for a port."""
+    option = typer.Option(name, metavar="PORT", min=1, max=65535, help=text, rich_help_panel=_PANEL)
+    return Annotated[Optional[int], option]  # noqa: UP045
+
+
 Udp = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
@@ -49,17 +56,7 @@ Vrpn = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
-VrpnPort = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(
-        "--vrpn-port",
-        metavar="PORT",
-        min=1,
-        max=65535,
-        help="Serve VRPN on another port.",
-        rich_help_panel=_PANEL,
-    ),
-]
+VrpnPort = _port_option("--vrpn-port", "Serve VRPN on another port.")
 Mavlink = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
@@ -79,17 +76,9 @@ Ros2 = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
-Ros2Port = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(
-        "--ros2-port",
-        metavar="PORT",
-        min=1,
-        max=65535,
-        help="Use the Zenoh router on this port instead of 7447; if none answers, be it.",
-        rich_help_panel=_PANEL,
-    ),
-]
+Ros2Port = _port_option(
+    "--ros2-port", "Use the Zenoh router on this port instead of 7447; if none answers, be it."
+)
 Ros2Domain = Annotated[
     Optional[int],  # noqa: UP045
     typer.Option(
@@ -107,17 +96,7 @@ Foxglove = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
-FoxglovePort = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(
-        "--foxglove-port",
-        metavar="PORT",
-        min=1,
-        max=65535,
-        help="Serve Foxglove on another port.",
-        rich_help_panel=_PANEL,
-    ),
-]
+FoxglovePort = _port_option("--foxglove-port", "Serve Foxglove on another port.")
 RerunPage = Annotated[
     bool,
     typer.Option(

@@ -75,6 +75,8 @@ def measured_part(rig: Rig, model: str) -> object:
     points = (rig.reference_points, {m.id for m in rig.markers})
     if not reads_corners(model):
         return points
-    markers = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
+    markers = {
+        (m.id, rig.length_of(m.id), rig.height_of(m.id), rig.height_sigma_of(m.id)) for m in rig.markers
+    }
     cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
     return points, markers, cameras, rig.tape_sigma_m

@@ -24,10 +24,10 @@ __all__ = [
     "TapeCovariances",
     "TapePoint",
     "WeakPoint",
+    "expected_tape_covariances",
     "find_weak_points",
     "is_on_reference",
     "reference_points",
-    "tape_covariances",
     "with_usual_tape",
     "world_point",
 ]
@@ -61,7 +61,7 @@ def with_usual_tape(rig: Rig) -> Rig:
     return replace(rig, tape_sigma_m=USUAL_TAPE_SIGMA_M) if rig.tape_sigma_m is None else rig
 
 
-def tape_covariances(rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_M) -> TapeCovariances:
+def expected_tape_covariances(rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_M) -> TapeCovariances:
     """Return the covariances of points that are measured from all reference points of a rig.
 
     With fewer than two reference points, a point is known as well as a tape measures a distance.

@@ -155,7 +155,7 @@ def _body(rig: Rig, marker_id: int, settings: JointSettings) -> Body:
         rig.length_of(marker_id),
         settings.scale_sigma,
         rig.height_of(marker_id),
-        settings.robot_height_sigma_m,
+        rig.height_sigma_of(marker_id) or settings.robot_height_sigma_m,
     )
 
 

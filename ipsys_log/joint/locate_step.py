@@ -14,6 +14,7 @@ from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.locate_poses import Poses, locate_poses
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import restore_joint
+from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
 from ipsys_log.units import NS_PER_S
 
@@ -23,8 +24,7 @@ Array = NDArray[np.float64]
 
 # Corners without a covariance have about this error.
 _CORNER_SIGMA_PX = 0.25
-# Usual standard deviation of the height of a marker on its robot.
-_HEIGHT_SIGMA_M = 0.001
+_HEIGHT_SIGMA_M = JointSettings().robot_height_sigma_m
 # A marker that is not where its corners say that it is has larger residuals. One in a million is larger by
 # chance: with five degrees of freedom at a known height, and with two for a full pose.
 MOST_CHI2 = 37.0

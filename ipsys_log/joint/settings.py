@@ -31,7 +31,7 @@ class JointSettings:
         and the slope of the floor, and the correlation time of this tilt. Sightings within this time share
         one tilt.
     scale_sigma : relative error of the printed size of a marker.
-    robot_height_sigma_m : error of the height at which a robot carries its marker.
+    robot_height_sigma_m : error of the height at which a robot carries its marker, where the rig has none.
     acceleration_sigma, turn_sigma : usual acceleration of a robot, in m/s^2 and rad/s^2. They bridge gaps of
         the path without sightings.
     """

@@ -37,7 +37,7 @@ from ipsys_log.simulation.geometric_sightings import (
     start_ns,
     still_times_ns,
 )
-from ipsys_log.simulation.lab import EPOCH_NS, build_rig
+from ipsys_log.simulation.lab import EPOCH_NS, ROBOT_HEIGHT_SIGMA_M, build_rig
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["MARKERS_RUN", "geometric_rig", "simulate_session"]
@@ -54,7 +54,8 @@ _STILL_MARGIN_NS = 100_000_000
 
 def geometric_rig(lab: GeometricLab) -> Rig:
     """Return the rig that the user has."""
-    rig = build_rig(lab.settings.lab)
+    sigma_m = max(lab.settings.robot_height_sigma_m, ROBOT_HEIGHT_SIGMA_M)
+    rig = replace(build_rig(lab.settings.lab), marker_height_sigma_m=sigma_m)
     if lab.settings.row_time_in_rig:
         return rig
     return replace(rig, cameras=tuple(replace(camera, row_time_ns=None) for camera in rig.cameras))

@@ -41,10 +41,12 @@ from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "moving_marker", "simulate"]
+__all__ = ["EPOCH_NS", "ROBOT_HEIGHT_SIGMA_M", "build_rig", "drive_start_ns", "moving_marker", "simulate"]
 
 # Start of the simulated clock: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
+# The heights of the robots are exact; a standard deviation must be above 0.
+ROBOT_HEIGHT_SIGMA_M = 0.0001
 # Pause of the recording, for the transport of the markers to their next calibration points.
 _PAUSE_NS = 3 * NS_PER_S
 # From the end of the exposure of the last row to the arrival of the frame.
@@ -116,6 +118,7 @@ def build_rig(settings: LabSettings) -> Rig:
         reference_points=REFERENCES,
         floor=Floor(FLOOR_M, FLOOR_M),
         marker_height_m=settings.drive_height_m,
+        marker_height_sigma_m=ROBOT_HEIGHT_SIGMA_M,
         tape_sigma_m=settings.tape_sigma_m or None,
     )
 

@@ -62,7 +62,7 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
 
 STAGE = Stage(
     name="smooth",
-    versions={"smooth": 1},
+    versions={"smooth": 2},
     reads=TRACK_READS,
     writes=(SMOOTHED_TRACKS,),
     plan=_plan,

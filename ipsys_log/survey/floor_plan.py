@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, plan_points
-from ipsys_log.analysis.tape import TapeCovariances, tape_covariances
+from ipsys_log.analysis.tape import TapeCovariances, expected_tape_covariances
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
 from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, are_collinear
@@ -271,7 +271,7 @@ def _tape_covariances(session: Session, rig: Rig) -> TapeCovariances:
     """Return the covariances of tape measurements with the usual sigma of the measurements in a log."""
     payloads = session.payloads(session.topics(MEASUREMENTS)) if rig.tape_sigma_m is None else []
     named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
-    return tape_covariances(rig, float(np.median(named_m or USUAL_TAPE_SIGMA_M)))
+    return expected_tape_covariances(rig, float(np.median(named_m or USUAL_TAPE_SIGMA_M)))
 
 
 def _joint_notes(rig: Rig, fitted: set[str]) -> Iterator[str]:

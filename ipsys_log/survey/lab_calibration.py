@@ -17,7 +17,7 @@ from ipsys_log.analysis.expected_error import (
     find_gaps,
 )
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
-from ipsys_log.analysis.tape import tape_covariances
+from ipsys_log.analysis.tape import expected_tape_covariances
 from ipsys_log.analysis.taped_points import TapedPoint, choose_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.diagnosis import Finding, find_faults
@@ -222,7 +222,7 @@ def describe_fit(
         sizes_px,
         expected,
         _candidates(rig, low_m, high_m, step_m),
-        tape_covariances(rig),
+        expected_tape_covariances(rig),
         length_m,
         goal_m if max(c.mean_m for c in cameras if len(c.expected.errors_m)) > goal_m else np.inf,
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,

@@ -21,7 +21,6 @@ _ROBOT_HEIGHT_M = 0.1
 _MARKER_M = 0.2
 # Standard deviation of a corner of detect: a weight of corners without noise.
 _USUAL_PX = 0.012
-_HEIGHT_SIGMA_M = 0.001
 # Rays that are flatter than this (cosine with the vertical) do not belong to positions.
 _FLATTEST = 0.2
 
@@ -46,14 +45,23 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     known_m = [height_m for height_m in heights_m if height_m is not None]
     usual_m = rig.marker_height_m if rig and rig.marker_height_m is not None else _ROBOT_HEIGHT_M
     height_m = float(np.median(known_m)) if known_m else usual_m
+    sigma_m = _height_sigma(rig)
     if reads_corners(model.name):
-        nodes = {camera.camera: _joint_nodes(camera, grid, height_m, _MARKER_M) for camera in model.cameras}
+        nodes = {camera.camera: _joint_nodes(camera, grid, height_m, sigma_m) for camera in model.cameras}
     else:
         separate = {
-            camera.camera: _table_nodes(model.name, camera, grid, height_m) for camera in model.cameras
+            camera.camera: _table_nodes(model.name, camera, grid, height_m, sigma_m)
+            for camera in model.cameras
         }
         nodes = _side_by_side({name: node for name, node in separate.items() if node is not None})
     return reduce_modes(grid, nodes, count)
+
+
+def _height_sigma(rig: Rig | None) -> float | None:
+    """Return the usual standard deviation of the heights of the rig; None if the rig has none."""
+    sigmas_m = [rig.height_sigma_of(marker.id) for marker in rig.markers] if rig else []
+    known_m = [sigma_m for sigma_m in sigmas_m if sigma_m is not None]
+    return float(np.median(known_m)) if known_m else None
 
 
 def _grid(model: Model) -> Grid | None:
@@ -80,36 +88,43 @@ def _below_cameras(model: Model) -> list[Array]:
     ]
 
 
-def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, length_m: float) -> NodeModes:
-    """Return the modes of a joint model: those of level markers at the nodes, and the error of the height."""
+def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None) -> NodeModes:
+    """Return the modes of a joint model: those of level markers at the nodes, and the error of the height.
+
+    ``sigma_m`` is the standard deviation of the height; None for the usual one.
+    """
     # Late: scipy takes 1 s.
     from ipsys_log.geometry.lenses import project
     from ipsys_log.geometry.markers import marker_corners
     from ipsys_log.geometry.rotations import level_turns
     from ipsys_log.joint.locate import locate_markers
     from ipsys_log.joint.payload import restore_joint
+    from ipsys_log.joint.settings import JointSettings
 
+    sigma_m = JointSettings().robot_height_sigma_m if sigma_m is None else sigma_m
     model, flat_m = restore_joint(camera), grid.points_m
     count = len(flat_m)
     floor_m, _ = model.floor.heights(flat_m, model.amplitudes)
     centres_m = np.column_stack([flat_m, floor_m + height_m])
-    arms_m = marker_corners(1.0) * length_m @ level_turns(np.zeros(count)).swapaxes(1, 2)
+    arms_m = marker_corners(1.0) * _MARKER_M @ level_turns(np.zeros(count)).swapaxes(1, 2)
     corners_c = (arms_m + (centres_m - model.origin_m)[:, None]) @ model.camera_from_world.T
     steep = (corners_c[..., 2] > _FLATTEST * np.linalg.norm(corners_c, axis=2)).all(axis=1)
     corners_px = project(corners_c.reshape(-1, 3), model.calibration).reshape(count, 4, 2)
     variances = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (count, 8, 8))
-    lengths_m, heights_m = np.full(count, length_m), np.full(count, height_m)
+    lengths_m, heights_m = np.full(count, _MARKER_M), np.full(count, height_m)
     modes_m = np.full((count, 3, model.modes.shape[1] + 1), np.nan)
     corners_px[~steep] = corners_px[steep][:1]
     located = locate_markers(model, corners_px, variances, heights_m, lengths_m)
-    higher = locate_markers(model, corners_px, variances, heights_m + _HEIGHT_SIGMA_M, lengths_m)
+    higher = locate_markers(model, corners_px, variances, heights_m + sigma_m, lengths_m)
     modes_m[steep, :, :-1] = located.modes_m[steep]
     modes_m[steep, :, -1] = (higher.points_m - located.points_m)[steep]
     clock = len(model.lens) + 7
     return NodeModes(modes_m, np.zeros((count, 3, 3)), np.append(model.modes[clock], 0.0))
 
 
-def _table_nodes(name: str, camera: CameraModel, grid: Grid, height_m: float) -> NodeModes | None:
+def _table_nodes(
+    name: str, camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None
+) -> NodeModes | None:
     """Return the modes of a model of the table, at the camera points of the nodes; None if it has none."""
     from ipsys_log.models.rigid import rigid_transform
 
@@ -122,7 +137,8 @@ def _table_nodes(name: str, camera: CameraModel, grid: Grid, height_m: float) ->
     points_m = np.column_stack([flat_m, np.full(len(flat_m), height_m)]) @ rotation.T + origin_m
     steep = points_m[:, 2] > _FLATTEST * np.linalg.norm(points_m, axis=1)
     points_m[~steep] = fitted_m[0]
-    parts = applied.error_modes(points_m, np.full(len(flat_m), height_m))
+    sigmas_m = None if sigma_m is None else np.full(len(flat_m), sigma_m)
+    parts = applied.error_modes(points_m, np.full(len(flat_m), height_m), sigmas_m)
     if parts is None:
         return None
     modes_m, rest_m2 = parts

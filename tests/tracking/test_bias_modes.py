@@ -13,7 +13,7 @@ from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import joint_payload, restore_joint
-from ipsys_log.messages import Model, Pair, Rig
+from ipsys_log.messages import Model, Pair, Rig, RigMarker
 from ipsys_log.models.table import AppliedModel
 from ipsys_log.stages.fit import fit_model
 from ipsys_log.tracking.bias_modes import LOCAL_M, BiasModes, Grid, NodeModes, reduce_modes
@@ -90,9 +90,21 @@ def joint() -> Model:
     return joint_payload(fit_jointly(make_lab(4, points=20)[0]), {}, 0)
 
 
-def test_joint_modes_are_the_covariance_of_located_markers(joint: Model) -> None:
+def rig_with(height_sigma_m: float | None) -> Rig:
+    return Rig(
+        "lab",
+        "DICT_4X4_100",
+        LENGTH_M,
+        (RigMarker(0, robot="ada"),),
+        marker_height_m=0.1,
+        marker_height_sigma_m=height_sigma_m,
+    )
+
+
+@pytest.mark.parametrize("sigma_m", [None, 0.0001, 0.004])
+def test_joint_modes_are_the_covariance_of_located_markers(joint: Model, sigma_m: float | None) -> None:
     """The part of the calibration in the covariance of real sightings, against the table."""
-    rig = Rig("lab", "DICT_4X4_100", LENGTH_M, marker_height_m=0.1)
+    rig = rig_with(sigma_m)
     modes = calibration_modes(joint, rig)
     assert modes.count == 12 + 3 * len(joint.cameras)
     rng = np.random.default_rng(5)
@@ -102,7 +114,8 @@ def test_joint_modes_are_the_covariance_of_located_markers(joint: Model) -> None
         headings = rng.uniform(-3, 3, 20)
         corners_px = level_corners(model, places_m, headings)
         noise = np.broadcast_to(0.012**2 * np.eye(8), (20, 8, 8))
-        located = locate_markers(model, corners_px, noise, np.full(20, 0.1), np.full(20, LENGTH_M))
+        sizes = np.full(20, 0.1), np.full(20, LENGTH_M)
+        located = locate_markers(model, corners_px, noise, *sizes, sigma_m or 0.001)
         wanted = (located.covariances_m2 - located.noise_m2)[:, :2, :2]
         sensitivities = modes.at(camera.camera, located.points_m, located.headings_rad)
         total = sensitivities[:, :2] @ sensitivities[:, :2].swapaxes(1, 2)
@@ -121,8 +134,10 @@ def level_corners(model: JointModel, places_m: Array, headings_rad: Array) -> Ar
     return np.array(corners)
 
 
-@pytest.mark.parametrize("name", ["poly", "best", "rayplane"])
-def test_modes_of_a_table_model_are_its_covariance(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "sigma_m"), [("poly", None), ("best", None), ("rayplane", None), ("rayplane", 0.004)]
+)
+def test_modes_of_a_table_model_are_its_covariance(name: str, sigma_m: float | None) -> None:
     rng = np.random.default_rng(3)
     camera_m = np.column_stack([rng.uniform(-1.2, 1.2, (30, 2)), rng.uniform(1.9, 2.1, 30)])
     turn = np.diag([1.0, -1.0, -1.0])
@@ -136,11 +151,12 @@ def test_modes_of_a_table_model_are_its_covariance(name: str) -> None:
         ]
     }
     model = fit_model(name, pairs, 0)
-    modes = calibration_modes(model, Rig("lab", "DICT_4X4_100", 0.2, marker_height_m=0.1), 19)
+    modes = calibration_modes(model, rig_with(sigma_m), 19)
     points_m = np.column_stack([rng.uniform(-0.8, 0.8, (15, 2)), np.full(15, 2.0)])
     applied = AppliedModel(name, model.cameras[0])
     heights_m = np.full(15, 0.1)
-    wanted = applied.covariances(points_m, heights_m)
+    sigmas_m = None if sigma_m is None else np.full(15, sigma_m)
+    wanted = applied.covariances(points_m, heights_m, sigmas_m)
     assert wanted is not None
     places_m = applied.predict(points_m, heights_m)
     sensitivities = modes.at("red", places_m, np.zeros(15))

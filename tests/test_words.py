@@ -181,6 +181,15 @@ def test_pages_are_plain(path: Path) -> None:
     assert page_faults(path.read_text(encoding="utf-8"), path.suffix) == []
 
 
+def test_comments_of_the_example_rig_are_plain() -> None:
+    """The example is the first file that a new user reads."""
+    comments = re.findall(r"# .*", (ROOT / "ipsys_log/rig/lab.toml").read_text(encoding="utf-8"))
+    text = " ".join(comment.lstrip("# ") for comment in comments)
+    assert len(comments) > 40
+    assert [phrase for phrase in _PAGE_PHRASES if phrase in text.lower()] == []
+    assert _OPENING.search(text) is None
+
+
 @pytest.mark.parametrize(
     ("source", "suffix"),
     [

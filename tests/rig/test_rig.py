@@ -63,7 +63,7 @@ def test_commented_examples_of_init_are_valid(tmp_path: Path) -> None:
     assert (full.marker_height_m, full.tape_sigma_m) == (0.10, 0.003)
     assert full.markers[0].height_m is not None
     assert full.height_of(0) == full.markers[0].height_m
-    assert "A third [[reference_points]]" in text
+    assert "A third reference point" in text
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,8 @@ def test_benchmark_smoke_run_writes_its_ratios(arguments: list[str], tmp_path: P
     assert pipelines["tracking"]["found"] > 0.8
 
 
+# Four calibrations of a lab.
+@pytest.mark.slow
 def test_accuracy_of_calibrations_is_measured(tmp_path: Path) -> None:
     output, picture = tmp_path / "results.json", tmp_path / "floor.png"
     command = [sys.executable, "bench.py", "joint", "--smoke", "--models", "rayplane,best"]

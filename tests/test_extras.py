@@ -81,6 +81,8 @@ def folder(tmp_path: Path, detected_log: Path, calibration: Path) -> Path:
     return tmp_path
 
 
+# Recordings in real time, and seven commands in a new process.
+@pytest.mark.slow
 def test_base_commands_without_extras_work(folder: Path) -> None:
     results = run_without(
         folder,

@@ -21,6 +21,8 @@ from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
 
 MODELS = ("poly", "joint")
+# Recordings, replays and verifications with two models.
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

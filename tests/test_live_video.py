@@ -81,6 +81,8 @@ def slow_decoding(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Video, "_next", slower)
 
 
+# A recording in real time, on a machine that is too slow for it.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("codec", "machine"), first_fast(1, [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)])
 )

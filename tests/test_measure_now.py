@@ -140,6 +140,8 @@ def counted(log: Path) -> dict[str, int]:
         return {name: session.count(topic) for name, topic in session.images.items()}
 
 
+# Six points in real time.
+@pytest.mark.slow
 @pytest.mark.parametrize("number", first_fast(1, [signal.SIGINT, signal.SIGTERM]))
 def test_page_measures_points_until_it_is_stopped(
     number: int, ipsys: Ipsys, still_lab: Lab, tmp_path: Path

@@ -90,6 +90,8 @@ def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
     assert np.median(np.hypot(*off_m.T)) < 0.002
 
 
+# Video of three cameras, decoded for a page.
+@pytest.mark.slow
 def test_page_shows_the_frames_of_each_stationary_interval(video: Path) -> None:
     """Most of these frames are no keyframes."""
     with open_finished_log(video, Request()) as scene:

@@ -10,7 +10,7 @@ import socket
 import struct
 import subprocess
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -278,7 +278,11 @@ def test_only_this_machine_can_connect_to_foxglove_without_a_host() -> None:
 def test_stalled_client_loses_messages_and_others_do_not() -> None:
     """The stalled client reads nothing; its socket and its queue fill up."""
     long = Message("/events", START_NS, START_NS, Event(START_NS, "camera_lost", "x" * (1 << 19)))
-    with streaming() as (stream, events), opened(stream) as stalled, opened(stream) as good:
+    with ExitStack() as stack:
+        stream, events = stack.enter_context(streaming())
+        # At its end, a stalled client waits for an answer that it cannot read.
+        stalled = stack.enter_context(opened(stream, close_timeout=0.1))
+        good = stack.enter_context(opened(stream))
         stream.consume(iter([long]))  # announces its topic
         stalled.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         for client in (stalled, good):

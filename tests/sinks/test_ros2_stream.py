@@ -275,6 +275,8 @@ def refusal(port: int, host: str | None = None, domain: int = 0) -> str:
     return str(error.value)
 
 
+# Routers of Zenoh need a second each to answer.
+@pytest.mark.slow
 def test_wrong_ports_hosts_and_domains_are_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]

@@ -56,7 +56,7 @@ def hour_later(messages: Iterator[Message]) -> Iterator[Message]:
 @pytest.fixture(scope="module")
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("joint") / "calibration.mcap"
-    write_log(path, simulate_session(lab(30, 10.0, held_out_points=10)))
+    write_log(path, simulate_session(lab(20, 8.0, held_out_points=8)))
     return path
 
 

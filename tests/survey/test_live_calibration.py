@@ -49,6 +49,8 @@ def test_no_measured_point_gives_coverage_only() -> None:
     assert last > first
 
 
+# A drive of a minute with several fits.
+@pytest.mark.slow
 def test_goal_that_is_not_reached_names_the_next_step() -> None:
     lines, _ = lines_of(list(simulate_session(LAB)), geometric_rig(LAB), goal_m=0.0005)
     assert "; drive through x " in lines[-1] or "; tape a point near x " in lines[-1]

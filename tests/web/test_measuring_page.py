@@ -105,6 +105,8 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         assert hand.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
 
 
+# A browser, and a fit for its model.
+@pytest.mark.slow
 def test_side_is_chosen_on_the_map_and_checked_by_the_model(
     hand: Phone, ipsys: Ipsys, unmeasured: Unmeasured, lab: Path
 ) -> None:
@@ -235,6 +237,8 @@ SEEN = """(e => {{ const b = e.getBoundingClientRect();
 }})(document.querySelector('{}'))"""
 
 
+# A browser at several positions of its page.
+@pytest.mark.slow
 def test_save_button_shows_the_point_to_save(hand: Phone) -> None:
     scene = Recording()
     with serve(scene, port=0) as page:
@@ -289,6 +293,8 @@ def test_cameras_show_visible_markers_before_a_choice(hand: Phone) -> None:
         says(hand, "#cameras button:nth-child(2) span", "not visible")
 
 
+# A browser, and several forms.
+@pytest.mark.slow
 def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> None:
     scene = Recording()
     third = ReferencePoint("C", 2.4, 0.3)

@@ -14,7 +14,6 @@ from ipsys_log.runs.options import Request
 from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.web.server import serve
 from tests.conftest import Unmeasured
-from tests.tiers import first_fast
 from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone, phone
 from tests.web.test_measuring_page import Recording, save, says, texts_at
@@ -63,7 +62,9 @@ def check_screen(browser: Phone) -> None:
         assert low_contrasts(browser) == [], scheme
 
 
-@pytest.mark.parametrize("size", first_fast(1, [PHONE, DESKTOP]), ids=["phone", "desktop"])
+@pytest.mark.parametrize(
+    "size", [PHONE, pytest.param(DESKTOP, marks=pytest.mark.slow)], ids=["phone", "desktop"]
+)
 def test_every_state_of_the_page_fits_the_screen(
     browser: Phone, unmeasured: Unmeasured, size: tuple[int, int]
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
@@ -47,11 +46,24 @@ def cut(
         Optional[list[str]],  # noqa: UP045
         typer.Option("--runs", "--run", metavar="NAME", help="Keep this run; repeat it for several."),
     ] = None,
+    robots: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--robots",
+            "--robot",
+            metavar="NAME",
+            help="Keep the frames that show this robot, with their results; repeat it for several.",
+        ),
+    ] = None,
+    every: Annotated[
+        int,
+        typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera, with its results."),
+    ] = 1,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", "--force", help="Replace an existing log of this name.")
     ] = False,
 ) -> None:
-    """Write a part of a log to a new log: a time range, some topics, cameras or runs.
+    """Write a part of a log to a new log: a time range, some topics, cameras, runs, robots or frames.
 
     The messages stay as they are. Rig, intrinsics, models, measurements and the records of runs come with
     every part. The new log names the log that it was cut from, and ipsys verify checks its messages.
@@ -67,6 +79,8 @@ def cut(
         exclude_topics=exclude_topics or (),
         cameras=cameras or (),
         runs=runs or (),
+        robots=robots or (),
+        every=every,
     )
     with progress_bar() as progress:
         result = cut_logs(logs, output, options, overwrite, progress)

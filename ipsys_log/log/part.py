@@ -54,7 +54,7 @@ def copy_messages(
                 _copy_chunk(view, contents, chunk, entries, writer)
             else:
                 data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
-                _copy_rows(view, contents, kept, writer, lambda low, high, data=data: data[low:high])
+                _copy_rows(view, contents, kept, writer, _Bytes(data).read)
         advance(chunk.end)
     unchunked = _kept_rows(contents, to_rows(contents.unchunked), choose)
     if unchunked:
@@ -98,6 +98,17 @@ def _kept_rows(contents: Contents, entries: Entries, choose: Choose) -> dict[int
         if len(chosen):
             kept[key] = chosen
     return kept
+
+
+class _Bytes:
+    """The records of a chunk, decompressed."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def read(self, low: int, high: int) -> bytes:
+        """Return the bytes from ``low`` to before ``high``."""
+        return self._data[low:high]
 
 
 def _adopt(contents: Contents, writer: LogWriter, key: int) -> int:

@@ -432,7 +432,7 @@ class LogWriter:
 
 
 def _settle_old(storage: Storage, path: Path) -> None:
-    """Check that no process writes a log that is to be replaced, and remove the journal of its last writer."""
+    """Check that no process writes a log that is to be replaced, and remove the journal of an append."""
     fd = open_locked(storage, path, os.O_RDWR)
     try:
         roll_back(storage, path, fd)

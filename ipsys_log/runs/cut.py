@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from ipsys_log.interrupts import undivided
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.known_contents import one_reading
-from ipsys_log.log.part import copy_messages, copy_records
+from ipsys_log.log.part import Choose, copy_messages, copy_records
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelCut, Cut, Message
 from ipsys_log.messages.channels import CUTS
@@ -92,7 +92,7 @@ def _check_output(paths: Sequence[Path], output: Path, overwrite: bool) -> None:
 
 
 def _check_ids(session: Session) -> None:
-    """Refuse logs whose measurements have the same ids: in one log, the later ones would replace the others."""
+    """Refuse logs whose measurements have the same ids: in one log, the later one would replace the other."""
     if session.has_new_ids:
         raise LogError(f"{session}: two logs have measurements with the same id; cut the logs one by one")
 
@@ -134,9 +134,7 @@ def _channel_cut(session: Session, writer: LogWriter, selection: Selection, topi
     )
 
 
-def _hash_in_log_order(
-    session: Session, topic: str, choose: Callable[[str, np.ndarray], np.ndarray]
-) -> ChannelHash:
+def _hash_in_log_order(session: Session, topic: str, choose: Choose) -> ChannelHash:
     """Return the hash of the selected messages of a channel that is not in log order in its file."""
     streams = [reader.messages([topic]) for reader in session.readers if topic in reader.channels]
     state = ChannelHash()

@@ -13,6 +13,7 @@ from ipsys_log.messages.channels import Channel
 __all__ = [
     "cut_topics",
     "has_result",
+    "is_cut",
     "is_whole",
     "left_out",
     "logs_before_cut",
@@ -57,6 +58,11 @@ def is_whole(session: Session, read: ChannelRead) -> bool:
 def _origin_of(session: Session, read: ChannelRead) -> _Origin | None:
     wanted = read.messages, read.hash
     return next((one for one in _origins(session, read.topic) if one[:2] == wanted), None)
+
+
+def is_cut(session: Session, read: ChannelRead) -> bool:
+    """Return whether a channel was as a stage has read it, before a cut; it did not change otherwise."""
+    return _origin_of(session, read) is not None
 
 
 def logs_before_cut(session: Session, run: Run) -> tuple[str, ...]:

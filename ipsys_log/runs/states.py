@@ -10,7 +10,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
 from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
-from ipsys_log.runs.origins import is_whole, logs_before_cut
+from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
 from ipsys_log.runs.provenance import is_complete, recorded_version
 
 __all__ = ["Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
@@ -115,7 +115,8 @@ def _judge(session: Session, one: Recorded) -> Recorded:
     ]
     if logs and not reasons:
         return replace(one, state=f"part of run {run.run}, cut from {', '.join(logs)}")
-    reasons += [_change(read) for read in run.inputs if not is_whole(session, read)]
+    changed = (read for read in run.inputs if not is_whole(session, read))
+    reasons += [_change(read) for read in changed if not is_cut(session, read)]
     return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one
 
 

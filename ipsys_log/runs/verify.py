@@ -28,7 +28,7 @@ from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.origins import logs_before_cut
+from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
 from ipsys_log.runs.part_check import compare_with_cut, repeatable_topics
 from ipsys_log.runs.provenance import replaced_lenses
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
@@ -76,7 +76,7 @@ def verify(
             for stage in recorded
             if stage.run.stage != IMPORTED and not _is_of_copied_model(stage.run)
         ]
-        if not records and not session.cuts:
+        if not records and (run is not None or not session.cuts):
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 f"to compute one: ipsys replay {paths[-1]}; to list the runs: ipsys runs {paths[-1]}"
@@ -252,7 +252,7 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
     """Return whether a stage can be repeated; skip inputs that are ``checked`` themselves."""
     for read in run.inputs:
         count = session.count(read.topic)
-        if read.topic in checked or (count == read.messages and session.hash(read.topic) == read.hash):
+        if read.topic in checked or is_whole(session, read) or is_cut(session, read):
             continue
         if count == 0:
             say(

@@ -8,6 +8,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from ipsys_log.log.bounds import chunk_excess
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunk_messages import Entries, Rows, chunk_entries, to_rows
 from ipsys_log.log.chunks import unpack
@@ -94,9 +95,10 @@ def _kept_rows(contents: Contents, entries: Entries, choose: Choose) -> dict[int
     """Return the rows of chosen messages by channel id; no channel has an empty array."""
     kept = {}
     for key, rows in entries.items():
-        chosen = rows[choose(contents.channels[key].topic, rows[:, 0].astype(np.int64))]
-        if len(chosen):
-            kept[key] = chosen
+        if key in contents.channels:  # readers leave out a message without a channel, too
+            chosen = rows[choose(contents.channels[key].topic, rows[:, 0].astype(np.int64))]
+            if len(chosen):
+                kept[key] = chosen
     return kept
 
 
@@ -155,7 +157,11 @@ def _message_head(view: LogBytes, data: Buffer, position: int, offset: int) -> t
 def _copy_chunk(
     view: LogBytes, contents: Contents, chunk: ChunkRef, entries: Entries, writer: LogWriter
 ) -> None:
-    head = parse_chunk_head(view, chunk.offset)[1]
+    record, head = parse_chunk_head(view, chunk.offset)
+    if record.length != chunk.length:
+        raise view.fault(chunk.offset, "its index claims another length of the chunk")
+    if not head.compression and (excess := chunk_excess(head.data_size, head.uncompressed_size)):
+        raise view.refusal(excess)
     whole = view.read(chunk.offset, chunk.length + chunk.index_length)
     start = head.data_offset - chunk.offset
     stored = memoryview(whole)[start : start + head.data_size]
@@ -188,7 +194,8 @@ class _Inside:
             opcode, length, key, _, log_ns, publish_ns = _message_head(view, data, offset, self._offset)
             start, end = offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length
             is_valid = opcode == Opcode.MESSAGE and key in entries and log_ns == time_ns
-            if not is_valid or offset < position or not start <= end <= len(data):
+            has_more = position < offset and data[position] == Opcode.MESSAGE  # and the index lacks it
+            if not is_valid or has_more or offset < position or not start <= end <= len(data):
                 raise view.fault(self._offset, "a message index points to no message of its time")
             crc = zlib.crc32(data[start:end])
             self.crc = extend(zlib.crc32(data[position:start], self.crc), data[start:end], crc)

@@ -258,8 +258,8 @@ class LogWriter:
         counts
             The number of messages by channel id.
         rows
-            Of each message in the order of the file: topic, log time and publish time in ns, length in bytes
-            and CRC-32 of the data.
+            Each message in the order of the file: topic, log time and publish time in ns, and the length in
+            bytes and CRC-32 of its data.
         """
         self.flush()
         shift = self._output.offset - chunk.offset

@@ -40,8 +40,8 @@ class CutOptions:
     start, end : UTC as text, or seconds from the first message of the log; the end is not included.
     topics, exclude_topics : patterns of topics, with ``*`` and ``?``.
     cameras, runs : names.
-    robots : names; of each camera only the frames that show one of these robots, with their results.
-    every : of each camera only each n-th of these frames, with their results.
+    robots : names; only frames that show one of these robots are kept, with their results.
+    every : only each n-th of these frames of each camera is kept, with its results.
     """
 
     start: str = ""

@@ -39,10 +39,10 @@ def stock_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def stock_part(stock_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty seconds of it, to be copied before they are changed."""
+    """Fifteen seconds of it, to be copied before they are changed."""
 
     def write(folder: Path) -> None:
-        cut([stock_log], folder / "part.mcap", CutOptions(start="30", end="70"))
+        cut([stock_log], folder / "part.mcap", CutOptions(start="5", end="20"))
 
     return make_once(tmp_path_factory, "stock_part", write) / "part.mcap"
 
@@ -190,7 +190,7 @@ def test_measurement_added_to_a_part_is_named(part: Path) -> None:
 def test_edges_are_compared_with_the_cut_and_not_repeated(replayed_log: Path, tmp_path: Path) -> None:
     """The method edges follows markers from frame to frame."""
     part = tmp_path / "part.mcap"
-    cut([replayed_log], part, CutOptions(start="30", end="70"))
+    cut([replayed_log], part, CutOptions(start="5", end="20"))
     repeated, remarks = verified(part)
     assert not repeated["/runs/edges/cameras/red/markers"]
     assert repeated["/runs/edges/cameras/red/camera_points"]

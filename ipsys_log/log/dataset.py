@@ -307,7 +307,7 @@ class Session:
 
     @property
     def has_new_ids(self) -> bool:
-        """Whether measurements of a later log have new ids here, because an earlier log has their ids too."""
+        """True if measurements of a later log have new ids here, because an earlier log has their ids too."""
         return any(self._ids.values())
 
     def _check_numbers(self) -> None:

@@ -252,7 +252,7 @@ def test_log_of_another_program_keeps_attachments(tmp_path: Path, chunked: bool)
             # The times of a topic go back: the hash of the part needs the log order.
             time_ns = 1_000 + (number ^ 1)
             writer.add_message(channels[number % 2], time_ns, b"{}" + bytes([number]), time_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call, unused-ignore]
     cut([log], part, CutOptions(exclude_topics=("/b",)))
     assert stock_rows(part) == [row for row in stock_rows(log) if row.topic == "/a"]
     with part.open("rb") as file:

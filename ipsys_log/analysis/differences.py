@@ -27,6 +27,7 @@ class Comparison:
     the same frame, and ``same`` the number of pairs that are equal byte for byte. ``first`` is the first
     difference. ``rms`` and ``greatest`` are distances between common markers of both sides, in ``unit``:
     corners in px, points in m. They are None without common markers.
+    ``repeated`` is False for a channel of a part of a log that is compared with the record of the cut.
     """
 
     topic: str
@@ -39,6 +40,7 @@ class Comparison:
     unit: str | None = None
     rms: float | None = None
     greatest: float | None = None
+    repeated: bool = True
 
     @property
     def equal(self) -> bool:

@@ -15,6 +15,7 @@ from ipsys_log.cli import (
     calibrate_lab,
     cameras,
     compare,
+    cut,
     drift,
     drive,
     export,
@@ -43,7 +44,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
     "Accuracy, and the next points to measure": ("evaluate", "plan", "report", "drift"),
     "Inspect a log": (
         *("info", "runs", "view", "export", "stream"),
-        *("verify", "diff", "latency", "repair"),
+        *("cut", "verify", "diff", "latency", "repair"),
     ),
     _STAGES: (),
     "Without cameras": ("simulate", "drive", "import"),
@@ -139,6 +140,12 @@ ipsys stream monday.mcap --udp 127.0.0.1:9870 --rate 2
 ipsys stream monday.mcap --udp 192.168.1.20:9870 --host 0.0.0.0 --loop
 ipsys stream monday.mcap --vrpn --start-offset 20    # port 3883
 """,
+    "cut": """
+ipsys cut monday.mcap -o part.mcap --start 60 --end 90
+ipsys cut monday.mcap -o part.mcap --start '2026-05-04 10:00' --camera red
+ipsys cut monday.mcap -o small.mcap --exclude-topics '/cameras/*/image'
+ipsys cut monday.mcap -o poly.mcap --run poly
+""",
     "verify": """
 ipsys verify monday.mcap                           # all of its runs
 """,
@@ -213,7 +220,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, drift, inspect, export, stream, compare, drive),
+    *(plan, drift, inspect, export, stream, cut, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

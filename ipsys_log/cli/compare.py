@@ -35,7 +35,9 @@ def verify(
 ) -> None:
     """Compute every run of a log again from its inputs, and compare each channel byte for byte.
 
-    Frames that live processing skipped are excluded. The exit code is 1 if there is a difference."""
+    Frames that live processing skipped are excluded. In a part of a log (ipsys cut), results that depend on
+    messages outside of the part are compared with the record of the cut. The exit code is 1 if there is a
+    difference."""
     from ipsys_log import api
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
 
@@ -49,7 +51,7 @@ def verify(
         console.print(comparison_table(comparisons, ("log", "again")))
         difference = first_difference(comparisons)
         console.print(
-            "the replay is identical to the log" if difference is None else difference,
+            _agreement(comparisons) if difference is None else difference,
             style="green" if difference is None else "red",
             markup=False,
         )
@@ -139,6 +141,16 @@ def latency(
         print(json.dumps({step: asdict(times) for step, times in steps.items()}, indent=2))  # noqa: T201
     else:
         console.print(latency_table(steps))
+
+
+def _agreement(found: Sequence[Comparison]) -> str:
+    count = sum(comparison.repeated for comparison in found)
+    if count == len(found):
+        return "the replay is identical to the log"
+    return (
+        f"{len(found) - count} channels have the messages of the cut; the replay of "
+        f"{count or 'no'} channels is identical to the log"
+    )
 
 
 def _end(found: Sequence[Comparison]) -> None:

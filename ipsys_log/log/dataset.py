@@ -10,6 +10,7 @@ import heapq
 import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -30,9 +31,10 @@ from ipsys_log.log.contents import (
     run_of_topic,
 )
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import Measurement, Message, Run
+from ipsys_log.messages import Cut, Measurement, Message, Run
 from ipsys_log.messages.channels import (
     CALIBRATIONS,
+    CUTS,
     IMAGES,
     MEASUREMENTS_TOPIC,
     Channel,
@@ -268,6 +270,16 @@ class Session:
         runs = [message.payload for message in self._decoded(reader, items, topics, None, None)]
         return sorted(runs, key=lambda run: run.number)
 
+    @cached_property
+    def cuts(self) -> dict[LogReader, list[Cut]]:
+        """The records of cuts of each log that is a part of another one, the oldest first."""
+        topics = self.topics(CUTS)
+        parts = {
+            reader: [message.payload for message in self._decoded(reader, items, topics, None, None)]
+            for reader, items in (self._items() if topics else ())
+        }
+        return {reader: cuts for reader, cuts in parts.items() if cuts}
+
     def _check_same_parameters(self) -> None:
         names = [{run_of_topic(topic) for topic in reader.channels} - {None} for reader in self.readers]
         if sum(map(len, names)) > len(set().union(*names)):  # the records are read only if runs have one name
@@ -292,6 +304,11 @@ class Session:
             for reader in readers
         )
         return dict(zip(readers, new_ids, strict=True))
+
+    @property
+    def has_new_ids(self) -> bool:
+        """True if measurements of a later log have new ids here, because an earlier log has their ids too."""
+        return any(self._ids.values())
 
     def _check_numbers(self) -> None:
         """Refuse more runs or measurements than a lab has: each of them costs a line, or an equation."""

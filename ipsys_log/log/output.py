@@ -40,13 +40,15 @@ class Output(Protocol):
 class NewFile:
     """A new file. Each piece of data goes to the operating system at once.
 
-    With a `target`, the complete file is renamed to `target`, and an abandoned file is removed.
+    With a `target`, the complete file is renamed to `target`, and an abandoned file is removed. Only with
+    `overwrite`, the rename replaces an existing file.
     """
 
     storage: Storage
     path: Path
     fd: int
     target: Path | None = None
+    overwrite: bool = False
     offset: int = 0
     crc: int | None = 0
     _failed: bool = False
@@ -69,7 +71,7 @@ class NewFile:
             self.emit(tail)
             self.storage.fsync(self.fd)
             if self.target is not None:
-                if self.target.exists():
+                if self.target.exists() and not self.overwrite:
                     raise LogError(
                         f"another program has created {self.target} in the meantime: choose another name"
                     )

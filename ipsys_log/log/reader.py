@@ -121,6 +121,16 @@ class LogReader:
         """The limits of the work to read the log."""
         return self._view.read_limits
 
+    @property
+    def view(self) -> LogBytes:
+        """The bytes of the log."""
+        return self._view
+
+    @property
+    def contents(self) -> Contents:
+        """The table of contents of the log, which callers do not change."""
+        return self._contents
+
     def check_number(self, number: int, item_name: str) -> None:
         """Refuse a log with more runs or measurements than its file size allows."""
         self._view.check_number(number, item_name)

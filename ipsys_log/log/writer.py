@@ -2,8 +2,9 @@
 
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -24,13 +25,13 @@ from ipsys_log.log.chunk_builder import (
     ChunkLimits,
 )
 from ipsys_log.log.contents import Contents, Schema, free_id
-from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
+from ipsys_log.log.hashing import METADATA_NAME, Buffer, ChannelHash, metadata_of_hashes
 from ipsys_log.log.journal import DISK, Storage, roll_back
 from ipsys_log.log.known_contents import contents_of, note_contents
 from ipsys_log.log.lock import check_free, open_locked
 from ipsys_log.log.output import NewFile, Output, PendingAppend, cannot_write
 from ipsys_log.log.reader import stored_hashes
-from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, to_bytes
+from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, to_bytes
 from ipsys_log.log.summary import tail_bytes, temporary_tail_bytes
 
 __all__ = ["LogWriter"]
@@ -73,17 +74,26 @@ class LogWriter:
         self._open = True
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], *, atomic: bool = False, storage: Storage = DISK) -> Self:
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        atomic: bool = False,
+        overwrite: bool = False,
+        storage: Storage = DISK,
+    ) -> Self:
         """Create a new log.
 
         Parameters
         ----------
         path
-            A file that does not exist yet.
+            A file that does not exist yet, except with `overwrite`.
         atomic
             False: the file grows in place, so that the data of a killed recorder stay there. An exception in
             the with-block finishes the log with its messages so far. True: the log is written as
             ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
+        overwrite
+            With `atomic`: replace an existing log in the moment when the new one is complete.
         storage
             The operations on files; only tests replace them.
 
@@ -93,10 +103,13 @@ class LogWriter:
             `path` exists, its folder does not, or another process is writing it.
         """
         target = Path(path)
-        check_free(target)
+        if overwrite and atomic and target.is_file():
+            _settle_old(storage, target)
+        else:
+            check_free(target)
         file = target.with_name(target.name + ".partial") if atomic else target
         fd = open_locked(storage, file, os.O_RDWR | os.O_CREAT | (0 if atomic else os.O_EXCL))
-        output = NewFile(storage, file, fd, target if atomic else None)
+        output = NewFile(storage, file, fd, target if atomic else None, overwrite)
         try:
             if atomic:
                 storage.truncate(fd, 0)  # an earlier writer of this file was killed: remove its data
@@ -202,6 +215,80 @@ class LogWriter:
         image = schema is not None and schema.name in IMAGE_SCHEMAS
         self._channels[topic] = (channel.id, self._images if image else self._small)
 
+    def adopt_channel(self, channel: mcap.Channel, schema: mcap.Schema | None) -> int:
+        """Declare a channel of another log; return its id here, which is the same if this id is free.
+
+        Raises
+        ------
+        LogError
+            The log has this topic with a schema of another name, or another encoding.
+        """
+        self._check_open()
+        own = Schema(schema.name, schema.encoding, schema.data) if schema else None
+        self._check_kind(channel.topic, own, channel.message_encoding)
+        known = (c for c in self._contents.channels.values() if c.topic == channel.topic)
+        same = next((c for c in known if self._schema_of(c) == own), None)
+        if same is None:
+            schema_id = self._schema_id(own, schema.id) if own and schema else 0
+            key = self._free_id(self._contents.channels, channel.id)
+            metadata = dict(channel.metadata)
+            same = mcap.Channel(key, channel.topic, channel.message_encoding, metadata, schema_id)
+            self._output.emit(to_bytes(same))
+            self._contents.channels[same.id] = same
+        image = own is not None and own.name in IMAGE_SCHEMAS
+        self._channels[channel.topic] = (same.id, self._images if image else self._small)
+        return same.id
+
+    def copy_chunk(
+        self,
+        chunk: ChunkRef,
+        data: Buffer,
+        crc: int,
+        counts: Mapping[int, int],
+        rows: Iterable[tuple[str, int, int, int, int]],
+    ) -> None:
+        """Copy a chunk of another log, whose channels have the same ids here.
+
+        Parameters
+        ----------
+        chunk
+            Its index in the other log.
+        data, crc
+            The bytes of the chunk with its message indexes, and their CRC-32.
+        counts
+            The number of messages by channel id.
+        rows
+            Each message in the order of the file: topic, log time and publish time in ns, and the length in
+            bytes and CRC-32 of its data.
+        """
+        self.flush()
+        shift = self._output.offset - chunk.offset
+        self._output.emit(data, crc)
+        offsets = {key: offset + shift for key, offset in chunk.index_offsets.items()}
+        self._contents.chunks.append(chunk._replace(offset=chunk.offset + shift, index_offsets=offsets))
+        self._contents.cover(chunk.start_ns, chunk.end_ns)
+        for key, number in counts.items():
+            self._contents.count(key, number)
+        for topic, *row in rows:
+            self._hashes.setdefault(topic, ChannelHash()).add_row(*row)
+
+    def copy_record(self, index: mcap.AttachmentIndex | mcap.MetadataIndex, pieces: Iterable[bytes]) -> None:
+        """Copy an attachment or a metadata record of another log, in pieces of bytes."""
+        self._check_open()
+        moved = replace(index, offset=self._output.offset)
+        for piece in pieces:
+            self._output.emit(piece)
+        if isinstance(moved, mcap.AttachmentIndex):
+            self._contents.attachments.append(moved)
+            self._contents.attachment_count += 1
+        else:
+            self._contents.metadata.append(moved)
+            self._contents.metadata_count += 1
+
+    def hash_of(self, topic: str) -> ChannelHash:
+        """Return the hash of the messages that this writer has written to a channel."""
+        return self._hashes.get(topic, ChannelHash())
+
     def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Add a message to a channel that was declared with `add_channel`; times in ns.
 
@@ -293,17 +380,23 @@ class LogWriter:
                     f"{self.path} has {topic} with another schema: use another topic (--run) or file (-o)"
                 )
 
-    def _schema_id(self, schema: Schema) -> int:
+    def _schema_of(self, channel: mcap.Channel) -> Schema | None:
+        record = self._contents.schemas.get(channel.schema_id)
+        return Schema(record.name, record.encoding, record.data) if record else None
+
+    def _schema_id(self, schema: Schema, wanted: int | None = None) -> int:
         for key, known in self._contents.schemas.items():
             if (known.name, known.encoding, known.data) == (schema.name, schema.encoding, schema.data):
                 return key
-        key = self._free_id(self._contents.schemas)
+        key = self._free_id(self._contents.schemas, wanted)
         record = mcap.Schema(key, schema.data, schema.encoding, schema.name)
         self._output.emit(to_bytes(record))
         self._contents.schemas[key] = record
         return key
 
-    def _free_id(self, known: Mapping[int, object]) -> int:
+    def _free_id(self, known: Mapping[int, object], wanted: int | None = None) -> int:
+        if wanted is not None and wanted not in known:
+            return wanted
         key = free_id(known)
         if key is None:
             raise LogError(f"{self.path} has no free channel or schema id left: write to another file (-o)")
@@ -336,3 +429,12 @@ class LogWriter:
         self._output.emit(head + data)
         self._contents.count(channel, 1)
         self._contents.cover(log_ns, log_ns)
+
+
+def _settle_old(storage: Storage, path: Path) -> None:
+    """Check that no process writes a log that is to be replaced, and remove the journal of an append."""
+    fd = open_locked(storage, path, os.O_RDWR)
+    try:
+        roll_back(storage, path, fd)
+    finally:
+        storage.close(fd)

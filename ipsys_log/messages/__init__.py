@@ -25,6 +25,7 @@ from ipsys_log.messages.commands import (
     Waypoint,
     WheelCommand,
 )
+from ipsys_log.messages.cuts import ChannelCut, Cut
 from ipsys_log.messages.events import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
 from ipsys_log.messages.images import (
     Color,
@@ -96,12 +97,14 @@ __all__ = [
     "CameraModel",
     "CameraPoint",
     "CameraPoints",
+    "ChannelCut",
     "ChannelRead",
     "ChannelWritten",
     "Color",
     "CompressedImage",
     "CompressedVideo",
     "Corners",
+    "Cut",
     "Distance",
     "ErrorStatistics",
     "Evaluation",

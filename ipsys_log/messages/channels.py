@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 
 from ipsys_log.messages.commands import RobotPath, WheelCommand
+from ipsys_log.messages.cuts import Cut
 from ipsys_log.messages.events import Event, Latency
 from ipsys_log.messages.images import (
     CompressedImage,
@@ -28,6 +29,7 @@ __all__ = [
     "CHANNELS",
     "COMMANDS",
     "COMMANDS_TOPIC",
+    "CUTS",
     "EVALUATION",
     "EVENTS",
     "EVENTS_TOPIC",
@@ -68,12 +70,14 @@ class Channel:
     payloads : types of its messages.
     by_schema : a topic outside of all runs with another name is this channel if it has such a payload. Other
         programs use their own topic names.
+    lasting : its messages hold beyond their instant, or describe the whole log: a part of a log has them all.
     """
 
     name: str
     topic: str
     payloads: tuple[type, ...]
     by_schema: bool = False
+    lasting: bool = False
 
     def __repr__(self) -> str:
         return f"<channel {self.name}>"
@@ -88,7 +92,7 @@ class Channel:
         return self.topic.format(run=run, camera=camera)
 
 
-RIG = Channel(name="rig", topic="/rig", payloads=(Rig,), by_schema=True)
+RIG = Channel(name="rig", topic="/rig", payloads=(Rig,), by_schema=True, lasting=True)
 # No log contains a skipped frame of a video as such: the log has the frame, and an event names it.
 IMAGES = Channel(
     name="images",
@@ -101,15 +105,19 @@ CALIBRATIONS = Channel(
     topic="/cameras/{camera}/calibration",
     payloads=(CameraCalibration,),
     by_schema=True,
+    lasting=True,
 )
-MEASUREMENTS = Channel(name="measurements", topic="/measurements", payloads=(Measurement,), by_schema=True)
+MEASUREMENTS = Channel(
+    name="measurements", topic="/measurements", payloads=(Measurement,), by_schema=True, lasting=True
+)
 EVENTS = Channel(name="events", topic="/events", payloads=(Event,), by_schema=True)
 LATENCY = Channel(name="latency", topic="/latency", payloads=(Latency,), by_schema=True)
 TRUTH = Channel(name="truth", topic="/truth/tracks", payloads=(Tracks,), by_schema=True)
-PATHS = Channel(name="paths", topic="/robots/paths", payloads=(RobotPath,), by_schema=True)
+PATHS = Channel(name="paths", topic="/robots/paths", payloads=(RobotPath,), by_schema=True, lasting=True)
 COMMANDS = Channel(name="commands", topic="/robots/commands", payloads=(WheelCommand,), by_schema=True)
+CUTS = Channel(name="cuts", topic="/cuts", payloads=(Cut,), lasting=True)
 
-RECORD = Channel(name="record", topic="/runs/{run}/record", payloads=(Run,))
+RECORD = Channel(name="record", topic="/runs/{run}/record", payloads=(Run,), lasting=True)
 MARKERS = Channel(name="markers", topic="/runs/{run}/cameras/{camera}/markers", payloads=(Markers,))
 ANNOTATIONS = Channel(
     name="annotations", topic="/runs/{run}/cameras/{camera}/annotations", payloads=(ImageAnnotations,)
@@ -117,8 +125,8 @@ ANNOTATIONS = Channel(
 CAMERA_POINTS = Channel(
     name="camera_points", topic="/runs/{run}/cameras/{camera}/camera_points", payloads=(CameraPoints,)
 )
-MODEL = Channel(name="model", topic="/runs/{run}/model", payloads=(Model,))
-EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads=(Evaluation,))
+MODEL = Channel(name="model", topic="/runs/{run}/model", payloads=(Model,), lasting=True)
+EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads=(Evaluation,), lasting=True)
 POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positions", payloads=(Positions,))
 TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
 SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
@@ -127,7 +135,7 @@ POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransfor
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
 
 CHANNELS: tuple[Channel, ...] = (
-    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS),
+    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS),
     *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
     *(SMOOTHED_TRACKS, RUN_EVENTS),
 )

@@ -104,6 +104,8 @@ class Stage:
     in_threads : it works outside of Python: one thread for each camera is faster.
     of_model : each model has its own run of this stage, and of the stages that read it.
     on_demand : it runs only if the user names it, or a stage that needs it.
+    stateless : the channels, by the parameters of a run and its view, of which each message follows from one
+        input message and from lasting channels such as the rig. A part of a log can repeat them.
     """
 
     name: str
@@ -118,6 +120,7 @@ class Stage:
     in_threads: bool = False
     of_model: bool = False
     on_demand: bool = False
+    stateless: Callable[[Mapping[str, str], StageView], Collection[Channel]] = lambda parameters, view: ()
 
     def __repr__(self) -> str:
         return f"<stage {self.name}>"

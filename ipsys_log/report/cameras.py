@@ -208,11 +208,17 @@ def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Tab
             Text(comparison.topic.removeprefix("/runs/"), style=style),
             str(comparison.left),
             str(comparison.right),
-            "all" if comparison.equal else str(comparison.same),
+            _same_text(comparison),
             _distance(comparison.rms, comparison.unit),
             _distance(comparison.greatest, comparison.unit),
         )
     return table
+
+
+def _same_text(comparison: Comparison) -> str:
+    if not comparison.equal:
+        return str(comparison.same)
+    return "all" if comparison.repeated else "as cut"
 
 
 def first_difference(found: Sequence[Comparison]) -> str | None:

@@ -141,7 +141,9 @@ def _current_run(
     else:
         options = request.options(model if is_of_model(stage) else None)
         task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
-    return task if isinstance(task, str) else find_run(session, record_of(session, task), name)
+    return (
+        task if isinstance(task, str) else find_run(session, record_of(session, task), stage.writes[0], name)
+    )
 
 
 def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:

@@ -135,7 +135,7 @@ def run_stage(
     """
     name = request.run if has_given_name(task.stage, until) else None
     record = record_of(session, task)
-    finished_run = find_run(session, record, name)
+    finished_run = find_run(session, record, task.stage.writes[0], name)
     if finished_run is not None:
         return Outcome(task.stage.name, finished_run, fresh=False)
     _say_renewal(session, task, record, say)

@@ -19,6 +19,7 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, ChannelRead, Run
 from ipsys_log.messages.channels import Channel
+from ipsys_log.runs.origins import has_result, present_inputs, was_complete
 
 __all__ = [
     "Outcome",
@@ -96,16 +97,28 @@ def complete_runs(session: Session) -> list[Run]:
 
 
 def is_complete(session: Session, run: Run) -> bool:
-    """Return whether all channels of a stage are in the log."""
-    return all(session.count(output.topic) >= output.messages for output in run.outputs)
+    """Return whether all channels of a stage are in the log, or were before the log was cut."""
+    return all(
+        session.count(output.topic) >= output.messages or was_complete(session, output.topic, output.messages)
+        for output in run.outputs
+    )
 
 
-def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
-    """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any."""
+def find_run(session: Session, wanted: Run, purpose: Channel, name: str | None = None) -> str | None:
+    """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any.
+
+    In a part of a log, a run is found if its inputs were cut and did not change otherwise.
+
+    Parameters
+    ----------
+    purpose : the channel of the result, which a part must have.
+    """
     essence = _identity(wanted)
     for run in reversed(complete_runs(session)):
-        if run.stage == wanted.stage and name in (None, run.run) and _identity(run) == essence:
-            return run.run
+        if run.stage == wanted.stage and name in (None, run.run):
+            here = replace(run, inputs=present_inputs(session, run)) if session.cuts else run
+            if _identity(here) == essence and has_result(session, run, purpose):
+                return run.run
     return None
 
 

@@ -10,6 +10,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
 from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
+from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
 from ipsys_log.runs.provenance import is_complete, recorded_version
 
 __all__ = ["Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
@@ -27,8 +28,8 @@ class Recorded:
     ----------
     run : the record of the stage.
     method : its corner method, camera-point method or model; "" if the stage has none.
-    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, or what to do if newer
-        software made it.
+    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, ``part of run <run>,
+        cut from <log>``, or what to do if newer software made it.
     out_of_date : the software, the log or an input run has changed since, and the stage can be repeated.
     is_newer : newer software made it.
     """
@@ -103,14 +104,19 @@ def _judge(session: Session, one: Recorded) -> Recorded:
         return replace(one, state=newer, is_newer=True)
     names = versioned_names(run.stage, one.method)
     is_copied = writes(run, MODEL) and not is_fitted_here(run)
-    if is_copied or any(read.messages and not session.count(read.topic) for read in run.inputs):
+    logs = logs_before_cut(session, run) if session.cuts and not is_copied else ()
+    missing = any(read.messages and not session.count(read.topic) for read in run.inputs) and not logs
+    if is_copied or missing:
         return replace(one, state="not repeatable")
     reasons = [
         f"made by {name} {recorded_version(run, name)}, this is {name} {VERSIONS[name]}"
         for name in names
         if recorded_version(run, name) < VERSIONS[name]
     ]
-    reasons += [_change(read) for read in run.inputs if _has_changed(session, read)]
+    if logs and not reasons:
+        return replace(one, state=f"part of run {run.run}, cut from {', '.join(logs)}")
+    changed = (read for read in run.inputs if not is_whole(session, read))
+    reasons += [_change(read) for read in changed if not is_cut(session, read)]
     return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one
 
 
@@ -120,10 +126,6 @@ def _judge_inputs(one: Recorded, stale: Collection[str]) -> Recorded:
     if one.state != _CURRENT or not names:
         return one
     return replace(one, state=f"out of date: input {names[0]} is", out_of_date=True)
-
-
-def _has_changed(session: Session, read: ChannelRead) -> bool:
-    return session.count(read.topic) != read.messages or session.hash(read.topic) != read.hash
 
 
 def _change(read: ChannelRead) -> str:

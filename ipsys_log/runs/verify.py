@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +28,8 @@ from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
+from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
+from ipsys_log.runs.part_check import compare_with_cut, repeatable_topics
 from ipsys_log.runs.provenance import replaced_lenses
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 
@@ -47,6 +49,9 @@ def verify(
     with it can. A run that was imported from files of another program cannot be repeated either. A model
     cannot be repeated if measurements were added or withdrawn since. Results of another version are not
     repeated; a remark reports this. Later stages are repeated from the recorded channels.
+
+    In a part of a log, channels without memory are repeated message by message. All other channels are
+    compared with the record of the cut, and a remark names their stages.
 
     Parameters
     ----------
@@ -71,7 +76,7 @@ def verify(
             for stage in recorded
             if stage.run.stage != IMPORTED and not _is_of_copied_model(stage.run)
         ]
-        if not records:
+        if not records and (run is not None or not session.cuts):
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 f"to compute one: ipsys replay {paths[-1]}; to list the runs: ipsys runs {paths[-1]}"
@@ -82,23 +87,46 @@ def verify(
             for stage in recorded
             if stage.run in records
             and not _is_of_other_version(stage, say)
-            and _is_up_to_date(session, stage.run, checked, say)
+            and (logs_before_cut(session, stage.run) or _is_up_to_date(session, stage.run, checked, say))
         ]
-        if not repeated:
+        topics_of = {id(record): _topics(session, record, say) for record in repeated}
+        if not repeated and not session.cuts:
             raise IpsysError(
                 f"{session}: has no run that can be verified; for the reasons: ipsys runs {paths[-1]}"
             )
         comparisons = []
         for name in sorted(names):
             stages = [record for record in repeated if record.run == name]
-            topics = {output.topic for record in stages for output in record.outputs}
+            others = _of_others(recorded, name, topics_of) if session.cuts else set()
+            topics = {topic for record in stages for topic in topics_of[id(record)]} - others
             # Several stages can write to the channel of events.
             made = heapq.merge(
-                *(_made_again(session, record, progress) for record in stages),
+                *(_made_again(session, record, progress) for record in stages if topics_of[id(record)]),
                 key=lambda row: row[0].log_time_ns,
             )
+            if session.cuts:
+                made = (row for row in made if row[0].topic in topics)
             comparisons += compare_channels(session.stored(sorted(topics)), made)
+        comparisons += compare_with_cut(session, names, {one.topic for one in comparisons}, progress)
         return sorted([*comparisons, *_unrecorded(session, names - imported)], key=lambda one: one.topic)
+
+
+def _topics(session: Session, run: Run, say: Callable[[str], None]) -> set[str]:
+    """Return the channels of a stage that are repeated: all of them, except in a part of a log."""
+    if logs_before_cut(session, run):
+        return repeatable_topics(session, run, say)
+    return {output.topic for output in run.outputs}
+
+
+def _of_others(recorded: Sequence[Recorded], name: str, topics_of: Mapping[int, set[str]]) -> set[str]:
+    """Return the channels of a run to which a stage has written that does not repeat them."""
+    return {
+        output.topic
+        for stage in recorded
+        if stage.run.run == name
+        for output in stage.run.outputs
+        if output.topic not in topics_of.get(id(stage.run), ())
+    }
 
 
 def _is_of_copied_model(run: Run) -> bool:
@@ -224,7 +252,7 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
     """Return whether a stage can be repeated; skip inputs that are ``checked`` themselves."""
     for read in run.inputs:
         count = session.count(read.topic)
-        if read.topic in checked or (count == read.messages and session.hash(read.topic) == read.hash):
+        if read.topic in checked or is_whole(session, read) or is_cut(session, read):
             continue
         if count == 0:
             say(

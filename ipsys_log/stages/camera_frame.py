@@ -244,4 +244,5 @@ STAGE = Stage(
     plan=_plan,
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("method", PERIMETER),
+    stateless=lambda parameters, view: (CAMERA_POINTS, RUN_EVENTS),
 )

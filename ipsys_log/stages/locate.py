@@ -175,4 +175,5 @@ STAGE = Stage(
     plan=_plan,
     rig_part=_rig_part,
     method=model_read,
+    stateless=lambda parameters, view: (POSITIONS,),
 )

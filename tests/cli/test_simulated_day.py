@@ -188,6 +188,8 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     assert np.percentile(errors, 95) < 0.05
 
     assert "the replay is identical to the log" in day("verify", "a.mcap")
+    day("cut", "a.mcap", "-o", "part.mcap", "--start", 2)
+    assert "channels have the messages of the cut" in day("verify", "part.mcap")
     day("latency", "a.mcap", "--plot", "latency.png")
     day("diff", "a.mcap", "a.mcap")
     day("repair", "a.mcap")

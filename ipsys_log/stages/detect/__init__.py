@@ -39,6 +39,7 @@ from ipsys_log.messages.channels import (
     MARKERS,
     RIG,
     RUN_EVENTS,
+    Channel,
 )
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.stages.detect.edges import MarkerFit
@@ -323,6 +324,25 @@ def _rig_part(rig: Rig, _method: str) -> object:
     return rig.dictionary, ids, {shutter for shutter in shutters if any(shutter[1:])}
 
 
+def _stateless(parameters: Mapping[str, str], view: StageView) -> Collection[Channel]:
+    """Return the channels without memory: edges follows markers, video needs its keyframes."""
+    if parameters.get("corners") != STOCK or "as_live" in parameters or _has_video(view):
+        return ()
+    return MARKERS, ANNOTATIONS
+
+
+def _has_video(view: StageView) -> bool:
+    """Return whether the first frame of a camera is a frame of a video."""
+    waiting = set(view.cameras)
+    for message in view.messages(IMAGES):
+        waiting.discard(str(message.camera))
+        if isinstance(message.payload, CompressedVideo):
+            return True
+        if not waiting:
+            break
+    return False
+
+
 STAGE = Stage(
     name="detect",
     versions={"detect": 1, EDGES: 1, STOCK: 1},
@@ -332,4 +352,5 @@ STAGE = Stage(
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("corners", ""),
     in_threads=True,
+    stateless=_stateless,
 )

@@ -1,0 +1,204 @@
+"""Copies of parts of logs: whole chunks as they are, other messages one by one, in constant memory."""
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+from mcap import records as mcap
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from ipsys_log.log.bounds import chunk_excess
+from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.chunk_messages import Entries, Rows, chunk_entries, to_rows
+from ipsys_log.log.chunks import unpack
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.hashing import METADATA_NAME, Buffer, extend
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
+from ipsys_log.log.writer import LogWriter
+
+__all__ = ["Choose", "copy_messages", "copy_records"]
+
+# From a topic and log times in ns, (n,), to those that are kept, (n,).
+Choose = Callable[[str, NDArray[np.int64]], NDArray[np.bool_]]
+
+_PIECE = 4 << 20  # bytes of an attachment that are copied at once
+
+
+def copy_messages(
+    reader: LogReader, writer: LogWriter, choose: Choose, advance: Callable[[int], None]
+) -> None:
+    """Copy the chosen messages of a log into a new log, in the order of the file.
+
+    Topic, times and data of each message stay as they are. A chunk of which all messages are chosen is copied
+    without decompression of its images. One chunk is in memory at a time.
+
+    Parameters
+    ----------
+    choose : returns the messages to keep, by topic and log time.
+    advance : called with the number of bytes of the log that are done.
+
+    Raises
+    ------
+    LogError
+        A chunk is damaged, or the new log has one of the topics with another schema.
+    """
+    view, contents = reader.view, reader.contents
+    for chunk in sorted(contents.chunks, key=lambda chunk: chunk.offset):
+        entries = chunk_entries(view, chunk, {})
+        kept = _kept_rows(contents, entries, choose)
+        if kept:
+            ids = {key: _adopt(contents, writer, key) for key in kept}
+            is_whole = all(len(kept.get(key, ())) == len(rows) for key, rows in entries.items())
+            if chunk.index_length and is_whole and all(key == own for key, own in ids.items()):
+                _copy_chunk(view, contents, chunk, entries, writer)
+            else:
+                data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
+                _copy_rows(view, contents, kept, writer, _Bytes(data).read)
+        advance(chunk.end)
+    unchunked = _kept_rows(contents, to_rows(contents.unchunked), choose)
+    if unchunked:
+        for key in unchunked:
+            _adopt(contents, writer, key)
+        _copy_rows(view, contents, unchunked, writer, lambda low, high: view.read(low, high - low))
+
+
+def copy_records(reader: LogReader, writer: LogWriter) -> None:
+    """Copy the attachments and the metadata of a log; the stored hashes of its channels are left out.
+
+    Raises
+    ------
+    LogError
+        A record is not at its place.
+    """
+    view, contents = reader.view, reader.contents
+    for index in contents.attachments:
+        _copy_record(view, writer, index, Opcode.ATTACHMENT)
+    for metadata in contents.metadata:
+        if metadata.name != METADATA_NAME:
+            _copy_record(view, writer, metadata, Opcode.METADATA)
+
+
+def _copy_record(
+    view: LogBytes, writer: LogWriter, index: mcap.AttachmentIndex | mcap.MetadataIndex, opcode: Opcode
+) -> None:
+    head = HEADER.unpack(view.read(index.offset, HEADER.size))
+    if head != (opcode, index.length - HEADER.size):
+        raise view.fault(index.offset, f"the record of {index.name} is missing")
+    end = index.offset + index.length
+    starts = range(index.offset, end, _PIECE)
+    writer.copy_record(index, (view.read(start, min(_PIECE, end - start)) for start in starts))
+
+
+def _kept_rows(contents: Contents, entries: Entries, choose: Choose) -> dict[int, Rows]:
+    """Return the rows of chosen messages by channel id; no channel has an empty array."""
+    kept = {}
+    for key, rows in entries.items():
+        if key in contents.channels:  # readers leave out a message without a channel, too
+            chosen = rows[choose(contents.channels[key].topic, rows[:, 0].astype(np.int64))]
+            if len(chosen):
+                kept[key] = chosen
+    return kept
+
+
+class _Bytes:
+    """The records of a chunk, decompressed."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def read(self, low: int, high: int) -> bytes:
+        """Return the bytes from ``low`` to before ``high``."""
+        return self._data[low:high]
+
+
+def _adopt(contents: Contents, writer: LogWriter, key: int) -> int:
+    channel = contents.channels[key]
+    return writer.adopt_channel(channel, contents.schemas.get(channel.schema_id))
+
+
+def _by_offset(entries: Mapping[int, Rows]) -> list[list[int]]:
+    """Return log time and offset of messages in the order of the file."""
+    rows = np.concatenate([*entries.values()])
+    ordered: list[list[int]] = rows[np.argsort(rows[:, 1], kind="stable")].tolist()
+    return ordered
+
+
+def _copy_rows(
+    view: LogBytes,
+    contents: Contents,
+    kept: Mapping[int, Rows],
+    writer: LogWriter,
+    read: Callable[[int, int], bytes],
+) -> None:
+    """Write messages one by one; ``read`` returns the bytes between two offsets."""
+    topics = [contents.channels[key].topic for key in kept]
+    for time_ns, offset in _by_offset(kept):
+        head = read(offset, offset + MESSAGE_HEAD_SIZE)
+        opcode, length, key, _, log_ns, publish_ns = _message_head(view, head, 0, offset)
+        if opcode != Opcode.MESSAGE or key not in kept or log_ns != time_ns:
+            raise view.fault(offset, "a message index points to no message of its time")
+        data = read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
+        if len(data) != length - MESSAGE_HEAD_SIZE + HEAD_SIZE:
+            raise view.fault(offset, "a message reaches beyond the end of its chunk")
+        topic = contents.channels[key].topic
+        if topics.count(topic) > 1:  # its channels differ in the version of their schema
+            _adopt(contents, writer, key)
+        writer.write(topic, log_ns, publish_ns, data)
+
+
+def _message_head(view: LogBytes, data: Buffer, position: int, offset: int) -> tuple[int, ...]:
+    if position + MESSAGE_HEAD_SIZE > len(data):
+        raise view.fault(offset, "a message reaches beyond the end of its chunk")
+    return MESSAGE.unpack_from(data, position)
+
+
+def _copy_chunk(
+    view: LogBytes, contents: Contents, chunk: ChunkRef, entries: Entries, writer: LogWriter
+) -> None:
+    record, head = parse_chunk_head(view, chunk.offset)
+    if record.length != chunk.length:
+        raise view.fault(chunk.offset, "its index claims another length of the chunk")
+    if not head.compression and (excess := chunk_excess(head.data_size, head.uncompressed_size)):
+        raise view.refusal(excess)
+    whole = view.read(chunk.offset, chunk.length + chunk.index_length)
+    start = head.data_offset - chunk.offset
+    stored = memoryview(whole)[start : start + head.data_size]
+    data: Buffer = unpack(view, chunk.offset, head) if head.compression else stored
+    inside = _Inside(view, contents, chunk.offset, data)
+    rows = list(inside.rows(entries))
+    if head.crc and inside.crc != head.crc:
+        raise view.fault(chunk.offset, "the CRC of the chunk is wrong")
+    stored_crc = zlib.crc32(stored) if head.compression else inside.crc
+    crc = extend(zlib.crc32(whole[:start]), stored, stored_crc)
+    crc = zlib.crc32(memoryview(whole)[start + len(stored) :], crc)
+    counts = {key: len(rows_of_one) for key, rows_of_one in entries.items()}
+    writer.copy_chunk(chunk, whole, crc, counts, rows)
+
+
+class _Inside:
+    """The messages inside a chunk: their rows for the hashes, and the CRC-32 of the whole chunk.
+
+    The CRC of an image is computed once: the hash of its channel and the CRC of the chunk both use it.
+    """
+
+    def __init__(self, view: LogBytes, contents: Contents, offset: int, data: Buffer) -> None:
+        self._view, self._contents, self._offset, self._data = view, contents, offset, memoryview(data)
+        self.crc = 0
+
+    def rows(self, entries: Entries) -> Iterator[tuple[str, int, int, int, int]]:
+        """Yield topic, log time, publish time, length and CRC of each message, in the order of the file."""
+        view, data, position = self._view, self._data, 0
+        for time_ns, offset in _by_offset(entries):
+            opcode, length, key, _, log_ns, publish_ns = _message_head(view, data, offset, self._offset)
+            start, end = offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length
+            is_valid = opcode == Opcode.MESSAGE and key in entries and log_ns == time_ns
+            has_more = position < offset and data[position] == Opcode.MESSAGE  # and the index lacks it
+            if not is_valid or has_more or offset < position or not start <= end <= len(data):
+                raise view.fault(self._offset, "a message index points to no message of its time")
+            crc = zlib.crc32(data[start:end])
+            self.crc = extend(zlib.crc32(data[position:start], self.crc), data[start:end], crc)
+            position = end
+            yield self._contents.channels[key].topic, log_ns, publish_ns, end - start, crc
+        self.crc = zlib.crc32(data[position:], self.crc)

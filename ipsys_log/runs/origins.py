@@ -1,0 +1,141 @@
+"""Origins of the channels of a part of a log: the identity of each channel before every cut."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ipsys_log.log.contents import camera_of_topic
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.reader import LogReader
+from ipsys_log.messages import ChannelCut, ChannelRead, Run
+from ipsys_log.messages.channels import Channel
+
+__all__ = [
+    "cut_topics",
+    "has_result",
+    "is_cut",
+    "is_whole",
+    "left_out",
+    "logs_before_cut",
+    "present_inputs",
+    "was_complete",
+]
+
+
+class _Origin(NamedTuple):
+    """A channel before a cut: the number of its messages, their hash, and the logs that were cut."""
+
+    messages: int
+    hash: str
+    logs: tuple[str, ...]
+
+
+def _origins(session: Session, topic: str) -> list[_Origin]:
+    """Return a channel before each cut, the last cut first.
+
+    A record of a cut counts only if the channel is now, or was before the next cut, as the cut has left it.
+    """
+    readers = [reader for reader in session.readers if topic in reader.channels]
+    if len(readers) > 1:  # the channel goes on in a second log, which the record does not know
+        return []
+    cuts = session.cuts.get(readers[0], []) if readers else [cut for c in session.cuts.values() for cut in c]
+    if not cuts:
+        return []
+    state, origins = (session.count(topic), session.hash(topic)), []
+    for cut in reversed(cuts):
+        before = next((one for one in cut.channels if one.topic == topic), None)
+        if before is not None and (before.kept, before.kept_hash or "") == state:
+            state = before.messages, before.hash
+            origins.append(_Origin(*state, cut.logs))
+    return origins
+
+
+def is_whole(session: Session, read: ChannelRead) -> bool:
+    """Return whether a channel is now as a stage has read it."""
+    return session.count(read.topic) == read.messages and session.hash(read.topic) == read.hash
+
+
+def _origin_of(session: Session, read: ChannelRead) -> _Origin | None:
+    wanted = read.messages, read.hash
+    return next((one for one in _origins(session, read.topic) if one[:2] == wanted), None)
+
+
+def is_cut(session: Session, read: ChannelRead) -> bool:
+    """Return whether a channel was as a stage has read it, before a cut; it did not change otherwise."""
+    return _origin_of(session, read) is not None
+
+
+def logs_before_cut(session: Session, run: Run) -> tuple[str, ...]:
+    """Return the names of the logs that a run was cut from.
+
+    Returns
+    -------
+    Nothing if the run is whole, or if one of its inputs changed in another way than by a cut.
+    """
+    logs: tuple[str, ...] = ()
+    for read in run.inputs:
+        if not is_whole(session, read):
+            origin = _origin_of(session, read)
+            if origin is None:
+                return ()
+            logs = origin.logs
+    for output in run.outputs:
+        if session.count(output.topic) < output.messages:
+            enough = (one for one in _origins(session, output.topic) if one.messages >= output.messages)
+            origin = next(enough, None)
+            if origin is None:
+                return ()
+            logs = logs or origin.logs
+    return logs
+
+
+def was_complete(session: Session, topic: str, messages: int) -> bool:
+    """Return whether a channel had this number of messages before a cut."""
+    return any(one.messages >= messages for one in _origins(session, topic))
+
+
+def present_inputs(session: Session, run: Run) -> tuple[ChannelRead, ...]:
+    """Return the inputs of a run as they are in this part; inputs without messages here are left out.
+
+    Inputs that were not cut, or changed in another way, stay as they are.
+    """
+    inputs = []
+    for read in run.inputs:
+        if is_whole(session, read) or _origin_of(session, read) is None:
+            inputs.append(read)
+        elif session.count(read.topic):
+            inputs.append(ChannelRead(read.topic, session.count(read.topic), session.hash(read.topic)))
+    return tuple(inputs)
+
+
+def cut_topics(session: Session) -> dict[LogReader, dict[str, ChannelCut]]:
+    """Return for each part the entry of each channel in the newest record of a cut that names it."""
+    return {
+        reader: {one.topic: one for cut in cuts for one in cut.channels}
+        for reader, cuts in session.cuts.items()
+    }
+
+
+def left_out(session: Session) -> set[str]:
+    """Return the channels that the options of a cut have excluded."""
+    excluded = {
+        one.topic for cuts in session.cuts.values() for cut in cuts for one in cut.channels if one.left_out
+    }
+    return {topic for topic in excluded if not session.count(topic)}
+
+
+def has_result(session: Session, run: Run, purpose: Channel) -> bool:
+    """Return whether the part has the result of a run for all its cameras.
+
+    Parameters
+    ----------
+    purpose : the channel of the result.
+    """
+    missing = left_out(session)
+    cameras = {camera_of_topic(read.topic) for read in run.inputs if read.topic in missing} - {None}
+    results = (
+        output.topic
+        for output in run.outputs
+        if purpose.topic_of(run.run, camera_of_topic(output.topic)) == output.topic
+    )
+    return not any(topic in missing and camera_of_topic(topic) not in cameras for topic in results)

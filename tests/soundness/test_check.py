@@ -59,7 +59,7 @@ def only(log: Path) -> Finding:
 def fault(log: Path) -> str:
     result = check(log)
     assert result.state == "broken", result
-    return result.remarks[0].text
+    return next(finding.text for finding in result.findings if finding.level == "broken")
 
 
 def stock_copy(

@@ -22,19 +22,22 @@ _IMAGE = IMAGES.topic.rpartition("/")[2]
 
 
 def find_input_logs(session: Session, others: Sequence[Path]) -> list[Path]:
-    """Return the logs among ``others`` that have inputs of runs which the log of ``session`` lacks."""
+    """Return the logs among ``others`` with inputs of runs that the log of ``session`` lacks in part."""
     needed = {
         read.topic: read.hash
         for run in session.runs()
         for read in run.inputs
-        if read.messages and not session.count(read.topic)
+        if read.messages != session.count(read.topic)
     }
     return [path for path in others if needed and _has_input(path, needed)]
 
 
 def _has_input(path: Path, needed: dict[str, str]) -> bool:
     with suppress(IpsysError), Session([path]) as other:
-        return any(other.count(topic) and other.hash(topic) == wanted for topic, wanted in needed.items())
+        # An input from several logs has the hash of each of them, joined by "+".
+        return any(
+            other.count(topic) and other.hash(topic) in wanted.split("+") for topic, wanted in needed.items()
+        )
     return False
 
 

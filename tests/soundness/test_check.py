@@ -231,7 +231,8 @@ def test_log_times_that_decrease_and_stamps_that_repeat_are_found(lab: Path) -> 
 
     def back(topic: str, times: Times) -> Times:
         last[topic] = last.get(topic, 0) + 1
-        return (times[0] - 10 * NS_PER_S, *times[1:]) if topic == RED and last[topic] == 30 else times
+        is_moved = topic == RED and last[topic] == 20  # in the drive, where frames are 0.2 s apart
+        return (times[0] - NS_PER_S // 4, *times[1:]) if is_moved else times
 
     finding = only(stock_copy(lab, back))
     assert (finding.kind, finding.topic, finding.count) == ("time", RED, 1)
@@ -316,7 +317,7 @@ def _other_size(message: Message) -> Message:
 def _measured(**changes: object) -> Callable[[Message], Message]:
     def change(message: Message) -> Message:
         payload = message.payload
-        if isinstance(payload, Measurement) and payload.id == "p003":
+        if isinstance(payload, Measurement) and payload.id == "s003":
             return replace(message, payload=replace(payload, **changes))  # type: ignore[arg-type]
         return message
 
@@ -330,10 +331,10 @@ def _measured(**changes: object) -> Callable[[Message], Message]:
         (_without_red, "camera red is not in the rig, which has black, white"),
         (_without_lens, "camera red has no intrinsics"),
         (_other_size, "are for 1920 x 1080 px, but its images have 960 x 540 px"),
-        (_measured(marker_id=77), "measurement p003: marker 77 is not in the rig"),
-        (_measured(distances=(Distance("Z", 1.0),)), "measurement p003: reference point Z is not in the rig"),
-        (_measured(withdraws="p999"), "measurement p003: withdraws p999, which is not in the log"),
-        (_measured(id="p002"), "measurement p002: an earlier measurement has the same id"),
+        (_measured(marker_id=77), "measurement s003: marker 77 is not in the rig"),
+        (_measured(distances=(Distance("Z", 1.0),)), "measurement s003: reference point Z is not in the rig"),
+        (_measured(withdraws="p999"), "measurement s003: withdraws p999, which is not in the log"),
+        (_measured(id="s002"), "measurement s002: an earlier measurement has the same id"),
     ],
 )
 def test_wrong_reference_is_found(lab: Path, change: Callable[[Message], Message | None], text: str) -> None:
@@ -347,8 +348,10 @@ def test_states_of_runs_are_those_of_the_list_of_runs(replayed_lab: Path, ipsys:
     def without_positions(topic: str, times: Times) -> Times | None:
         return None if topic == "/runs/poly/cameras/red/positions" else times
 
-    finding = only(stock_copy(replayed_lab, without_positions))
-    assert finding.text == "run poly, locate: unfinished"
+    assert [finding.text for finding in check(stock_copy(replayed_lab, without_positions)).remarks] == [
+        "run poly, locate: unfinished",
+        "run poly, fuse: its input /runs/poly/cameras/red/positions is not in the log",
+    ]
 
     def other_lens(topic: str, times: Times) -> Times:
         return (times[0] - 1, *times[1:]) if topic == "/cameras/red/calibration" else times

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -121,8 +123,12 @@ def cat(
         ends_ns = [_ns(end_secs), _ns(end_offset, session.start_ns)]
         start_ns = max((time for time in starts_ns if time is not None), default=None)
         end_ns = min((time for time in ends_ns if time is not None), default=None)
-        for raw, message in session.attempts(wanted, start_ns, end_ns):
-            print(draw(raw, message, channels[raw.topic]))  # noqa: T201
+        try:
+            for raw, message in session.attempts(wanted, start_ns, end_ns):
+                print(draw(raw, message, channels[raw.topic]))  # noqa: T201
+            sys.stdout.flush()
+        except BrokenPipeError:  # the reader of the pipe, such as head, has ended
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _wanted(session: Session, topics: list[str]) -> list[str]:

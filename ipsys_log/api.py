@@ -23,7 +23,7 @@ from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sampled_track import SampledTrack
 from ipsys_log.soundness.check import check_logs
-from ipsys_log.soundness.finding import Finding, LogCheck
+from ipsys_log.soundness.finding import LogCheck, LogFinding
 from ipsys_log.tracker import LiveTracks, Tracker
 
 if TYPE_CHECKING:
@@ -38,12 +38,12 @@ __all__ = [
     "Comparison",
     "Export",
     "Failure",
-    "Finding",
     "FittedModel",
     "Listing",
     "LiveTracks",
     "Log",
     "LogCheck",
+    "LogFinding",
     "ModelEvaluation",
     "Outcome",
     "Player",

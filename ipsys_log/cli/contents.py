@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -64,15 +64,9 @@ def du(logs: Logs, as_json: AsJson = False) -> None:
 
     The payload is counted before compression. A compressed chunk counts in proportion to the bytes of its
     messages."""
-    from ipsys_log.log.reader import LogReader
-    from ipsys_log.report.channel_sizes import sizes_json, sizes_table
+    from ipsys_log.report.channel_sizes import sizes_table
 
-    results = []
-    for path in logs:
-        with LogReader(path) as reader, progress_bar(()) as progress:
-            total = reader.chunk_count
-            rows = reader.sizes(lambda done, total=total: progress("chunks", done, total))  # type: ignore[misc]
-            results.append(sizes_json(str(path), reader.size, rows))
+    results = [_sizes(path) for path in logs]
     if as_json:
         print(json.dumps(results, indent=2))  # noqa: T201
         return
@@ -80,6 +74,15 @@ def du(logs: Logs, as_json: AsJson = False) -> None:
         if number:
             console.print()
         console.print(sizes_table(result))
+
+
+def _sizes(path: Path) -> dict[str, Any]:
+    from ipsys_log.log.reader import LogReader
+    from ipsys_log.report.channel_sizes import sizes_json
+
+    with LogReader(path) as reader, progress_bar(()) as progress:
+        sizes = reader.sizes(lambda done: progress("chunks", done, reader.chunk_count))
+        return sizes_json(str(path), reader.size, sizes)
 
 
 @writes_nothing

@@ -33,7 +33,8 @@ def compare_schema(schema: Schema) -> SchemaDifference:
     if schema.name not in stored:
         return SchemaDifference((f"its definition does not contain {schema.name}",))
     known = _messages(FileDescriptorSet.FromString(schema_data(schema.name)))
-    faults, new_fields = [], []
+    faults: list[str] = []
+    new_fields: list[str] = []
     for name in sorted(stored.keys() & known.keys()):
         fields = {field.number: field for field in known[name].field}
         for field in stored[name].field:

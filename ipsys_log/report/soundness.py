@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ipsys_log.plain_text import plain_text
-from ipsys_log.soundness.finding import BROKEN, SOUND, Finding, LogCheck
+from ipsys_log.soundness.finding import BROKEN, SOUND, LogCheck, LogFinding
 from ipsys_log.units import format_time
 
 __all__ = ["check_json", "check_lines"]
@@ -30,7 +30,7 @@ def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
     }
 
 
-def _finding_json(finding: Finding) -> dict[str, Any]:
+def _finding_json(finding: LogFinding) -> dict[str, Any]:
     return {key: value for key, value in asdict(finding).items() if value not in (None, "")}
 
 
@@ -47,7 +47,7 @@ def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
         yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
 
 
-def _first_fault(check: LogCheck) -> Finding | None:
+def _first_fault(check: LogCheck) -> LogFinding | None:
     return next((finding for finding in check.findings if finding.level == BROKEN), None)
 
 
@@ -59,7 +59,7 @@ def _answer(check: LogCheck) -> str:
     return SOUND if not number else f"readable, {number} remark{'s' if number > 1 else ''}"
 
 
-def _line(finding: Finding) -> str:
+def _line(finding: LogFinding) -> str:
     """Return the place, the fault and the advice of a finding in one line."""
     place = [finding.topic] if finding.topic else []
     place += [f"at {format_time(finding.time_ns)}"] if finding.time_ns is not None else []

@@ -17,7 +17,7 @@ from ipsys_log.log.stored_schemas import compare_schema
 from ipsys_log.messages import Event
 from ipsys_log.messages.channels import CHANNELS, EVENTS, IMAGES, RUN_EVENTS, channel_of
 from ipsys_log.messages.events import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE
-from ipsys_log.soundness.finding import NOTE, REMARK, Finding
+from ipsys_log.soundness.finding import NOTE, REMARK, LogFinding
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["check_events", "check_messages", "check_rates", "check_schemas", "decoded_topics", "image_topics"]
@@ -45,18 +45,18 @@ def _payload(channel: StoredChannel) -> type | None:
     return None if channel.schema is None else payload_type(channel.schema.name)
 
 
-def check_schemas(session: Session) -> Iterator[Finding]:
+def check_schemas(session: Session) -> Iterator[LogFinding]:
     """Check that the schema of each known channel can be decoded; an unknown channel is no fault."""
     for reader in session.readers:
         for topic, text in reader.conflicts.items():
             advice = "write the channels with different topics"
-            yield Finding("schema", REMARK, f"{text}: the topic cannot be read", advice, topic)
+            yield LogFinding("schema", REMARK, f"{text}: the topic cannot be read", advice, topic)
         for topic, channel in reader.channels.items():
             if topic not in reader.conflicts:
                 yield from _check_schema(topic, channel)
 
 
-def _check_schema(topic: str, channel: StoredChannel) -> Iterator[Finding]:
+def _check_schema(topic: str, channel: StoredChannel) -> Iterator[LogFinding]:
     name = "no schema" if channel.schema is None else f"the schema {channel.schema.name}"
     payload, count = _payload(channel), channel.message_count
     if payload is None or channel.schema is None or channel_of(topic, payload) is None:
@@ -64,16 +64,16 @@ def _check_schema(topic: str, channel: StoredChannel) -> Iterator[Finding]:
         level = REMARK if is_reserved else NOTE
         text = f"has {name}, which ipsys does not read in this topic"
         advice = "give the channel another topic, or update ipsys" if is_reserved else ""
-        yield Finding("schema", level, text, advice, topic, None, count)
+        yield LogFinding("schema", level, text, advice, topic, None, count)
         return
     difference = compare_schema(channel.schema)
     if difference.faults:
         more = f" and {len(difference.faults) - 1} more" if len(difference.faults) > 1 else ""
         text = f"{difference.faults[0]}{more}: the values of its messages may be wrong"
-        yield Finding("schema", REMARK, text, "ask its sender for the software that wrote it", topic)
+        yield LogFinding("schema", REMARK, text, "ask its sender for the software that wrote it", topic)
     elif difference.new_fields:
         text = f"newer software wrote it: {difference.new_fields[0]} is not known here"
-        yield Finding("schema", NOTE, text, "update ipsys to read all fields", topic)
+        yield LogFinding("schema", NOTE, text, "update ipsys to read all fields", topic)
 
 
 def _is_reserved(topic: str) -> bool:
@@ -82,7 +82,7 @@ def _is_reserved(topic: str) -> bool:
     return is_named or any(channel.topic == topic for channel in CHANNELS)
 
 
-def check_messages(session: Session, progress: Callable[[int], None]) -> Iterator[Finding]:
+def check_messages(session: Session, progress: Callable[[int], None]) -> Iterator[LogFinding]:
     """Decode each message of the known channels without images.
 
     Raises
@@ -101,7 +101,7 @@ def check_messages(session: Session, progress: Callable[[int], None]) -> Iterato
             progress(number)
     for topic, (count, first_ns, text) in sorted(faults.items()):
         advice = "commands that read this topic stop there; ask its sender for the original log"
-        yield Finding("message", REMARK, f"cannot be decoded: {text}", advice, topic, first_ns, count)
+        yield LogFinding("message", REMARK, f"cannot be decoded: {text}", advice, topic, first_ns, count)
 
 
 def _reason(error: LogError) -> str:
@@ -121,17 +121,18 @@ def decoded_topics(session: Session) -> list[str]:
     ]
 
 
-def check_rates(session: Session) -> Iterator[Finding]:
+def check_rates(session: Session) -> Iterator[LogFinding]:
     """Check the frames of each camera for gaps in which other cameras have frames."""
     times_ns = {topic: _times_ns(session, topic) for topic in session.images.values()}
     for camera, topic in session.images.items():
         gaps = find_gaps(times_ns[topic])
         if gaps.rate_hz is not None:
             text = f"{len(times_ns[topic])} frames of camera {camera} at {gaps.rate_hz:.1f} Hz"
-            yield Finding("rate", NOTE, text, "", topic)
+            yield LogFinding("rate", NOTE, text, "", topic)
         others = [times for name, times in times_ns.items() if name != topic]
         margin_ns = round(gaps.usual_s * NS_PER_S)
-        own, common = [], []
+        own: list[tuple[float, int]] = []
+        common: list[tuple[float, int]] = []
         for start_ns, length_s in zip(gaps.starts_ns, gaps.lengths_s, strict=True):
             span_ns = start_ns + margin_ns, start_ns + round(length_s * NS_PER_S) - margin_ns
             goes_on = any(_has_time(other, *span_ns) for other in others)
@@ -139,10 +140,10 @@ def check_rates(session: Session) -> Iterator[Finding]:
         if own:
             text = f"camera {camera} has no frames while others have: {_gaps(own)}"
             advice = "check its cable, its bus and the events of the recording"
-            yield Finding("rate", REMARK, text, advice, topic, min(own, key=_start)[1], len(own))
+            yield LogFinding("rate", REMARK, text, advice, topic, min(own, key=_start)[1], len(own))
         if common:
             text = f"the recording pauses: {_gaps(common)}"
-            yield Finding("rate", NOTE, text, "", topic, min(common, key=_start)[1], len(common))
+            yield LogFinding("rate", NOTE, text, "", topic, min(common, key=_start)[1], len(common))
 
 
 def _times_ns(session: Session, topic: str) -> NDArray[np.int64]:
@@ -164,7 +165,7 @@ def _gaps(gaps: list[tuple[float, int]]) -> str:
     return f"one gap of {longest}" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest}"
 
 
-def check_events(session: Session) -> Iterator[Finding]:
+def check_events(session: Session) -> Iterator[LogFinding]:
     """Report the events of the recorder and of runs, by kind and camera."""
     runs = [None, *sorted(session.run_names())]
     for run in runs:
@@ -179,4 +180,4 @@ def check_events(session: Session) -> Iterator[Finding]:
             for (kind, _), (count, first_ns, text) in groups.items():
                 level = NOTE if kind in _USUAL_EVENTS else REMARK
                 advice = _ADVICE.get(kind, "" if level == NOTE else "ipsys cat shows all events")
-                yield Finding("event", level, f"{kind}: {text}", advice, topic, first_ns, count)
+                yield LogFinding("event", level, f"{kind}: {text}", advice, topic, first_ns, count)

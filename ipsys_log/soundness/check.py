@@ -20,7 +20,7 @@ from ipsys_log.soundness.channels import (
     decoded_topics,
     image_topics,
 )
-from ipsys_log.soundness.finding import BROKEN, REMARK, Finding, LogCheck
+from ipsys_log.soundness.finding import BROKEN, REMARK, LogCheck, LogFinding
 from ipsys_log.soundness.provenance import check_runs, find_input_logs
 from ipsys_log.soundness.references import check_cameras, check_intrinsics, check_measurements, check_rigs
 from ipsys_log.soundness.times import MessageTimes
@@ -56,18 +56,18 @@ def check_logs(
 
 
 def _check_log(path: Path, others: Sequence[Path], progress: Progress) -> LogCheck:
-    findings: list[Finding] = []
+    findings: list[LogFinding] = []
     try:
         findings += _check_file(path, progress)
         if not any(finding.level == BROKEN for finding in findings):
             findings += _check_contents(path, others, progress)
     except IpsysError as error:
         text = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
-        findings.append(Finding("file", BROKEN, text))
+        findings.append(LogFinding("file", BROKEN, text))
     return LogCheck(path, tuple(findings))
 
 
-def _check_file(path: Path, progress: Progress) -> Iterator[Finding]:
+def _check_file(path: Path, progress: Progress) -> Iterator[LogFinding]:
     advice = f"run: ipsys repair {path}"
     with LogReader(path) as reader:
         times = MessageTimes(
@@ -84,19 +84,19 @@ def _check_file(path: Path, progress: Progress) -> Iterator[Finding]:
 
         result = reader.check_file(Watch(show, times.add))
     for fault in result.faults:
-        yield Finding("file", BROKEN, fault, advice)
+        yield LogFinding("file", BROKEN, fault, advice)
     if result.faults:
         return
     if result.interrupted:
         text = "an append was interrupted: ipsys reads the log before it"
-        yield Finding("file", REMARK, text, advice)
+        yield LogFinding("file", REMARK, text, advice)
     for topic in result.changed_topics:
         text = "another program changed messages: they do not match the hash that their writer stored"
-        yield Finding("file", REMARK, text, "ask its sender for the original log", topic)
+        yield LogFinding("file", REMARK, text, "ask its sender for the original log", topic)
     yield from times.findings()
 
 
-def _check_contents(path: Path, others: Sequence[Path], progress: Progress) -> Iterator[Finding]:
+def _check_contents(path: Path, others: Sequence[Path], progress: Progress) -> Iterator[LogFinding]:
     with ExitStack() as stack:
         session = stack.enter_context(Session([path]))
         total = sum(session.count(topic) for topic in decoded_topics(session))
@@ -113,11 +113,11 @@ def _check_contents(path: Path, others: Sequence[Path], progress: Progress) -> I
         yield from _findings("run", check_runs(whole, names))
 
 
-def _findings(kind: str, part: Iterator[Finding]) -> Iterator[Finding]:
+def _findings(kind: str, part: Iterator[LogFinding]) -> Iterator[LogFinding]:
     """Yield the findings of a part of the check; a fault that stops it is one more finding."""
     try:
         yield from part
     except BoundError:
         raise
     except IpsysError as error:
-        yield Finding(kind, REMARK, str(error), "later messages of this kind are not checked")
+        yield LogFinding(kind, REMARK, str(error), "later messages of this kind are not checked")

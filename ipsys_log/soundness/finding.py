@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "Finding", "LogCheck"]
+__all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "LogCheck", "LogFinding"]
 
 # The levels of a finding.
 BROKEN, REMARK, NOTE = "broken", "remark", "note"
@@ -15,7 +15,7 @@ SOUND, READABLE = "sound", "readable"
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class LogFinding:
     """A finding of a check.
 
     Attributes
@@ -41,7 +41,7 @@ class LogCheck:
     """The result of the check of a log: its path and its findings, in the order of the checks."""
 
     path: Path
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[LogFinding, ...] = ()
 
     @property
     def state(self) -> str:
@@ -52,7 +52,7 @@ class LogCheck:
         return READABLE if REMARK in levels else SOUND
 
     @property
-    def remarks(self) -> tuple[Finding, ...]:
+    def remarks(self) -> tuple[LogFinding, ...]:
         """The findings that are no notes."""
         return tuple(finding for finding in self.findings if finding.level != NOTE)
 

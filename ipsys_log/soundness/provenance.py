@@ -12,7 +12,7 @@ from ipsys_log.messages import IMPORTED
 from ipsys_log.messages.channels import IMAGES, MODEL, RECORD
 from ipsys_log.runs.graph import writes
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
-from ipsys_log.soundness.finding import NOTE, REMARK, Finding
+from ipsys_log.soundness.finding import NOTE, REMARK, LogFinding
 
 __all__ = ["check_runs", "find_input_logs"]
 
@@ -41,7 +41,7 @@ def _has_input(path: Path, needed: dict[str, str]) -> bool:
     return False
 
 
-def check_runs(session: Session, names: Collection[str]) -> Iterator[Finding]:
+def check_runs(session: Session, names: Collection[str]) -> Iterator[LogFinding]:
     """Check the runs with these names: their records, their inputs and their states."""
     recorded = recorded_stages(session)
     for stage in recorded:
@@ -49,20 +49,20 @@ def check_runs(session: Session, names: Collection[str]) -> Iterator[Finding]:
             yield _check_stage(session, stage)
     for name in sorted(set(names) - {stage.run.run for stage in recorded}):
         text = f"run {name} has no record: its writer was stopped"
-        yield Finding("run", REMARK, text, "ipsys replay computes it again", RECORD.topic_of(name))
+        yield LogFinding("run", REMARK, text, "ipsys replay computes it again", RECORD.topic_of(name))
 
 
-def _check_stage(session: Session, stage: Recorded) -> Finding:
+def _check_stage(session: Session, stage: Recorded) -> LogFinding:
     run = stage.run
     text = f"run {run.run}, {run.stage}: {stage.state}"
     topic = RECORD.topic_of(run.run)
     missing = [read.topic for read in run.inputs if read.messages and not session.count(read.topic)]
     is_copy = run.stage == IMPORTED or (writes(run, MODEL) and not is_fitted_here(run))
     if stage.is_newer:
-        return Finding("run", REMARK, text, "", topic)
+        return LogFinding("run", REMARK, text, "", topic)
     if stage.state == "unfinished" or stage.out_of_date:
-        return Finding("run", REMARK, text, "ipsys replay computes it again", topic)
+        return LogFinding("run", REMARK, text, "ipsys replay computes it again", topic)
     if any(not topic.endswith(f"/{_IMAGE}") for topic in missing) and not is_copy:
         text = f"run {run.run}, {run.stage}: its input {missing[0]} is not in the log"
-        return Finding("run", REMARK, text, "give the log with this input too", topic)
-    return Finding("run", NOTE, text, "", topic)
+        return LogFinding("run", REMARK, text, "give the log with this input too", topic)
+    return LogFinding("run", NOTE, text, "", topic)

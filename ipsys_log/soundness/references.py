@@ -13,27 +13,27 @@ from ipsys_log.messages import Measurement, Rig
 from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MEASUREMENTS_TOPIC, RIG, RIG_TOPIC
 from ipsys_log.rig.file import check_rig
 from ipsys_log.runs.checks import image_sizes
-from ipsys_log.soundness.finding import REMARK, Finding
+from ipsys_log.soundness.finding import REMARK, LogFinding
 
 __all__ = ["check_cameras", "check_intrinsics", "check_measurements", "check_rigs"]
 
 _MOST_NAMES = 5
 
 
-def check_rigs(session: Session) -> Iterator[Finding]:
+def check_rigs(session: Session) -> Iterator[LogFinding]:
     """Check that a log with images, markers or measurements has a valid rig."""
     topics = session.topics(RIG)
     if not topics:
         if session.images or session.topics(MEASUREMENTS) or _marker_cameras(session):
             advice = "give one to each command: --rig lab.toml"
-            yield Finding("reference", REMARK, "the log has no rig", advice, RIG_TOPIC)
+            yield LogFinding("reference", REMARK, "the log has no rig", advice, RIG_TOPIC)
         return
     for message in session.messages(topics):
         try:
             check_rig(message.payload, "the rig")
         except IpsysError as error:
             advice = "give a correct rig to each command: --rig lab.toml"
-            yield Finding("reference", REMARK, str(error), advice, message.topic, message.log_time_ns, 1)
+            yield LogFinding("reference", REMARK, str(error), advice, message.topic, message.log_time_ns, 1)
 
 
 def _marker_cameras(session: Session) -> dict[str, str]:
@@ -47,7 +47,7 @@ def _cameras(session: Session) -> dict[str, str]:
     return _marker_cameras(session) | session.images
 
 
-def check_cameras(session: Session) -> Iterator[Finding]:
+def check_cameras(session: Session) -> Iterator[LogFinding]:
     """Check that the rig has each camera with images or markers."""
     rigs: list[Rig] = session.payloads(session.topics(RIG))
     known = {camera.name for rig in rigs for camera in rig.cameras}
@@ -56,17 +56,17 @@ def check_cameras(session: Session) -> Iterator[Finding]:
     for camera, topic in sorted(_cameras(session).items()):
         if camera not in known:
             text = f"camera {camera} is not in the rig, which has {_names(sorted(known))}"
-            yield Finding("reference", REMARK, text, "add it to lab.toml as [[cameras]]", topic)
+            yield LogFinding("reference", REMARK, text, "add it to lab.toml as [[cameras]]", topic)
 
 
-def check_intrinsics(session: Session) -> Iterator[Finding]:
+def check_intrinsics(session: Session) -> Iterator[LogFinding]:
     """Check that each camera has valid intrinsics for the size of its images."""
     sizes_px = image_sizes(session)
     for camera, topic in sorted(_cameras(session).items()):
         advice = f"calibrate it, and give its intrinsics: --calibration {camera}=FILE"
         if camera not in session.calibrations:
             text = f"camera {camera} has no intrinsics"
-            yield Finding("reference", REMARK, text, advice, topic)
+            yield LogFinding("reference", REMARK, text, advice, topic)
             continue
         stored = session.calibrations[camera]
         message = next(session.messages([stored]))
@@ -75,17 +75,17 @@ def check_intrinsics(session: Session) -> Iterator[Finding]:
         try:
             check_calibration(replace(lens, frame_id=camera), "the intrinsics")
         except IpsysError as error:
-            yield Finding("reference", REMARK, str(error), advice, *place)
+            yield LogFinding("reference", REMARK, str(error), advice, *place)
         if camera in sizes_px and sizes_px[camera] != (lens.width, lens.height):
             width, height = sizes_px[camera]
             text = (
                 f"the intrinsics of camera {camera} are for {lens.width} x {lens.height} px, but its images "
                 f"have {width} x {height} px"
             )
-            yield Finding("reference", REMARK, text, advice, *place)
+            yield LogFinding("reference", REMARK, text, advice, *place)
 
 
-def check_measurements(session: Session) -> Iterator[Finding]:
+def check_measurements(session: Session) -> Iterator[LogFinding]:
     """Check that measurements name markers and reference points of the rig, and withdrawals measurements."""
     rigs: list[Rig] = session.payloads(session.topics(RIG))[:1]
     active: set[str] = set()
@@ -105,7 +105,7 @@ def check_measurements(session: Session) -> Iterator[Finding]:
         ids = _names([name for name, _ in places])
         title = "measurement" if len(places) == 1 else "measurements"
         place = MEASUREMENTS_TOPIC, places[0][1], len(places)
-        yield Finding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
+        yield LogFinding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
 
 
 def _faults(measurement: Measurement, active: set[str], rig: Rig | None) -> Iterator[tuple[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 
-from ipsys_log.soundness.finding import REMARK, Finding
+from ipsys_log.soundness.finding import REMARK, LogFinding
 from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["MessageTimes"]
@@ -17,7 +17,7 @@ _FAR_SHARE = 0.1
 
 
 @dataclass(slots=True)
-class _Tally:
+class _Occurrences:
     """The number of messages with a fault, and the log time of the first one."""
 
     count: int = 0
@@ -40,26 +40,26 @@ class MessageTimes:
 
     stamped: Collection[str]
     _last: dict[str, tuple[int, int]] = field(default_factory=dict)
-    _decreasing: dict[str, _Tally] = field(default_factory=dict)
-    _repeated: dict[str, _Tally] = field(default_factory=dict)
-    _distant: dict[str, _Tally] = field(default_factory=dict)
-    _days: dict[int, dict[str, _Tally]] = field(default_factory=dict)
+    _decreasing: dict[str, _Occurrences] = field(default_factory=dict)
+    _repeated: dict[str, _Occurrences] = field(default_factory=dict)
+    _distant: dict[str, _Occurrences] = field(default_factory=dict)
+    _days: dict[int, dict[str, _Occurrences]] = field(default_factory=dict)
 
     def add(self, topic: str, log_time_ns: int, publish_time_ns: int) -> None:
         """Add the times of the next message in the file."""
-        self._days.setdefault(log_time_ns // _DAY_NS, {}).setdefault(topic, _Tally()).add(log_time_ns)
+        self._days.setdefault(log_time_ns // _DAY_NS, {}).setdefault(topic, _Occurrences()).add(log_time_ns)
         is_stamped = topic in self.stamped
         if topic in self._last:
             last_log_ns, last_stamp_ns = self._last[topic]
             if log_time_ns < last_log_ns:
-                self._decreasing.setdefault(topic, _Tally()).add(log_time_ns)
+                self._decreasing.setdefault(topic, _Occurrences()).add(log_time_ns)
             elif is_stamped and publish_time_ns <= last_stamp_ns:
-                self._repeated.setdefault(topic, _Tally()).add(log_time_ns)
+                self._repeated.setdefault(topic, _Occurrences()).add(log_time_ns)
         if is_stamped and abs(publish_time_ns - log_time_ns) > _DAY_NS:
-            self._distant.setdefault(topic, _Tally()).add(log_time_ns)
+            self._distant.setdefault(topic, _Occurrences()).add(log_time_ns)
         self._last[topic] = log_time_ns, publish_time_ns
 
-    def findings(self) -> Iterator[Finding]:
+    def findings(self) -> Iterator[LogFinding]:
         """Yield the findings, by topic."""
         for tallies, text, advice in (
             (
@@ -79,10 +79,10 @@ class MessageTimes:
             ),
         ):
             for topic, tally in sorted(tallies.items()):
-                yield Finding("time", REMARK, text, advice, topic, tally.first_ns, tally.count)
+                yield LogFinding("time", REMARK, text, advice, topic, tally.first_ns, tally.count)
         yield from self._far()
 
-    def _far(self) -> Iterator[Finding]:
+    def _far(self) -> Iterator[LogFinding]:
         """Yield a finding for each topic with few messages far from the time of all others."""
         groups: list[list[int]] = []
         for day in sorted(self._days):
@@ -97,4 +97,4 @@ class MessageTimes:
                 for topic, tally in sorted(self._days[day].items()):
                     text = f"log times are far from those of the log ({format_time(main_ns)[:10]})"
                     advice = "the clock of its writer was wrong: leave these messages out"
-                    yield Finding("time", REMARK, text, advice, topic, tally.first_ns, tally.count)
+                    yield LogFinding("time", REMARK, text, advice, topic, tally.first_ns, tally.count)

@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from mcap import records as mcap
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
@@ -23,12 +24,12 @@ def check_sizes(path: Path) -> None:
     topics: dict[int, str] = {}
     with path.open("rb") as file:
         for record in StreamReader(file).records:
-            if type(record).__name__ == "Channel":
-                topics[record.id] = record.topic  # type: ignore[attr-defined]
-            elif type(record).__name__ == "Message":
-                topic = topics[record.channel_id]  # type: ignore[attr-defined]
+            if isinstance(record, mcap.Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, mcap.Message):
+                topic = topics[record.channel_id]
                 messages[topic] += 1
-                payload[topic] += len(record.data)  # type: ignore[attr-defined]
+                payload[topic] += len(record.data)
     with LogReader(path) as reader:
         sizes = reader.sizes()
     assert Counter({size.topic: size.messages for size in sizes}) == messages

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -30,7 +30,7 @@ from ipsys_log.messages import (
     RigCamera,
 )
 from ipsys_log.soundness.check import check_logs
-from ipsys_log.soundness.finding import Finding, LogCheck
+from ipsys_log.soundness.finding import LogCheck, LogFinding
 from ipsys_log.soundness.times import MessageTimes
 from ipsys_log.units import NS_PER_S
 from tests.changed_logs import rewrite
@@ -49,7 +49,7 @@ def check(log: Path) -> LogCheck:
     return result
 
 
-def only(log: Path) -> Finding:
+def only(log: Path) -> LogFinding:
     """Return the only remark of a readable log."""
     result = check(log)
     assert result.state == "readable", result
@@ -218,7 +218,8 @@ def test_schema_with_more_fields_and_unknown_channels_are_sound(lab: Path) -> No
         files = FileDescriptorSet.FromString(data)
         if name == "ipsys.v1.Rig":
             message = next(m for file in files.file for m in file.message_type if m.name == "Rig")
-            message.field.add(name="colour", number=99, type=9, label=1)
+            kind = FieldDescriptorProto.TYPE_STRING
+            message.field.add(name="colour", number=99, type=kind, label=FieldDescriptorProto.LABEL_OPTIONAL)
         return files.SerializeToString()
 
     path = stock_copy(lab, schema=change)

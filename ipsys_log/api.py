@@ -22,6 +22,8 @@ from ipsys_log.player import Player
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sampled_track import SampledTrack
+from ipsys_log.soundness.check import check_logs
+from ipsys_log.soundness.finding import LogCheck, LogFinding
 from ipsys_log.tracker import LiveTracks, Tracker
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ __all__ = [
     "Listing",
     "LiveTracks",
     "Log",
+    "LogCheck",
+    "LogFinding",
     "ModelEvaluation",
     "Outcome",
     "Player",
@@ -47,6 +51,7 @@ __all__ = [
     "SampledTrack",
     "Tracker",
     "calibrate",
+    "check",
     "live",
     "load_model",
     "open",
@@ -180,6 +185,24 @@ def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, Mod
         for evaluation in session.payloads(session.topics(EVALUATION, run)):
             evaluations[evaluation.model] = ModelEvaluation(evaluation.model, run, evaluation)
     return evaluations
+
+
+def check(*paths: StrPath, progress: Progress = lambda stage, done, total: None) -> tuple[LogCheck, ...]:
+    """Read logs completely and check them; no file is changed.
+
+    The check covers the file, schemas, times, rates, references and runs. A run may have its inputs in
+    another of the logs.
+
+    Returns
+    -------
+    A result for each log: its ``state`` is ``sound``, ``readable`` (with remarks) or ``broken``.
+
+    Examples
+    --------
+    >>> for result in check("monday.mcap"):  # doctest: +SKIP
+    ...     print(result.state, *(finding.text for finding in result.remarks), sep="\\n")
+    """
+    return check_logs([Path(path) for path in paths], progress)
 
 
 def verify(

@@ -21,6 +21,8 @@ from ipsys_log.sampled_track import SampledTrack, sample_track, time_in_ns
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ipsys_log.soundness.finding import LogCheck
+
 __all__ = ["Export", "Listing", "Log", "StrPath", "Time"]
 
 StrPath = str | PathLike[str]
@@ -256,6 +258,12 @@ class Log:
             There is no such robot or run, or a time has no time zone.
         """
         return sample_track(self._session, robot, times, run)
+
+    def check(self) -> tuple[LogCheck, ...]:
+        """Read the logs completely and check them, as ``ipsys.check()`` does; a result for each log."""
+        from ipsys_log.soundness.check import check_logs
+
+        return check_logs(self.paths)
 
     def _run_of(self, channel: Channel, run: str | None) -> str | None:
         if not channel.is_derived:

@@ -23,6 +23,7 @@ LAYERS = (
     ("tracking",),
     ("stages",),
     ("runs",),
+    ("soundness",),
     ("simulation",),
     ("capture",),
     ("exchange", "sinks"),

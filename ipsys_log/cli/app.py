@@ -15,6 +15,7 @@ from ipsys_log.cli import (
     calibrate_lab,
     cameras,
     compare,
+    contents,
     cut,
     drift,
     drive,
@@ -43,7 +44,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
     ),
     "Accuracy, and the next points to measure": ("evaluate", "plan", "report", "drift"),
     "Inspect a log": (
-        *("info", "runs", "view", "export", "stream"),
+        *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
         *("cut", "verify", "diff", "latency", "repair"),
     ),
     _STAGES: (),
@@ -128,6 +129,19 @@ ipsys drift week*.mcap --fix                       # correct its pose
 """,
     "info": """
 ipsys info monday.mcap
+""",
+    "check": """
+ipsys check monday.mcap                  # is it sound? exit code 0, 1 or 2
+ipsys check lab.mcap derived.mcap        # derived.mcap has runs of lab.mcap
+ipsys check *.mcap --json                # also notes, for programs
+""",
+    "du": """
+ipsys du monday.mcap
+""",
+    "cat": """
+ipsys cat monday.mcap --topics /events,/measurements
+ipsys cat monday.mcap --start-offset 10 --end-offset 12 | less
+ipsys cat monday.mcap --topics /runs/poly/tracks --json > tracks.ndjson
 """,
     "export": """
 ipsys export monday.mcap -o tracks.csv
@@ -220,7 +234,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, drift, inspect, export, stream, cut, compare, drive),
+    *(plan, drift, inspect, contents, export, stream, cut, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

@@ -178,6 +178,27 @@ class Session:
         streams = [self._stored(reader, items, topics) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
 
+    def attempts(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[RawMessage, Message | LogError]]:
+        """Yield the messages of some topics in log order, each decoded, or with the error of its decoding."""
+        streams = [self._attempts(reader, items, topics, start_ns, end_ns) for reader, items in self._items()]
+        return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
+
+    def _attempts(
+        self,
+        reader: LogReader,
+        items: PartCounter,
+        topics: Collection[str],
+        start_ns: int | None,
+        end_ns: int | None,
+    ) -> Iterator[tuple[RawMessage, Message | LogError]]:
+        for raw in self._raw(reader, topics, start_ns, end_ns):
+            try:
+                yield raw, self._message(reader, raw, items)
+            except LogError as error:
+                yield raw, error
+
     def encoded(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, int, int, bytes]]:

@@ -4,7 +4,7 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import ReadLimits
 from ipsys_log.log.byte_source import LogBytes, open_for_reading
+from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
     RangeCache,
@@ -25,6 +26,8 @@ from ipsys_log.log.chunk_messages import (
     to_rows,
 )
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
+from ipsys_log.log.damage.findings import Watch
+from ipsys_log.log.file_check import FileCheck, check_file
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
 from ipsys_log.log.known_contents import contents_of
@@ -213,6 +216,14 @@ class LogReader:
                 state.add(message.log_time_ns, message.publish_time_ns, message.data)
             self._stored[topic] = state
         return state.digest.hex()
+
+    def check_file(self, watch: Watch) -> FileCheck:
+        """Read every byte of the log, and compare records, CRCs, indexes, summary and stored hashes."""
+        return check_file(self._view, self._contents, stored_hashes(self._view, self._contents), watch)
+
+    def sizes(self, progress: Callable[[int], None] = lambda done: None) -> list[ChannelSize]:
+        """Return the sizes of the channels, the largest first; `progress` gets the number of chunks done."""
+        return read_sizes(self._view, self._contents, progress)
 
     def _topics_by_id(self, topics: Collection[str] | None) -> dict[int, str]:
         wanted = self.channels.keys() if topics is None else set(topics)

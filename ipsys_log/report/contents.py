@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
+from ipsys_log.analysis.frame_gaps import FrameGaps, find_gaps
 from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
@@ -70,9 +71,7 @@ def intervals_table(found: list[dict[str, Any]]) -> Table:
     return table
 
 
-# On a channel of one camera, a gap is this many times longer than the usual interval between messages.
 # Messages of several cameras have no regular interval. On their channels, a gap is longer than this time.
-_GAP_FACTOR = 3
 _MERGED_GAP_S = 0.5
 # Schemas with one message per frame; the other channels have no rate.
 _OF_FRAMES = (
@@ -144,19 +143,16 @@ def _channel(session: Session, topic: str) -> dict[str, Any]:
     times_ns = np.sort(np.concatenate([reader.times(topic) for reader in readers]))
     schema = readers[0].channels[topic].schema
     name = schema.name if schema else None
-    gaps_s, rate_hz = np.zeros(0), None
-    if name is not None and re.split(r"[./]", name)[-1] in _OF_FRAMES and len(times_ns) > 1:
-        steps_s = np.diff(times_ns) / NS_PER_S
+    gaps = FrameGaps()
+    if name is not None and re.split(r"[./]", name)[-1] in _OF_FRAMES:
         of_one = camera_of_topic(topic) is not None or topic in session.images.values()
-        longest_s = _GAP_FACTOR * float(np.median(steps_s)) if of_one else _MERGED_GAP_S
-        gaps_s, steady_s = steps_s[steps_s > longest_s], steps_s[steps_s <= longest_s]
-        rate_hz = float(1 / steady_s.mean()) if steady_s.any() else None
+        gaps = find_gaps(times_ns, None if of_one else _MERGED_GAP_S)
     return {
         "schema": name,
         "messages": len(times_ns),
-        "rate_hz": rate_hz,
-        "gaps": len(gaps_s),
-        "longest_gap_s": float(gaps_s.max()) if len(gaps_s) else None,
+        "rate_hz": gaps.rate_hz,
+        "gaps": len(gaps.lengths_s),
+        "longest_gap_s": max(gaps.lengths_s, default=None),
     }
 
 

@@ -44,7 +44,7 @@ def unsafe(text: str) -> set[str]:
     return {sign for sign in text if sign != "\n" and plain_text(sign) != sign}
 
 
-@pytest.mark.parametrize("command", ["info", "runs", "repair", "view"])
+@pytest.mark.parametrize("command", ["info", "runs", "repair", "view", "check", "du", "cat"])
 def test_commands_with_hostile_names_print_no_controls(ipsys: Ipsys, hostile: Path, command: str) -> None:
     done = ipsys(command, hostile)
     assert unsafe(done.out + done.err) == set()

@@ -195,6 +195,8 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("repair", "a.mcap")
     day("info", "a.mcap")
     day("runs", "a.mcap")
+    day("du", "a.mcap")
+    day("cat", "a.mcap", "--topics", "/events")
     day("view", "a.mcap", "--save", "a.rrd")
     day("stream", "a.mcap", "--udp", "9870", "--rate", 10)
     day("evaluate", "session.mcap", "--model", "poly", "--model", "best")
@@ -204,6 +206,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     for stage in ("detect", "camera-frame", "fit", "locate", "fuse", "smooth"):
         day(stage, "session.mcap")
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
+    day("check", "s.mcap")
     # These have tests of their own: with public data, weeks of logs, and programs of robots.
     day.commands |= {"import", "drift", "drive"}
     assert day.commands == {name for names in panels().values() for name in names}

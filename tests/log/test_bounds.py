@@ -101,7 +101,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Cost]:
     return {command: run(*line(command, path)) for command in COMMANDS}
 
 
-COMMANDS = ("info", "runs", "repair", "view")
+COMMANDS = ("info", "runs", "repair", "view", "check", "du", "cat")
 
 
 def line(command: str, path: Path) -> list[object]:
@@ -119,11 +119,11 @@ def test_commands_on_a_small_file_stay_within_bounds(
         path = tmp_path / f"{command}.mcap"
         path.write_bytes(data)
         cost = run(*line(command, path))
-        assert cost.code in (0, 1), cost
+        assert cost.code in (0, 1) or (cost.code, command) == (2, "check"), cost
         assert "Traceback" not in cost.err
         assert cost.cpu_s - plain[command].cpu_s < 5.0, (command, cost)
         assert cost.peak_mb - plain[command].peak_mb < 300, (command, cost)
-        if cost.code == 1:
+        if cost.code:
             assert path.read_bytes() == data
 
 

@@ -1,5 +1,6 @@
 """Findings of a survey: whole and damaged parts of a log, and its lost messages."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from mcap.opcode import Opcode
@@ -20,6 +21,7 @@ __all__ = [
     "IndexGroup",
     "Lost",
     "Survey",
+    "Watch",
     "add_damage",
     "close_indexes",
     "skip_damage",
@@ -58,6 +60,18 @@ class IndexGroup:
         return self.inside is not None and self.sound and self.rows.keys() >= self.inside.entries.keys()
 
 
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Functions that a survey calls while it reads a log.
+
+    `progress` gets the number of bytes that are checked. `message` gets the topic, the log time and the
+    publish time in ns of each whole message, in the order of the file.
+    """
+
+    progress: Callable[[int], None] = lambda checked: None
+    message: Callable[[str, int, int], None] = lambda topic, log_time_ns, publish_time_ns: None
+
+
 @dataclass(slots=True)
 class Survey:
     """The whole records up to `end`, except the ranges in `damaged`.
@@ -71,6 +85,7 @@ class Survey:
     resync: Resync
     definitions: Definitions
     salvage: Salvage | None = None
+    watch: Watch = field(default_factory=Watch)
     contents: Contents = field(default_factory=Contents)
     unchunked: ChunkContents = field(default_factory=ChunkContents)
     counts: dict[int, dict[int, int]] = field(default_factory=dict)

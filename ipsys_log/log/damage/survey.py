@@ -15,6 +15,7 @@ from ipsys_log.log.damage.findings import (
     UNCHUNKED,
     IndexGroup,
     Survey,
+    Watch,
     add_damage,
     close_indexes,
     skip_damage,
@@ -47,7 +48,12 @@ _LONGEST_HEADER = 1 << 20  # bytes
 
 
 def survey(
-    view: LogBytes, known: Summary | None = None, salvage: Salvage | None = None, *, doubtful: bool = False
+    view: LogBytes,
+    known: Summary | None = None,
+    salvage: Salvage | None = None,
+    *,
+    doubtful: bool = False,
+    watch: Watch | None = None,
 ) -> Survey:
     """Check the data section record by record, without trusting lengths or raising errors for damage.
 
@@ -55,13 +61,13 @@ def survey(
 
     The file is read once. `known` is the summary, if there is one: it may have definitions that the data
     section lacks. Without `salvage`, damaged chunks are skipped. With `doubtful`, unconfirmed lengths are
-    checked closely.
+    checked closely. `watch` follows the reading.
     """
     damaged: list[DamagedRange] = []
     definitions = Definitions(known, damaged)
     channels = ChainMap[int, mcap.Channel](definitions.channels, definitions.known.channels)
     resync = Resync(view, channels, _is_chunked(known), _span_ns(known))
-    findings = Survey(view, resync, definitions, salvage, damaged=damaged)
+    findings = Survey(view, resync, definitions, salvage, watch or Watch(), damaged=damaged)
     findings.doubtful_to = view.size if doubtful else 0
     position = _take_start(findings)
     while position < view.size and not findings.finished:
@@ -144,6 +150,7 @@ def _take_records(findings: Survey, position: int) -> int:
                 return view.size
             findings.end = position = record_at.offset + record_at.length
             if position - findings.crc_at > _LAG:
+                findings.watch.progress(position)
                 _advance_crc(findings, position if findings.indexed is None else findings.indexed.start)
     except BoundError:
         raise
@@ -217,7 +224,7 @@ def _take_unchunked(findings: Survey, record: RecordAt) -> None:
         if stored != crc:
             raise view.fault(record.offset, "the CRC of an attachment is wrong")
     elif record.opcode == Opcode.MESSAGE and record.length >= MESSAGE.size:
-        _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(record.offset, MESSAGE.size))
+        _, _, channel, _, time_ns, published_ns = MESSAGE.unpack(view.read(record.offset, MESSAGE.size))
         if (
             _has_lost_chunk_heads(findings)
             and up_to_first_hole(view, record.offset, record.length) < record.length
@@ -235,6 +242,7 @@ def _take_unchunked(findings: Survey, record: RecordAt) -> None:
             else:
                 findings.displaced.append(record)
             raise
+        findings.watch.message(findings.definitions.topic(channel), time_ns, published_ns)
         findings.resync.times_ns.append(time_ns)
         if findings.resync.chunked and record.offset >= findings.doubtful_to:
             findings.resync.chunked = None  # the log has messages in chunks and outside of chunks
@@ -315,6 +323,7 @@ def _continue_hashes(findings: Survey, inside: ChunkContents, data: bytes) -> No
         _, length, _, _, time, published = MESSAGE.unpack_from(data, offset)
         payload = data[offset + MESSAGE.size : offset + HEADER.size + length]
         findings.hashes.setdefault(topic, ChannelHash()).add(time, published, payload)
+        findings.watch.message(topic, time, published)
 
 
 def _take_index(findings: Survey, record: RecordAt) -> None:

@@ -1,0 +1,1 @@
+"""Soundness of logs: the file, its channels, their references, and the provenance of runs."""

@@ -1,0 +1,123 @@
+"""The check of a log: its file first, then its channels, references and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.damage.findings import Watch
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.reader import LogReader
+from ipsys_log.runs.options import Progress
+from ipsys_log.soundness.channels import (
+    check_events,
+    check_messages,
+    check_rates,
+    check_schemas,
+    decoded_topics,
+    image_topics,
+)
+from ipsys_log.soundness.finding import BROKEN, REMARK, LogCheck, LogFinding
+from ipsys_log.soundness.provenance import check_runs, find_input_logs
+from ipsys_log.soundness.references import check_cameras, check_intrinsics, check_measurements, check_rigs
+from ipsys_log.soundness.times import MessageTimes
+
+__all__ = ["check_logs"]
+
+_BYTES_PER_MB = 1_000_000
+
+
+def check_logs(
+    paths: Sequence[Path], progress: Progress = lambda stage, done, total: None
+) -> tuple[LogCheck, ...]:
+    """Read logs completely, and check each of them; no file is changed.
+
+    A log may have runs whose inputs are in another of the given logs.
+
+    Parameters
+    ----------
+    progress : called with the name of the step, the amount done, and the total amount.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from ipsys_log.log.writer import LogWriter
+    >>> with TemporaryDirectory() as folder:
+    ...     with LogWriter.create(Path(folder) / "a.mcap"):
+    ...         pass
+    ...     [check] = check_logs([Path(folder) / "a.mcap"])
+    >>> check.state, check.findings
+    ('sound', ())
+    """
+    return tuple(_check_log(path, [other for other in paths if other != path], progress) for path in paths)
+
+
+def _check_log(path: Path, others: Sequence[Path], progress: Progress) -> LogCheck:
+    findings: list[LogFinding] = []
+    try:
+        findings += _check_file(path, progress)
+        if not any(finding.level == BROKEN for finding in findings):
+            findings += _check_contents(path, others, progress)
+    except IpsysError as error:
+        text = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
+        findings.append(LogFinding("file", BROKEN, text))
+    return LogCheck(path, tuple(findings))
+
+
+def _check_file(path: Path, progress: Progress) -> Iterator[LogFinding]:
+    advice = f"run: ipsys repair {path}"
+    with LogReader(path) as reader:
+        times = MessageTimes(
+            {
+                topic
+                for topic in image_topics(reader.channels)
+                if reader.channels[topic].message_encoding != "cdr"  # its stamps are in the messages
+            }
+        )
+        total = reader.size // _BYTES_PER_MB
+
+        def show(checked: int) -> None:
+            progress("check MB", checked // _BYTES_PER_MB, total)
+
+        result = reader.check_file(Watch(show, times.add))
+    for fault in result.faults:
+        yield LogFinding("file", BROKEN, fault, advice)
+    if result.faults:
+        return
+    if result.interrupted:
+        text = "an append was interrupted: ipsys reads the log before it"
+        yield LogFinding("file", REMARK, text, advice)
+    for topic in result.changed_topics:
+        text = "another program changed messages: they do not match the hash that their writer stored"
+        yield LogFinding("file", REMARK, text, "ask its sender for the original log", topic)
+    yield from times.findings()
+
+
+def _check_contents(path: Path, others: Sequence[Path], progress: Progress) -> Iterator[LogFinding]:
+    with ExitStack() as stack:
+        session = stack.enter_context(Session([path]))
+        total = sum(session.count(topic) for topic in decoded_topics(session))
+        yield from _findings("schema", check_schemas(session))
+        yield from _findings("message", check_messages(session, lambda done: progress("decode", done, total)))
+        yield from _findings("rate", check_rates(session))
+        yield from _findings("event", check_events(session))
+        whole, names = session, session.run_names()
+        sources = find_input_logs(session, others)
+        if sources:
+            whole = stack.enter_context(Session([*sources, path]))
+        for check in (check_rigs, check_cameras, check_intrinsics, check_measurements):
+            yield from _findings("reference", check(whole))
+        yield from _findings("run", check_runs(whole, names))
+
+
+def _findings(kind: str, part: Iterator[LogFinding]) -> Iterator[LogFinding]:
+    """Yield the findings of a part of the check; a fault that stops it is one more finding."""
+    try:
+        yield from part
+    except BoundError:
+        raise
+    except IpsysError as error:
+        yield LogFinding(kind, REMARK, str(error), "later messages of this kind are not checked")

@@ -1,0 +1,63 @@
+"""The findings of a check of a log, and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "LogCheck", "LogFinding"]
+
+# The levels of a finding.
+BROKEN, REMARK, NOTE = "broken", "remark", "note"
+# The states of a log without a fault of the level BROKEN.
+SOUND, READABLE = "sound", "readable"
+
+
+@dataclass(frozen=True, slots=True)
+class LogFinding:
+    """A finding of a check.
+
+    Attributes
+    ----------
+    kind : ``file``, ``schema``, ``message``, ``time``, ``rate``, ``event``, ``reference`` or ``run``.
+    level : ``broken``, ``remark``, or ``note``; a log with notes only is sound.
+    text : the fault, without its place.
+    advice : the next step of the user; "" if there is none.
+    topic, time_ns, count : its place: the topic, the first log time in ns, and the number of messages.
+    """
+
+    kind: str
+    level: str
+    text: str
+    advice: str = ""
+    topic: str | None = None
+    time_ns: int | None = None
+    count: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LogCheck:
+    """The result of the check of a log: its path and its findings, in the order of the checks."""
+
+    path: Path
+    findings: tuple[LogFinding, ...] = ()
+
+    @property
+    def state(self) -> str:
+        """Return ``sound``, ``readable`` (with remarks), or ``broken``."""
+        levels = {finding.level for finding in self.findings}
+        if BROKEN in levels:
+            return BROKEN
+        return READABLE if REMARK in levels else SOUND
+
+    @property
+    def remarks(self) -> tuple[LogFinding, ...]:
+        """The findings that are no notes."""
+        return tuple(finding for finding in self.findings if finding.level != NOTE)
+
+    @staticmethod
+    def worst(checks: Iterable[LogCheck]) -> str:
+        """Return the worst state of several logs."""
+        order = (SOUND, READABLE, BROKEN)
+        return max((check.state for check in checks), key=order.index, default=SOUND)

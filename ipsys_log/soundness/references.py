@@ -1,0 +1,136 @@
+"""References between the messages of a log: rig, cameras, intrinsics, measurements and withdrawals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.log.contents import camera_of_topic
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Measurement, Rig
+from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MEASUREMENTS_TOPIC, RIG, RIG_TOPIC
+from ipsys_log.rig.file import check_rig
+from ipsys_log.runs.checks import image_sizes
+from ipsys_log.soundness.finding import REMARK, LogFinding
+
+__all__ = ["check_cameras", "check_intrinsics", "check_measurements", "check_rigs"]
+
+_MOST_NAMES = 5
+
+
+def check_rigs(session: Session) -> Iterator[LogFinding]:
+    """Check that a log with images, markers or measurements has a valid rig."""
+    topics = session.topics(RIG)
+    if not topics:
+        if session.images or session.topics(MEASUREMENTS) or _marker_cameras(session):
+            advice = "give one to each command: --rig lab.toml"
+            yield LogFinding("reference", REMARK, "the log has no rig", advice, RIG_TOPIC)
+        return
+    for message in session.messages(topics):
+        try:
+            check_rig(message.payload, "the rig")
+        except IpsysError as error:
+            advice = "give a correct rig to each command: --rig lab.toml"
+            yield LogFinding("reference", REMARK, str(error), advice, message.topic, message.log_time_ns, 1)
+
+
+def _marker_cameras(session: Session) -> dict[str, str]:
+    """Return the cameras with markers in a run, each with one topic of its markers."""
+    topics = [topic for run in sorted(session.run_names()) for topic in session.topics(MARKERS, run)]
+    return {str(camera_of_topic(topic)): topic for topic in topics}
+
+
+def _cameras(session: Session) -> dict[str, str]:
+    """Return the cameras with images or markers, each with its topic."""
+    return _marker_cameras(session) | session.images
+
+
+def check_cameras(session: Session) -> Iterator[LogFinding]:
+    """Check that the rig has each camera with images or markers."""
+    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    known = {camera.name for rig in rigs for camera in rig.cameras}
+    if not known:  # a rig may leave out the cameras
+        return
+    for camera, topic in sorted(_cameras(session).items()):
+        if camera not in known:
+            text = f"camera {camera} is not in the rig, which has {_names(sorted(known))}"
+            yield LogFinding("reference", REMARK, text, "add it to lab.toml as [[cameras]]", topic)
+
+
+def check_intrinsics(session: Session) -> Iterator[LogFinding]:
+    """Check that each camera has valid intrinsics for the size of its images."""
+    sizes_px = image_sizes(session)
+    for camera, topic in sorted(_cameras(session).items()):
+        advice = f"calibrate it, and give its intrinsics: --calibration {camera}=FILE"
+        if camera not in session.calibrations:
+            text = f"camera {camera} has no intrinsics"
+            yield LogFinding("reference", REMARK, text, advice, topic)
+            continue
+        stored = session.calibrations[camera]
+        message = next(session.messages([stored]))
+        lens = message.payload
+        place = stored, message.log_time_ns
+        try:
+            check_calibration(replace(lens, frame_id=camera), "the intrinsics")
+        except IpsysError as error:
+            yield LogFinding("reference", REMARK, str(error), advice, *place)
+        if camera in sizes_px and sizes_px[camera] != (lens.width, lens.height):
+            width, height = sizes_px[camera]
+            text = (
+                f"the intrinsics of camera {camera} are for {lens.width} x {lens.height} px, but its images "
+                f"have {width} x {height} px"
+            )
+            yield LogFinding("reference", REMARK, text, advice, *place)
+
+
+def check_measurements(session: Session) -> Iterator[LogFinding]:
+    """Check that measurements name markers and reference points of the rig, and withdrawals measurements."""
+    rigs: list[Rig] = session.payloads(session.topics(RIG))[:1]
+    active: set[str] = set()
+    faults: dict[tuple[str, str], list[tuple[str, int]]] = {}
+    for message in session.messages([*session.topics(RIG), *session.topics(MEASUREMENTS)]):
+        payload = message.payload
+        if isinstance(payload, Rig):
+            rigs[:] = [payload]
+        elif isinstance(payload, Measurement):
+            for fault in _faults(payload, active, rigs[0] if rigs else None):
+                faults.setdefault(fault, []).append((payload.id, message.log_time_ns))
+            if payload.withdraws is None:
+                active.add(payload.id)
+            else:
+                active.discard(payload.withdraws)
+    for (text, advice), places in faults.items():
+        ids = _names([name for name, _ in places])
+        title = "measurement" if len(places) == 1 else "measurements"
+        place = MEASUREMENTS_TOPIC, places[0][1], len(places)
+        yield LogFinding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
+
+
+def _faults(measurement: Measurement, active: set[str], rig: Rig | None) -> Iterator[tuple[str, str]]:
+    """Yield the wrong references of a measurement, each with the advice."""
+    again = "withdraw it and measure again: ipsys measure"
+    complete = "add it to lab.toml, and give --rig lab.toml"
+    if measurement.withdraws is not None:
+        if measurement.withdraws not in active:
+            text = f"withdraws {measurement.withdraws}, which is not in the log"
+            yield text, "it has no effect: check the id"
+        return
+    if measurement.id in active:
+        yield "an earlier measurement has the same id", "withdraw one of them"
+    if measurement.marker_id is None:
+        yield "has no marker", again
+        return
+    if rig is None:
+        return
+    if not rig.knows(measurement.marker_id):
+        yield f"marker {measurement.marker_id} is not in the rig", complete
+    points = {point.name for point in rig.reference_points}
+    for name in sorted({distance.reference for distance in measurement.distances} - points):
+        yield f"reference point {name} is not in the rig", complete
+
+
+def _names(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(names[:_MOST_NAMES]) + more

@@ -308,23 +308,26 @@ def _record(
 
 
 def _numbers(fitted: _Fitted) -> dict[str, str]:
-    """Return the estimates with their standard deviations, and the residuals, as texts with all digits."""
-    values: dict[str, float | None] = {}
+    """Return the estimates with all digits, and standard deviations and residuals with a few, as texts."""
+    estimates: dict[str, float] = {}
+    errors: dict[str, float] = {}
     found, motion = fitted.alignment, fitted.motion
-    if found is not None:
-        values["time_offset_sigma_s"] = found.offset_sigma_s
+    if found is not None and found.offset_sigma_s is not None:
+        errors["time_offset_sigma_s"] = found.offset_sigma_s
     if found is not None and motion is not None:
         for axis, name in enumerate("xyz"):
             if np.isfinite(found.turn_sigmas_rad[axis]):
-                values[f"rotation_{name}_rad"] = float(found.turn_rad[axis])
-                values[f"rotation_{name}_sigma_rad"] = float(found.turn_sigmas_rad[axis])
+                estimates[f"rotation_{name}_rad"] = float(found.turn_rad[axis])
+                errors[f"rotation_{name}_sigma_rad"] = float(found.turn_sigmas_rad[axis])
             if np.isfinite(found.shift_sigmas_m[axis]):
-                values[f"translation_{name}_m"] = float(motion.shift_m[axis])
-                values[f"translation_{name}_sigma_m"] = float(found.shift_sigmas_m[axis])
+                estimates[f"translation_{name}_m"] = float(motion.shift_m[axis])
+                errors[f"translation_{name}_sigma_m"] = float(found.shift_sigmas_m[axis])
     if (residuals := fitted.residuals) is not None:
-        values |= {"rmse_2d_m": residuals.rmse_2d_m, "rmse_3d_m": residuals.rmse_3d_m}
-        values |= {"instants": residuals.instants, "outliers": residuals.outliers}
-    return {name: repr(value) for name, value in values.items() if value is not None}
+        errors |= {"rmse_2d_m": residuals.rmse_2d_m, "rmse_3d_m": residuals.rmse_3d_m}
+        estimates |= {"instants": residuals.instants, "outliers": residuals.outliers}
+    return {name: repr(value) for name, value in estimates.items()} | {
+        name: f"{value:.4g}" for name, value in errors.items()
+    }
 
 
 def _seconds(time_ns: int) -> str:

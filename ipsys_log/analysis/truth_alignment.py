@@ -93,11 +93,13 @@ def align_truth(
     fits = [
         fit for start_s in offsets if (fit := fit_truth(pairs, kind, start_s, offset_s is None)) is not None
     ]
-    if not fits:
+    if not fits and offset_s is not None:
         raise IpsysError(
-            f"{where}: truth and tracks have fewer than {LEAST_INSTANTS} common instants; check the files "
-            "and --time-offset"
+            f"{where}: truth and tracks have fewer than {LEAST_INSTANTS} common instants; check the files and "
+            "--time-offset"
         )
+    if not fits:
+        raise _no_agreement(where)
     fits.sort(key=lambda fit: fit.median_m)
     best = fits[0]
     _check_agreement(pairs, fits, where)
@@ -132,10 +134,7 @@ def _check_agreement(pairs: Sequence[PathPair], fits: Sequence[Fit], where: str)
     best = fits[0]
     extent_m = max(_extent_m(pair.track_m) for pair in pairs)
     if best.median_m > _LARGEST_SHARE * extent_m:
-        raise IpsysError(
-            f"{where}: no alignment brings truth and tracks together: the median distance is "
-            f"{best.median_m:.2f} m; check that the files are of the same drive and robot"
-        )
+        raise _no_agreement(where)
     for other in fits[1:]:
         is_other = abs(other.offset_s - best.offset_s) > 0.5
         if is_other and other.median_m < _ALIKE * best.median_m + _ALIKE_M:
@@ -143,6 +142,13 @@ def _check_agreement(pairs: Sequence[PathPair], fits: Sequence[Fit], where: str)
                 f"{where}: two time offsets, {abs(other.offset_s - best.offset_s):.1f} s apart, fit equally "
                 "well: the path repeats itself; give --time-offset S"
             )
+
+
+def _no_agreement(where: str) -> IpsysError:
+    return IpsysError(
+        f"{where}: no time offset and alignment bring truth and tracks together; check that the files are of "
+        "the same drive and robot, and the units"
+    )
 
 
 def _result(pairs: Sequence[PathPair], kind: str, fit: Fit, free_offset: bool, where: str) -> TruthAlignment:

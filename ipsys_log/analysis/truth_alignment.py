@@ -95,8 +95,8 @@ def align_truth(
     ]
     if not fits and offset_s is not None:
         raise IpsysError(
-            f"{where}: truth and tracks have fewer than {LEAST_INSTANTS} common instants; check the files and "
-            "--time-offset"
+            f"{where}: truth and tracks have fewer than {LEAST_INSTANTS} common instants; check the files, "
+            "and --time-offset"
         )
     if not fits:
         raise _no_agreement(where)

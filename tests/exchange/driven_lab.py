@@ -41,7 +41,10 @@ def instants_ns(seconds: float, rate_hz: float = 30.0) -> NDArray[np.int64]:
 
 
 def tracked(
-    times_ns: NDArray[np.int64], points_m: dict[str, Array], with_record: bool = True
+    times_ns: NDArray[np.int64],
+    points_m: dict[str, Array],
+    with_record: bool = True,
+    with_headings: bool = True,
 ) -> Iterator[Message]:
     """Yield the messages of a log: the rig, the tracks of the run ``poly``, and its record."""
     yield Message(RIG_TOPIC, START_NS - 1, START_NS - 1, LAB)
@@ -50,7 +53,7 @@ def tracked(
         tracks = []
         for robot, rows in points_m.items():
             ahead = rows[min(n + 1, len(rows) - 1)] - rows[max(n - 1, 0)]
-            heading_rad = float(np.arctan2(ahead[1], ahead[0]))
+            heading_rad = float(np.arctan2(ahead[1], ahead[0])) if with_headings else None
             tracks.append(Track(robot, ROBOTS[robot], *rows[n].tolist(), heading_rad=heading_rad))
         yield Message(topic, time_ns, time_ns, Tracks(time_ns, tuple(tracks)))
     if with_record:

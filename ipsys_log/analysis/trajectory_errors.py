@@ -26,8 +26,9 @@ Places = NDArray[np.int64]
 
 # The distances (m) and times (s) of the relative pose error.
 DELTAS = ((1.0, "m"), (1.0, "s"))
-# A pair counts if its distance or time differs from the stated one by at most this share, as in evo.
-_TOLERANCE = 0.1
+# A pair counts if its distance differs from the stated one by at most this share, as in evo; or if its time
+# differs by at most this share of the usual interval.
+_DISTANCE_SHARE, _INTERVAL_SHARE = 0.1, 0.5
 TRANSLATION, DISTANCE = "translation_part", "point_distance"
 
 
@@ -89,8 +90,8 @@ def trajectory_errors(
     """Return the absolute trajectory error (ATE) and the relative pose error (RPE) of each robot.
 
     All instants of a track with a ground truth count. The truth is interpolated linearly between instants up
-    to 0.1 s apart. A pair of the RPE is each instant with the later one that is nearest to ``delta``, within
-    10 %. A distance is measured along the true path.
+    to 0.1 s apart. A pair of the RPE is each instant with the later one that is nearest to ``delta``: within
+    10 % of a distance along the true path, or within half an interval of a time.
 
     Parameters
     ----------
@@ -167,9 +168,11 @@ def _relative_errors(
 ) -> list[RelativeErrors]:
     steps_m = np.linalg.norm(np.diff(points_m[1], axis=0), axis=1)
     passed = {"m": np.append(0.0, np.cumsum(steps_m)), "s": (times_ns - times_ns[0]) / NS_PER_S}
+    intervals_s = np.diff(passed["s"])
+    half_s = _INTERVAL_SHARE * float(np.median(intervals_s)) if len(intervals_s) else 0.0
     found = []
     for delta, unit in deltas:
-        start, end = pairs_at(passed[unit], delta)
+        start, end = pairs_at(passed[unit], delta, half_s if unit == "s" else _DISTANCE_SHARE * delta)
         if len(start):
             moves_m = [rows[end] - rows[start] for rows in points_m]
             if headings_rad is None:
@@ -182,16 +185,17 @@ def _relative_errors(
     return found
 
 
-def pairs_at(passed: Array, delta: float) -> tuple[Places, Places]:
-    """Return pairs of places, (k,) and (k,), between which a quantity grows by ``delta`` within 10 %.
+def pairs_at(passed: Array, delta: float, tolerance: float) -> tuple[Places, Places]:
+    """Return pairs of places, (k,) and (k,), between which a quantity grows by ``delta``.
 
     Parameters
     ----------
     passed : (n,), not decreasing: the distance or the time since the start.
+    tolerance : the largest difference from ``delta``, in the unit of ``passed``.
 
     Examples
     --------
-    >>> [places.tolist() for places in pairs_at(np.array([0.0, 0.5, 1.0, 1.5]), 1.0)]
+    >>> [places.tolist() for places in pairs_at(np.array([0.0, 0.5, 1.0, 1.5]), 1.0, 0.1)]
     [[0, 1], [2, 3]]
     """
     start = np.arange(len(passed) - 1)
@@ -200,7 +204,7 @@ def pairs_at(passed: Array, delta: float) -> tuple[Places, Places]:
     below = np.maximum(np.searchsorted(passed, passed[np.maximum(above - 1, 0)]), start + 1)
     misses = [np.abs(passed[place] - passed[start] - delta) for place in (below, above)]
     end = np.where(misses[0] <= misses[1], below, above)
-    kept = np.minimum(*misses) <= _TOLERANCE * delta
+    kept = np.minimum(*misses) <= tolerance
     return start[kept], end[kept]
 
 

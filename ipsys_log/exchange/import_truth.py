@@ -101,23 +101,20 @@ def import_truth(
     where = ", ".join(map(str, files))
     with ExitStack() as stack:
         session = stack.enter_context(Session([into])) if into is not None else None
-        rig = _rig(session, options.rig)
-        check_robots(rig, [path.robot for path in paths], where)
-        ids = {path.robot: _marker_id(rig, path.robot) for path in paths}
+        ids = _marker_ids(_rig(session, options.rig), paths, where)
         if session is not None and session.topics(TRUTH):
             raise IpsysError(f"{session}: has ground truth already; import into a log without it")
         run = _tracks_run(session, options.run)
-        tracks = gather_tracks(session.messages(session.topics(TRACKS, run))) if session and run else {}
-        tracks = {robot: tracks[ids[robot]] for robot in ids if ids[robot] in tracks}
+        tracks = _tracks(session, run, ids)
         fitted = _fit(paths, tracks, options, session, run, where)
         record = _record(files, options, fitted, session, run if tracks else None)
         messages = list(_messages(paths, ids, fitted, where))
-        rig_messages = [_first(messages[0], options.rig)] if session is None else []
-        _, target = stack.enter_context(open_target([into] if into is not None else [], output))
         last_ns = messages[-1].log_time_ns
-        record = append_run(
-            target, replace(record, timestamp=last_ns), last_ns, lambda: iter([*rig_messages, *messages]), {}
-        )
+        record = replace(record, timestamp=last_ns)
+        if session is None:  # a new log: its rig comes first
+            messages.insert(0, replace(messages[0], topic=RIG_TOPIC, payload=options.rig))
+        _, target = stack.enter_context(open_target([into] if into is not None else [], output))
+        record = append_run(target, record, last_ns, lambda: messages, {})
     return ImportedTruth(
         output or target,
         record,
@@ -162,9 +159,21 @@ def _rig(session: Session | None, given: Rig | None) -> Rig:
     return rigs[-1]
 
 
-def _marker_id(rig: Rig, robot: str) -> int:
+def _marker_ids(rig: Rig, paths: Sequence[TruthPath], where: str) -> dict[str, int]:
+    """Return the id of the marker of each robot; a rig without markers has robots ``marker_<id>``."""
+    check_robots(rig, [path.robot for path in paths], where)
     ids = {rig.robot_of(marker.id): marker.id for marker in rig.markers}
-    return ids[robot] if robot in ids else int(robot.removeprefix(_MARKER_PREFIX))
+    return {
+        path.robot: ids[path.robot] if ids else int(path.robot.removeprefix(_MARKER_PREFIX)) for path in paths
+    }
+
+
+def _tracks(session: Session | None, run: str | None, ids: dict[str, int]) -> dict[str, Sightings]:
+    """Return the tracks of a run by robot, for the robots with a track."""
+    if session is None or run is None:
+        return {}
+    tracks = gather_tracks(session.messages(session.topics(TRACKS, run)))
+    return {robot: tracks[marker_id] for robot, marker_id in ids.items() if marker_id in tracks}
 
 
 def _tracks_run(session: Session | None, run: str | None) -> str | None:
@@ -277,11 +286,6 @@ def _messages(
     for time_ns in sorted(by_time):
         tracks = tuple(sorted(by_time[time_ns], key=lambda track: track.id))
         yield Message(TRUTH_TOPIC, time_ns, time_ns, Tracks(time_ns, tracks))
-
-
-def _first(message: Message, rig: Rig | None) -> Message:
-    """Return the message of the rig of a new log, at the time of its first message."""
-    return Message(RIG_TOPIC, message.log_time_ns, message.publish_time_ns, rig)
 
 
 def _record(

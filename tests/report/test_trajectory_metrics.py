@@ -99,9 +99,9 @@ def test_trajectory_errors_are_those_of_evo(log: Path, tmp_path: Path) -> None:
 
 
 def test_pairs_skip_gaps_and_take_the_start_of_a_stop() -> None:
-    start, end = pairs_at(np.array([0.0, 0.5, 1.0, 1.0, 1.0, 4.0, 5.05]), 1.0)
+    start, end = pairs_at(np.array([0.0, 0.5, 1.0, 1.0, 1.0, 4.0, 5.05]), 1.0, 0.1)
     assert list(zip(start.tolist(), end.tolist(), strict=True)) == [(0, 2), (5, 6)]
-    assert not len(pairs_at(np.array([0.0]), 1.0)[0])
+    assert not len(pairs_at(np.array([0.0]), 1.0, 0.1)[0])
 
 
 @pytest.fixture(scope="module")

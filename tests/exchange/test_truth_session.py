@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ipsys_log as ipsys_api
-from ipsys_log.messages import TRUTH_TOPIC, Message
+from ipsys_log.messages import TRUTH_TOPIC
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
@@ -30,13 +30,9 @@ def _moved_table(path: Path, truth: Path, system: OtherSystem) -> None:
 
 @pytest.mark.slow
 def test_imported_truth_scores_as_that_of_the_simulator(tmp_path: Path, ipsys: Ipsys) -> None:
-    messages = list(simulate_session(build_lab(GeometricSettings(points=20))))
-
-    def without_truth() -> list[Message]:
-        return [message for message in messages if message.topic != TRUTH_TOPIC]
-
+    messages = list(simulate_session(build_lab(GeometricSettings(points=40))))
     write_log(tmp_path / "full.mcap", messages)
-    write_log(tmp_path / "lab.mcap", without_truth())
+    write_log(tmp_path / "lab.mcap", [one for one in messages if one.topic != TRUTH_TOPIC])
     _moved_table(
         tmp_path / "truth.csv", tmp_path / "full.mcap", OtherSystem(987_654_321, 0.8, (3.0, -4.0, 0.0))
     )

@@ -17,8 +17,9 @@ Mask = NDArray[np.bool_]
 _USUAL_INTERVALS, _SHORTEST_GAP_S, _LONGEST_GAP_S = 2.5, 0.1, 1.0
 # Neighbouring errors of tracks are alike. Errors further apart than this count as independent.
 _BLOCK_S = 2.0
-# A jump is this many times longer than the usual distance of a position from its neighbours, and than 1 cm.
-_JUMP, _LEAST_JUMP_M, _PASSES = 10.0, 0.01, 4
+# A jump is this many times longer than the usual distance of a position from its neighbours, and than 1 cm,
+# and needs a larger acceleration than a robot has.
+_JUMP, _LEAST_JUMP_M, _LARGEST_ACCELERATION_M_S2, _PASSES = 10.0, 0.01, 10.0, 4
 
 
 class PathPair(NamedTuple):
@@ -57,20 +58,30 @@ def without_jumps(pair: PathPair) -> PathPair:
     An interpolation beside a jump has a wrong velocity, which a time offset would follow.
     """
     times_s, points_m = pair.true_s, pair.true_m
+    limit_s = gap_limit_s(times_s)
     for _ in range(_PASSES):
         if len(times_s) < 5:
             break
+        steps_s = np.diff(times_s)
+        beside = (steps_s[:-1] <= limit_s) & (steps_s[1:] <= limit_s)
+        between_m = points_m[:-2] + (steps_s[:-1] / (steps_s[:-1] + steps_s[1:]))[:, None] * (
+            points_m[2:] - points_m[:-2]
+        )
         apart_m = np.zeros(len(times_s))
-        share = ((times_s[1:-1] - times_s[:-2]) / (times_s[2:] - times_s[:-2]))[:, None]
-        between_m = points_m[:-2] + share * (points_m[2:] - points_m[:-2])
-        apart_m[1:-1] = np.linalg.norm(points_m[1:-1] - between_m, axis=1)
+        apart_m[1:-1] = np.where(beside, np.linalg.norm(points_m[1:-1] - between_m, axis=1), 0.0)
         # A jump moves the middle of its neighbours, too: only the largest of three is removed.
         largest = apart_m >= np.maximum(np.append(apart_m[1:], 0.0), np.append(0.0, apart_m[:-1]))
-        kept = ~(largest & (apart_m > max(_JUMP * float(np.median(apart_m)), _LEAST_JUMP_M)))
+        kept = ~(largest & (apart_m > _longest_step_m(apart_m, steps_s)))
         if kept.all():
             break
         times_s, points_m = times_s[kept], points_m[kept]
     return pair._replace(true_s=times_s, true_m=points_m)
+
+
+def _longest_step_m(apart_m: Array, steps_s: Array) -> float:
+    """Return the largest distance of a position from the middle of its neighbours that is no jump."""
+    turning_m = _LARGEST_ACCELERATION_M_S2 * float(np.median(steps_s)) ** 2 / 2
+    return max(_JUMP * float(np.median(apart_m)), _LEAST_JUMP_M, turning_m)
 
 
 def common_instants(pairs: Sequence[PathPair], offset_s: float) -> CommonInstants:

@@ -36,6 +36,8 @@ _MEDIAN_LENGTH = {2: 1.1774, 3: 1.5382}
 # Residuals above 5 sigma are outliers. A smaller sigma than 0.1 mm is none of a camera.
 _OUTLIER, _LEAST_SCALE_M = 5.0, 1e-4
 _ROUNDS, _FREE_ROUNDS, _CONVERGED_M = 40, 15, 1e-11
+# The velocity of a path holds for a short time only.
+_LARGEST_OFFSET_STEP_S = 0.3
 LEAST_INSTANTS = 8
 
 
@@ -81,6 +83,8 @@ def fit_truth(pairs: Sequence[PathPair], kind: str, start_s: float, free_offset:
         if not jacobian.shape[2]:
             break
         step = _step(jacobian[kept], residual[kept])
+        if free_offset:
+            step *= min(1.0, _LARGEST_OFFSET_STEP_S / max(abs(float(step[0])), 1e-12))
         fit = _moved(fit, step, kind, free_offset)
         if np.abs(step).max() < _CONVERGED_M:
             break

@@ -60,7 +60,7 @@ def search_offsets_s(pairs: Sequence[PathPair]) -> list[float]:
 def _speeds(times_s: Array, points_m: Array, step_s: float) -> tuple[Array, Array]:
     """Return speeds on the floor at the steps of a grid, with 0 where they are unknown, and a mask 0 or 1."""
     half_s = max(_HALF_WINDOW_S, step_s)
-    grid_s = np.arange(int(times_s[-1] / step_s) + 1) * step_s
+    grid_s: Array = np.arange(int(times_s[-1] / step_s) + 1, dtype=np.float64) * step_s
     ends = [_floor_at(times_s, points_m, grid_s + sign * half_s) for sign in (-1, 1)]
     speeds = np.linalg.norm(ends[1] - ends[0], axis=1) / (2 * half_s)
     known = np.isfinite(speeds)

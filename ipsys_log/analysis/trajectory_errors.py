@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,8 @@ _DISTANCE_SHARE, _INTERVAL_SHARE = 0.1, 0.5
 TRANSLATION, DISTANCE = "translation_part", "point_distance"
 
 
-class ErrorSummary(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class ErrorSummary:
     """Statistics of errors in m, with the names and definitions of evo; ``std_m`` divides by n."""
 
     count: int

@@ -54,7 +54,8 @@ def tracked(
         for robot, rows in points_m.items():
             ahead = rows[min(n + 1, len(rows) - 1)] - rows[max(n - 1, 0)]
             heading_rad = float(np.arctan2(ahead[1], ahead[0])) if with_headings else None
-            tracks.append(Track(robot, ROBOTS[robot], *rows[n].tolist(), heading_rad=heading_rad))
+            x_m, y_m, z_m = rows[n].tolist()
+            tracks.append(Track(robot, ROBOTS[robot], x_m, y_m, z_m, heading_rad))
         yield Message(topic, time_ns, time_ns, Tracks(time_ns, tuple(tracks)))
     if with_record:
         written = (ChannelWritten(topic, len(times_ns)),)
@@ -81,7 +82,7 @@ class OtherSystem:
 
     def __init__(self, offset_ns: int, turn_rad: float | Array, shift_m: tuple[float, float, float]) -> None:
         self.offset_ns = offset_ns
-        vector = [0.0, 0.0, turn_rad] if np.isscalar(turn_rad) else turn_rad
+        vector = turn_rad if isinstance(turn_rad, np.ndarray) else np.array([0.0, 0.0, turn_rad])
         self.lab_from_own = Rotation.from_rotvec(vector)
         self.shift_m = np.array(shift_m)
 

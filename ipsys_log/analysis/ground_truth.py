@@ -1,8 +1,10 @@
-"""Ground truth of a simulated lab: true positions of markers, and errors against them."""
+"""Ground truth: true positions of markers, and errors against them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +15,15 @@ from ipsys_log.analysis.pairs import RiggedMeasurement, Sightings, still_interva
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["TrackErrors", "gather_tracks", "track_errors", "true_points"]
+__all__ = [
+    "RobotPath",
+    "TrackErrors",
+    "gather_paths",
+    "gather_tracks",
+    "interpolate",
+    "track_errors",
+    "true_points",
+]
 
 _SAME_HEIGHT_M = 0.005
 # Longest gap for linear interpolation. For a robot with 2 m/s and 2.5 rad/s, its error is 0.7 mm over 1/30 s,
@@ -43,23 +53,44 @@ class TrackErrors(NamedTuple):
     whole: tuple[ErrorStatistics, ErrorStatistics]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotPath:
+    """The positions of a robot in order of time, and its headings (n,) in rad, NaN where there is none."""
+
+    robot: str
+    positions: Sightings
+    headings_rad: Array
+
+
 def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
     """Return positions of tracks by marker, in order of time; those of equal time in log order.
 
     Predicted positions of unseen robots are left out.
     """
-    rows: dict[int, list[tuple[int, float, float, float]]] = {}
+    return {marker_id: path.positions for marker_id, path in gather_paths(messages).items()}
+
+
+def gather_paths(messages: Iterable[Message]) -> dict[int, RobotPath]:
+    """Return the positions of :func:`gather_tracks` with headings and the names of the robots, by marker."""
+    rows: dict[int, list[tuple[int, float, float, float, float]]] = {}
+    robots: dict[int, str] = {}
     for message in messages:
         if isinstance(message.payload, Tracks):
             for track in (one for one in message.payload.tracks if one.coasting_ns is None):
-                row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m)
+                heading_rad = math.nan if track.heading_rad is None else track.heading_rad
+                row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m, heading_rad)
                 rows.setdefault(track.id, []).append(row)
+                robots.setdefault(track.id, track.robot)
     for values in rows.values():
         values.sort(key=lambda row: row[0])
     return {
-        marker_id: Sightings(
-            np.array([row[0] for row in values], dtype=np.int64),
-            np.array([row[1:] for row in values], dtype=np.float64),
+        marker_id: RobotPath(
+            robots[marker_id],
+            Sightings(
+                np.array([row[0] for row in values], dtype=np.int64),
+                np.array([row[1:4] for row in values], dtype=np.float64),
+            ),
+            np.array([row[4] for row in values], dtype=np.float64),
         )
         for marker_id, values in rows.items()
     }
@@ -104,7 +135,7 @@ def track_errors(
             continue
         # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-        true_m, is_known = _between(known, times_ns)
+        true_m, is_known = interpolate(known, times_ns)
         offsets.append((track.points_m[::-1][last] - true_m)[is_known])
     rows_m = np.vstack([np.zeros((0, 3)), *offsets])
     if not len(rows_m):
@@ -123,7 +154,9 @@ def _statistics(offsets_m: Array) -> tuple[ErrorStatistics, ErrorStatistics]:
     )
 
 
-def _between(known: Sightings, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def interpolate(
+    known: Sightings, times_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return points (n, 3) at times (n,), and a mask of the known points.
 
     Points beyond the ends or in a gap are unknown. At an instant of the ground truth, the result is the exact

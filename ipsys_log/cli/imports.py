@@ -1,14 +1,18 @@
-"""Import of other data into a log: ``ipsys import imsel``, ``images`` and ``videos``."""
+"""Import of other data into a log: ``ipsys import imsel``, ``images``, ``videos`` and ``truth``."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.options import Calibrations, NewLog, RigFile
+from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, log_option
+
+if TYPE_CHECKING:
+    from ipsys_log.exchange.import_truth import TruthOptions
 
 __all__ = ["add_commands"]
 
@@ -20,6 +24,7 @@ def add_commands(app: typer.Typer) -> None:
     group.command("imsel")(imsel)
     group.command("images")(images)
     group.command("videos")(videos)
+    group.command("truth")(truth)
     app.add_typer(group, name="import")
 
 
@@ -103,6 +108,89 @@ def videos(
     counts = write_log(output, read_videos(paths, lab, lenses, parse_start(start), remarks.print))
     text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
     console.print(f"{output} written: frames: {text}")
+
+
+def truth(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE", help="A CSV table (.csv), or a TUM trajectory (.tum) of one robot."),
+    ],
+    into: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="The log of the same drive; it gets the ground truth.")
+    ] = None,
+    output: Annotated[
+        Path | None, log_option(help="A new log for the ground truth. Without --into, it needs --rig.")
+    ] = None,
+    robot: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            metavar="NAME", help="The robot of a file that names none; repeat it in the order of the files."
+        ),
+    ] = None,
+    run: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Compare with the tracks of this run. Default: the newest."),
+    ] = None,
+    align: Annotated[
+        str,
+        typer.Option(
+            metavar="2d|3d|none",
+            help="Estimate rotation and translation on the floor (2d), in space (3d), or none.",
+        ),
+    ] = "2d",
+    time_offset: Annotated[
+        str | None,
+        typer.Option(metavar="S", help="Add this to the times of the files, instead of an estimate."),
+    ] = None,
+    time_unit: Annotated[
+        str | None, typer.Option(metavar="s|ns", help="Unit of a time column whose header has none.")
+    ] = None,
+    length_unit: Annotated[
+        str | None, typer.Option(metavar="m|mm", help="Unit of x, y and z whose header has none.")
+    ] = None,
+    rig: RigFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import the ground truth of another system, such as Vicon or OptiTrack, for scores of the tracks.
+
+    The command estimates the time offset and the rigid alignment to the tracks of a run, without a scale.
+    An alignment hides constant errors of the tracks."""
+    from ipsys_log.exchange.import_truth import import_truth
+    from ipsys_log.report.truth_import import truth_json, truth_lines
+
+    for file in files:
+        _refuse_log(file)
+    options = _truth_options(robot, run, align, time_offset, time_unit, length_unit, rig)
+    imported = import_truth(files, into, output, options)
+    if as_json:
+        print(json.dumps(truth_json(imported), indent=2, allow_nan=False))  # noqa: T201
+    else:
+        for line in truth_lines(imported):
+            console.print(line)
+    remarks.print(f"results are in {imported.path}", markup=False)
+
+
+def _truth_options(
+    robot: list[str] | None,
+    run: str | None,
+    align: str,
+    time_offset: str | None,
+    time_unit: str | None,
+    length_unit: str | None,
+    rig: Path | None,
+) -> TruthOptions:
+    from ipsys_log.exchange.ground_truth_files import TruthUnits, parse_offset
+    from ipsys_log.exchange.import_truth import TruthOptions
+    from ipsys_log.rig.file import load_rig
+
+    return TruthOptions(
+        tuple(robot or ()),
+        TruthUnits(time_unit, length_unit),
+        align,
+        None if time_offset is None else parse_offset(time_offset),
+        run,
+        load_rig(rig) if rig else None,
+    )
 
 
 def _refuse_log(path: Path) -> None:

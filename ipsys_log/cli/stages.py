@@ -261,9 +261,11 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
     """Print the answer first, then one table, and on request all numbers."""
     from ipsys_log.report.summary import answer_text, models_table
     from ipsys_log.report.tables import accuracy_tables
+    from ipsys_log.report.trajectory_table import trajectory_table
 
     parts = [answer_text(accuracies), models_table(accuracies)]
-    for part in [*parts, *(accuracy_tables(accuracies) if details else [])]:
+    further = [*accuracy_tables(accuracies), trajectory_table(accuracies)] if details else []
+    for part in [*parts, *further]:
         if part is not None:
             console.print(part)
             console.print()

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats, root_mean_square_m
-from ipsys_log.analysis.ground_truth import TrackErrors, gather_tracks, track_errors
+from ipsys_log.analysis.ground_truth import TrackErrors, gather_paths, track_errors
+from ipsys_log.analysis.trajectory_errors import (
+    ErrorSummary,
+    TrajectoryErrors,
+    pool_trajectories,
+    trajectory_errors,
+)
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     TRUTH_TOPIC,
@@ -29,11 +35,15 @@ __all__ = ["Accuracy", "accuracy_json", "gather_outliers", "read_accuracy"]
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """The evaluation of one model, and the errors of its tracks if the log has ground truth."""
+    """The evaluation of one model, and the errors of its tracks if the log has ground truth.
+
+    ``trajectories`` are the errors of the tracks by robot.
+    """
 
     run: str
     evaluation: Evaluation | None
     tracks: TrackErrors | None
+    trajectories: tuple[TrajectoryErrors, ...] = ()
 
     @property
     def model(self) -> str:
@@ -66,16 +76,25 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
     for evaluated, fused in _run_pairs(outcomes):
         run = evaluated or fused
         evaluations = session.payloads(session.topics(EVALUATION, run))
-        tracks = None
-        if fused and session.count(TRUTH_TOPIC):
-            tracks = track_errors(
-                gather_tracks(session.messages(session.topics(TRACKS, fused))),
-                gather_tracks(session.messages([TRUTH_TOPIC])),
-                at_track_height=_uses_heights(session, fused),
-            )
+        tracks, trajectories = _track_errors(session, fused)
         if evaluations or tracks is not None:
-            accuracies.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))
+            evaluation = evaluations[-1] if evaluations else None
+            accuracies.append(Accuracy(run, evaluation, tracks, tuple(trajectories)))
     return accuracies
+
+
+def _track_errors(session: Session, run: str) -> tuple[TrackErrors | None, list[TrajectoryErrors]]:
+    """Return the errors of the tracks of a run, at all robots and by robot, if there is ground truth."""
+    if not run or not session.count(TRUTH_TOPIC):
+        return None, []
+    paths = gather_paths(session.messages(session.topics(TRACKS, run)))
+    true = gather_paths(session.messages([TRUTH_TOPIC]))
+    errors = track_errors(
+        {marker_id: path.positions for marker_id, path in paths.items()},
+        {marker_id: path.positions for marker_id, path in true.items()},
+        at_track_height=_uses_heights(session, run),
+    )
+    return errors, trajectory_errors(paths, true)
 
 
 def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
@@ -123,7 +142,7 @@ def _model_json(accuracy: Accuracy) -> dict[str, Any]:
             summary["excluded"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.excluded]
             summary["with_excluded"] = _rows_json(accuracy, rows)
     if accuracy.tracks is not None:
-        summary["tracks"] = _tracks_json(accuracy.tracks)
+        summary["tracks"] = _tracks_json(accuracy.tracks) | _trajectories_json(accuracy.trajectories)
     return summary
 
 
@@ -154,6 +173,37 @@ def _tracks_json(tracks: TrackErrors) -> dict[str, Any]:
     if tracks.others is not None:
         summary |= {"other_heights": both(*tracks.others), "all_heights": both(*tracks.whole)}
     return summary
+
+
+def _trajectories_json(trajectories: Sequence[TrajectoryErrors]) -> dict[str, Any]:
+    """Return the absolute trajectory error and the relative pose error, over all robots and by robot."""
+    if not trajectories:
+        return {}
+    robots = {one.robot: _trajectory_json(one) for one in trajectories}
+    return {**_trajectory_json(pool_trajectories(trajectories)), "robots": robots}
+
+
+def _trajectory_json(trajectory: TrajectoryErrors) -> dict[str, Any]:
+    absolute = {"3d": trajectory.absolute_3d, "2d": trajectory.absolute_2d}
+    return {
+        "ate": {name: _summary_json(errors) for name, errors in absolute.items()},
+        "rpe": [
+            {"delta": one.delta, "unit": one.unit, "relation": one.relation, **_summary_json(one.summary)}
+            for one in trajectory.relative
+        ],
+    }
+
+
+def _summary_json(errors: ErrorSummary) -> dict[str, float | int]:
+    values = {
+        "rmse_cm": errors.rmse_m,
+        "mean_cm": errors.mean_m,
+        "median_cm": errors.median_m,
+        "std_cm": errors.std_m,
+        "max_cm": errors.max_m,
+        "p95_cm": errors.p95_m,
+    }
+    return {**{name: value_m * CM_PER_M for name, value_m in values.items()}, "n": errors.count}
 
 
 def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:

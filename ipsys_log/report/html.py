@@ -21,6 +21,7 @@ from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.report.overlap_figure import overlap_pictures
+from ipsys_log.report.trajectory_table import TRAJECTORY_COLUMNS, trajectory_rows
 from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.view import LogView
@@ -78,6 +79,8 @@ def _text_values(findings: Findings) -> dict[str, Any]:
         "head": html_sections.headline(findings),
         "advice": html_sections.advice_rows(findings),
         "models": html_sections.model_rows(findings),
+        "trajectories": trajectory_rows(findings.ranked()),
+        "trajectory_columns": TRAJECTORY_COLUMNS,
         "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
         "told_note": HEIGHT_NOTE if any(map(uses_height, findings.models)) else "",
         "suspects": html_sections.suspects(findings),

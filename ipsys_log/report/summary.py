@@ -18,6 +18,7 @@ from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
 from ipsys_log.report.tables import format_interval, name_cell, plain_table, wrap_text
+from ipsys_log.report.trajectory_table import trajectory_lines
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 
@@ -40,6 +41,7 @@ def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
     for accuracy in shown:
         if accuracy.tracks is not None:
             lines += _track_lines(accuracy, in_space(accuracies), len(shown) > 1)
+            lines += trajectory_lines(accuracy)
     if any(accuracy.evaluation and accuracy.evaluation.cameras for accuracy in accuracies):
         lines += _outlier_lines(accuracies)
     advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])

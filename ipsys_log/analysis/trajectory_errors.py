@@ -1,0 +1,229 @@
+"""Trajectory metrics of tracks against ground truth: absolute trajectory error and relative pose error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.ground_truth import RobotPath, interpolate
+from ipsys_log.units import NS_PER_S
+
+__all__ = [
+    "DELTAS",
+    "ErrorSummary",
+    "RelativeErrors",
+    "TrajectoryErrors",
+    "pairs_at",
+    "pool_trajectories",
+    "trajectory_errors",
+]
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+# The distances (m) and times (s) of the relative pose error.
+DELTAS = ((1.0, "m"), (1.0, "s"))
+# A pair counts if its distance differs from the stated one by at most this share, as in evo; or if its time
+# differs by at most this share of the usual interval.
+_DISTANCE_SHARE, _INTERVAL_SHARE = 0.1, 0.5
+TRANSLATION, DISTANCE = "translation_part", "point_distance"
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSummary:
+    """Statistics of errors in m, with the names and definitions of evo; ``std_m`` divides by n."""
+
+    count: int
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    std_m: float
+    max_m: float
+    p95_m: float
+
+
+class RelativeErrors(NamedTuple):
+    """The relative pose error over a distance or a time.
+
+    ``relation`` is ``translation_part``, which needs headings, or ``point_distance``. ``errors_m`` is (n,).
+    """
+
+    delta: float
+    unit: str
+    relation: str
+    errors_m: Array
+
+    @property
+    def summary(self) -> ErrorSummary:
+        return _summary(self.errors_m)
+
+
+class TrajectoryErrors(NamedTuple):
+    """The errors of the track of a robot, or of all with the name ``""``.
+
+    ``offsets_m`` (n, 3) are the positions of the track minus the true ones. ``relative`` lacks a distance or
+    a time that no pair has.
+    """
+
+    robot: str
+    offsets_m: Array
+    relative: tuple[RelativeErrors, ...]
+
+    @property
+    def absolute_3d(self) -> ErrorSummary:
+        """The absolute trajectory error (ATE) in space, without a further alignment."""
+        return _summary(np.linalg.norm(self.offsets_m, axis=1))
+
+    @property
+    def absolute_2d(self) -> ErrorSummary:
+        """The absolute trajectory error (ATE) on the floor."""
+        return _summary(np.linalg.norm(self.offsets_m[:, :2], axis=1))
+
+
+def trajectory_errors(
+    tracks: Mapping[int, RobotPath],
+    ground_truth: Mapping[int, RobotPath],
+    deltas: Sequence[tuple[float, str]] = DELTAS,
+) -> list[TrajectoryErrors]:
+    """Return the absolute trajectory error (ATE) and the relative pose error (RPE) of each robot.
+
+    All instants of a track with a ground truth count. The truth is interpolated linearly between instants up
+    to 0.1 s apart. A pair of the RPE is each instant with the later one that is nearest to ``delta``: within
+    10 % of a distance along the true path, or within half an interval of a time.
+
+    Parameters
+    ----------
+    deltas : distances in ``m`` or times in ``s`` of the relative pose error.
+
+    References
+    ----------
+    Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, eq. (1) to (5), with one
+    difference: the ATE is without an alignment. Grupp, evo, 2017: ``evo_ape`` and
+    ``evo_rpe --all_pairs --pairs_from_reference``.
+    """
+    found = []
+    for marker_id, track in sorted(tracks.items()):
+        if marker_id in ground_truth:
+            errors = _errors_of(track, ground_truth[marker_id], deltas)
+            if errors is not None:
+                found.append(errors)
+    return found
+
+
+def pool_trajectories(trajectories: Sequence[TrajectoryErrors]) -> TrajectoryErrors:
+    """Return the errors of all robots as those of one; the pairs stay within each robot."""
+    kinds = dict.fromkeys((r.delta, r.unit, r.relation) for one in trajectories for r in one.relative)
+    relative = [
+        RelativeErrors(
+            *kind,
+            np.concatenate([r.errors_m for one in trajectories for r in one.relative if r[:3] == kind]),
+        )
+        for kind in kinds
+    ]
+    return TrajectoryErrors("", np.vstack([one.offsets_m for one in trajectories]), tuple(relative))
+
+
+def _errors_of(
+    track: RobotPath, truth: RobotPath, deltas: Sequence[tuple[float, str]]
+) -> TrajectoryErrors | None:
+    # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
+    times_ns, last = np.unique(track.positions.times_ns[::-1], return_index=True)
+    true_m, is_known = interpolate(truth.positions, times_ns)
+    if not is_known.any():
+        return None
+    points_m, headings_rad = (
+        values[::-1][last][is_known] for values in (track.positions.points_m, track.headings_rad)
+    )
+    times_ns, true_m = times_ns[is_known], true_m[is_known]
+    true_rad = _headings_at(truth, times_ns)
+    has_headings = np.isfinite(headings_rad) & np.isfinite(true_rad)
+    used = has_headings if has_headings.any() else np.ones(len(times_ns), dtype=np.bool_)
+    relative = _relative_errors(
+        times_ns[used],
+        (points_m[used], true_m[used]),
+        (headings_rad[used], true_rad[used]) if has_headings.any() else None,
+        deltas,
+    )
+    return TrajectoryErrors(track.robot, points_m - true_m, tuple(relative))
+
+
+def _headings_at(truth: RobotPath, times_ns: NDArray[np.int64]) -> Array:
+    """Return headings (n,) at times between instants of the truth, along the shorter arc; NaN if unknown."""
+    known_ns = truth.positions.times_ns
+    after = np.searchsorted(known_ns, times_ns).clip(max=len(known_ns) - 1)
+    before = np.where(known_ns[after] > times_ns, after - 1, after).clip(min=0)
+    span_ns = np.maximum(known_ns[after] - known_ns[before], 1)
+    start_rad, end_rad = truth.headings_rad[before], truth.headings_rad[after]
+    arc_rad = (end_rad - start_rad + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray(start_rad + (times_ns - known_ns[before]) / span_ns * arc_rad)
+
+
+def _relative_errors(
+    times_ns: NDArray[np.int64],
+    points_m: tuple[Array, Array],
+    headings_rad: tuple[Array, Array] | None,
+    deltas: Sequence[tuple[float, str]],
+) -> list[RelativeErrors]:
+    steps_m = np.linalg.norm(np.diff(points_m[1], axis=0), axis=1)
+    passed = {"m": np.append(0.0, np.cumsum(steps_m)), "s": (times_ns - times_ns[0]) / NS_PER_S}
+    intervals_s = np.diff(passed["s"])
+    half_s = _INTERVAL_SHARE * float(np.median(intervals_s)) if len(intervals_s) else 0.0
+    found = []
+    for delta, unit in deltas:
+        start, end = pairs_at(passed[unit], delta, half_s if unit == "s" else _DISTANCE_SHARE * delta)
+        if len(start):
+            moves_m = [rows[end] - rows[start] for rows in points_m]
+            if headings_rad is None:
+                lengths_m = [np.linalg.norm(move_m, axis=1) for move_m in moves_m]
+                found.append(RelativeErrors(delta, unit, DISTANCE, np.abs(lengths_m[0] - lengths_m[1])))
+                continue
+            own_m = [_turned_back(m, rad[start]) for m, rad in zip(moves_m, headings_rad, strict=True)]
+            errors_m = np.linalg.norm(own_m[0] - own_m[1], axis=1)
+            found.append(RelativeErrors(delta, unit, TRANSLATION, errors_m))
+    return found
+
+
+def pairs_at(passed: Array, delta: float, tolerance: float) -> tuple[Places, Places]:
+    """Return pairs of places, (k,) and (k,), between which a quantity grows by ``delta``.
+
+    Parameters
+    ----------
+    passed : (n,), not decreasing: the distance or the time since the start.
+    tolerance : the largest difference from ``delta``, in the unit of ``passed``.
+
+    Examples
+    --------
+    >>> [places.tolist() for places in pairs_at(np.array([0.0, 0.5, 1.0, 1.5]), 1.0, 0.1)]
+    [[0, 1], [2, 3]]
+    """
+    start = np.arange(len(passed) - 1)
+    above = np.searchsorted(passed, passed[start] + delta).clip(start + 1, len(passed) - 1)
+    # The first place of a stop counts.
+    below = np.maximum(np.searchsorted(passed, passed[np.maximum(above - 1, 0)]), start + 1)
+    misses = [np.abs(passed[place] - passed[start] - delta) for place in (below, above)]
+    end = np.where(misses[0] <= misses[1], below, above)
+    kept = np.minimum(*misses) <= tolerance
+    return start[kept], end[kept]
+
+
+def _turned_back(moves_m: Array, headings_rad: Array) -> Array:
+    """Return moves (n, 3) in the coordinates of a robot with headings (n,)."""
+    cos, sin = np.cos(headings_rad), np.sin(headings_rad)
+    x_m, y_m, z_m = moves_m.T
+    return np.column_stack([cos * x_m + sin * y_m, cos * y_m - sin * x_m, z_m])
+
+
+def _summary(errors_m: Array) -> ErrorSummary:
+    return ErrorSummary(
+        len(errors_m),
+        float(np.sqrt((errors_m**2).mean())),
+        float(errors_m.mean()),
+        float(np.median(errors_m)),
+        float(errors_m.std()),
+        float(errors_m.max()),
+        float(np.percentile(errors_m, 95)),
+    )

@@ -1,0 +1,139 @@
+"""The trajectory metrics are those of evo, and the tables and the JSON have them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.core import metrics
+from evo.core.trajectory import PosePath3D
+from evo.core.units import Unit
+from rich.console import Console
+
+import ipsys_log as ipsys
+from ipsys_log.analysis.ground_truth import gather_paths
+from ipsys_log.analysis.trajectory_errors import ErrorSummary, TrajectoryErrors, pairs_at, trajectory_errors
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import TRUTH_TOPIC, Message
+from ipsys_log.messages.channels import TRACKS
+from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
+from ipsys_log.report.trajectory_table import trajectory_lines, trajectory_table
+from ipsys_log.runs.output import append_messages
+from ipsys_log.runs.provenance import Outcome
+from ipsys_log.units import NS_PER_S
+from tests.exchange.driven_lab import ROBOTS, START_NS, instants_ns, path_of, tracked, write_lab
+
+SECONDS = 12.0
+
+
+def truth_messages(with_headings: bool) -> Iterator[Message]:
+    times_ns = instants_ns(SECONDS)
+    points_m = {robot: path_of(seed)((times_ns - START_NS) / NS_PER_S) for robot, seed in ROBOTS.items()}
+    for message in tracked(times_ns, points_m, with_record=False, with_headings=with_headings):
+        if message.topic == TRACKS.topic_of("poly"):
+            yield Message(TRUTH_TOPIC, message.log_time_ns, message.publish_time_ns, message.payload)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["headings", "positions"])
+def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = write_lab(tmp_path_factory.mktemp("metrics") / "lab.mcap", SECONDS, 0.01)
+    append_messages(path, truth_messages(request.param))
+    return path
+
+
+def errors_of(log: Path) -> list[TrajectoryErrors]:
+    with Session([log]) as session:
+        tracks, truth = (
+            gather_paths(session.messages(topics))
+            for topics in (session.topics(TRACKS, "poly"), [TRUTH_TOPIC])
+        )
+    return trajectory_errors(tracks, truth)
+
+
+def evo_paths(log: Path, folder: Path, robot: str) -> tuple[PosePath3D, PosePath3D, bool]:
+    """Return truth and track as evo reads exported TUM files; without headings, from the tables."""
+    paths = []
+    with ipsys.open(log) as opened:
+        has_headings = bool(opened.table("truth")["heading_rad"].notna().all())
+        for name in ("truth", "tracks"):
+            if has_headings:
+                opened.export(folder / f"{name}.tum", name, robot=robot)
+                rows = np.loadtxt(folder / f"{name}.tum")
+                points_m, turns = rows[:, 1:4], rows[:, [7, 4, 5, 6]]
+            else:
+                table = opened.table(name)
+                points_m = table[table["robot"] == robot][["x_m", "y_m", "z_m"]].to_numpy()
+                turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(points_m), 1))
+            paths.append(PosePath3D(positions_xyz=points_m, orientations_quat_wxyz=turns))
+    return paths[0], paths[1], has_headings
+
+
+def assert_same(found: ErrorSummary, metric: metrics.PE) -> None:
+    statistics = metric.get_all_statistics()
+    assert found.count == len(metric.error) > 50
+    for name in ("rmse", "mean", "median", "std", "max"):
+        assert getattr(found, f"{name}_m") == pytest.approx(statistics[name], abs=1e-6), name
+    assert found.p95_m == pytest.approx(np.percentile(metric.error, 95), abs=1e-6)
+
+
+def test_trajectory_errors_are_those_of_evo(log: Path, tmp_path: Path) -> None:
+    for errors in errors_of(log):
+        truth, track, has_headings = evo_paths(log, tmp_path, errors.robot)
+        absolute = metrics.APE(metrics.PoseRelation.translation_part)
+        absolute.process_data((truth, track))
+        assert_same(errors.absolute_3d, absolute)
+        relation = (
+            metrics.PoseRelation.translation_part if has_headings else metrics.PoseRelation.point_distance
+        )
+        assert [(one.delta, one.unit) for one in errors.relative] == [(1.0, "m"), (1.0, "s")]
+        for one, (delta, unit) in zip(errors.relative, [(1.0, Unit.meters), (30, Unit.frames)], strict=True):
+            assert one.relation == relation.value.replace(" ", "_")
+            relative = metrics.RPE(
+                relation, delta, unit, rel_delta_tol=0.1, all_pairs=True, pairs_from_reference=True
+            )
+            relative.process_data((truth, track))
+            assert_same(one.summary, relative)
+
+
+def test_pairs_skip_gaps_and_take_the_start_of_a_stop() -> None:
+    start, end = pairs_at(np.array([0.0, 0.5, 1.0, 1.0, 1.0, 4.0, 5.05]), 1.0, 0.1)
+    assert list(zip(start.tolist(), end.tolist(), strict=True)) == [(0, 2), (5, 6)]
+    assert not len(pairs_at(np.array([0.0]), 1.0, 0.1)[0])
+
+
+@pytest.fixture(scope="module")
+def accuracies(log: Path) -> list[Accuracy]:
+    with Session([log]) as session:
+        return read_accuracy(session, [Outcome("fuse", "poly", False)])
+
+
+def test_json_has_ate_and_rpe_of_each_robot(accuracies: list[Accuracy], log: Path) -> None:
+    tracks = accuracy_json(accuracies)["models"]["poly"]["tracks"]
+    by_robot = {errors.robot: errors for errors in errors_of(log)}
+    assert [*tracks["robots"]] == [*by_robot] == ["ada", "bob"]
+    for robot, errors in by_robot.items():
+        ate = tracks["robots"][robot]["ate"]
+        assert ate["3d"]["rmse_cm"] == pytest.approx(errors.absolute_3d.rmse_m * 100)
+        assert ate["2d"]["n"] == 360
+    squares = [tracks["robots"][robot]["ate"]["3d"]["rmse_cm"] ** 2 for robot in by_robot]
+    assert tracks["ate"]["3d"]["rmse_cm"] == pytest.approx(np.sqrt(np.mean(squares)))
+    assert tracks["ate"]["3d"]["rmse_cm"] == pytest.approx(tracks["truth"]["3d"]["rmse_cm"])
+    assert [(one["delta"], one["unit"]) for one in tracks["rpe"]] == [(1.0, "m"), (1.0, "s")]
+    assert tracks["rpe"][1]["n"] == 2 * 330
+
+
+def test_table_of_metrics_fits_a_terminal(accuracies: list[Accuracy]) -> None:
+    output = io.StringIO()
+    console = Console(file=output, width=80)
+    console.print(trajectory_table([*accuracies, *accuracies]))
+    text = output.getvalue()
+    pooled = accuracy_json(accuracies)["models"]["poly"]["tracks"]
+    row = next(line for line in text.splitlines() if "(all)" in line)
+    assert f"{pooled['ate']['3d']['rmse_cm']:.2f}" in row.split()
+    assert f"{pooled['rpe'][0]['rmse_cm']:.2f}" in row.split()
+    assert "…" not in text
+    (line,) = trajectory_lines(accuracies[0])
+    assert f"(ATE): RMSE {pooled['ate']['3d']['rmse_cm']:.2f} cm in 3D" in line

@@ -32,6 +32,7 @@ class Recorded:
         cut from <log>``, or what to do if newer software made it.
     out_of_date : the software, the log or an input run has changed since, and the stage can be repeated.
     is_newer : newer software made it.
+    is_part : the log is a part of the log with the whole run.
     """
 
     run: Run
@@ -39,6 +40,7 @@ class Recorded:
     state: str = _CURRENT
     out_of_date: bool = False
     is_newer: bool = False
+    is_part: bool = False
 
     @property
     def is_of_other_version(self) -> bool:
@@ -114,7 +116,7 @@ def _judge(session: Session, one: Recorded) -> Recorded:
         if recorded_version(run, name) < VERSIONS[name]
     ]
     if logs and not reasons:
-        return replace(one, state=f"part of run {run.run}, cut from {', '.join(logs)}")
+        return replace(one, state=f"part of run {run.run}, cut from {', '.join(logs)}", is_part=True)
     changed = (read for read in run.inputs if not is_whole(session, read))
     reasons += [_change(read) for read in changed if not is_cut(session, read)]
     return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one

@@ -20,6 +20,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.verify import verify
+from ipsys_log.soundness.check import check_logs
 from tests.conftest import Ipsys
 from tests.shared_files import make_once
 
@@ -71,6 +72,14 @@ def test_runs_of_a_part_name_the_log_they_come_from(part: Path) -> None:
         ("detect", "camera-frame"), "part of run stock, cut from monday.mcap"
     )
     assert found["locate"] == found["fuse"] == "part of run rigid, cut from monday.mcap"
+
+
+def test_part_without_a_camera_is_sound(stock_log: Path, tmp_path: Path) -> None:
+    """A check knows that the inputs of its runs were cut."""
+    path = tmp_path / "red.mcap"
+    cut([stock_log], path, CutOptions(cameras=["red"]))
+    (result,) = check_logs([path])
+    assert (result.state, [finding.text for finding in result.remarks]) == ("sound", [])
 
 
 def test_replay_of_a_part_computes_nothing(ipsys: Ipsys, part: Path) -> None:

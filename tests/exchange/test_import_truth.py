@@ -43,7 +43,7 @@ def tracks_of(log: Path) -> list[Tracks]:
         return list(session.payloads(session.topics(TRACKS, "poly")))
 
 
-def rows(frames: list[Tracks]) -> list[tuple[object, ...]]:
+def rows(frames: list[Tracks]) -> list[tuple[int, str, int, float, float, float]]:
     return [
         (frame.timestamp, track.robot, track.id, track.x_m, track.y_m, track.z_m)
         for frame in frames

@@ -104,7 +104,7 @@ def test_moved_trajectories_come_back(
     assert [row[1:3] for row in back] == [row[1:3] for row in expected]
     since_ns = [np.array([row[0] for row in part], np.int64) - START_NS for part in (back, expected)]
     np.testing.assert_allclose(since_ns[0], since_ns[1], atol=100)
-    np.testing.assert_allclose([row[3:] for row in back], [row[3:] for row in expected], atol=1e-7)  # type: ignore[arg-type]
+    np.testing.assert_allclose([row[3:] for row in back], [row[3:] for row in expected], atol=1e-7)
     apart_rad = np.subtract(headings_rad(stored(log)), headings_rad(tracks_of(log)))  # type: ignore[arg-type]
     assert np.abs((apart_rad + np.pi) % (2 * np.pi) - np.pi).max() < 1e-7
 

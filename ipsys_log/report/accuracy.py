@@ -30,7 +30,7 @@ from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Accuracy", "accuracy_json", "gather_outliers", "read_accuracy"]
+__all__ = ["Accuracy", "accuracy_json", "gather_outliers", "read_accuracy", "read_trajectories"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +81,11 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
             evaluation = evaluations[-1] if evaluations else None
             accuracies.append(Accuracy(run, evaluation, tracks, tuple(trajectories)))
     return accuracies
+
+
+def read_trajectories(session: Session, run: str) -> list[TrajectoryErrors]:
+    """Return the errors of the tracks of a run by robot; none without tracks or without ground truth."""
+    return _track_errors(session, run)[1]
 
 
 def _track_errors(session: Session, run: str) -> tuple[TrackErrors | None, list[TrajectoryErrors]]:

@@ -17,11 +17,11 @@ from ipsys_log.messages import Run
 from ipsys_log.messages.channels import EVALUATION, POSITIONS, TRACKS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
-from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.report.overlap_figure import overlap_pictures
-from ipsys_log.report.trajectory_table import TRAJECTORY_COLUMNS, trajectory_rows
+from ipsys_log.report.trajectory_table import TRAJECTORY_COLUMNS, rows_of_run
 from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.view import LogView
@@ -62,7 +62,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         flat=html_sections.flat_rows(_measured(session, findings)),
         **_figure_values(findings),
         **_overlap(session, findings),
-        tracks_picture=html_figures.tracks_picture(session, newest_run(session, TRACKS)),
+        **_tracks(session),
         **_provenance(session, findings),
     )
 
@@ -79,8 +79,6 @@ def _text_values(findings: Findings) -> dict[str, Any]:
         "head": html_sections.headline(findings),
         "advice": html_sections.advice_rows(findings),
         "models": html_sections.model_rows(findings),
-        "trajectories": trajectory_rows(findings.ranked()),
-        "trajectory_columns": TRAJECTORY_COLUMNS,
         "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
         "told_note": HEIGHT_NOTE if any(map(uses_height, findings.models)) else "",
         "suspects": html_sections.suspects(findings),
@@ -114,6 +112,16 @@ def _overlap(session: Session, findings: Findings) -> dict[str, Any]:
     return {
         "overlap": {"run": run, "rows": html_sections.overlap_rows(pairs)} if pairs else None,
         "overlap_pictures": overlap_pictures(pairs, findings.rig) if pairs else [],
+    }
+
+
+def _tracks(session: Session) -> dict[str, Any]:
+    """Return the picture of the newest tracks, and their errors if there is ground truth."""
+    run = newest_run(session, TRACKS)
+    return {
+        "tracks_picture": html_figures.tracks_picture(session, run),
+        "trajectories": rows_of_run(run, read_trajectories(session, run)) if run is not None else [],
+        "trajectory_columns": TRAJECTORY_COLUMNS,
     }
 
 

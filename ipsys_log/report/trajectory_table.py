@@ -12,7 +12,7 @@ from ipsys_log.report.advice import label
 from ipsys_log.report.tables import name_cell, plain_table
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["TRAJECTORY_COLUMNS", "trajectory_lines", "trajectory_rows", "trajectory_table"]
+__all__ = ["TRAJECTORY_COLUMNS", "rows_of_run", "trajectory_lines", "trajectory_rows", "trajectory_table"]
 
 TRAJECTORY_COLUMNS = (
     *("n", "ATE RMSE", "mean", "median", "std", "p95", "max"),
@@ -37,14 +37,15 @@ def trajectory_lines(accuracy: Accuracy) -> Iterator[str]:
 
 def trajectory_rows(accuracies: Sequence[Accuracy]) -> list[tuple[str, str, list[str]]]:
     """Return model, robot and cells of each robot in cm, and of all robots together if there are several."""
-    rows = []
-    for accuracy in accuracies:
-        trajectories = list(accuracy.trajectories)
-        if len(trajectories) > 1:
-            trajectories.append(pool_trajectories(trajectories)._replace(robot=_ALL))
-        for number, one in enumerate(trajectories):
-            rows.append(("" if number else label(accuracy.model), one.robot, _cells(one)))
-    return rows
+    return [row for one in accuracies for row in rows_of_run(label(one.model), one.trajectories)]
+
+
+def rows_of_run(name: str, trajectories: Sequence[TrajectoryErrors]) -> list[tuple[str, str, list[str]]]:
+    """Return the same rows for one run; the first has its name or that of its model."""
+    rows = [*trajectories]
+    if len(rows) > 1:
+        rows.append(pool_trajectories(rows)._replace(robot=_ALL))
+    return [("" if number else name, row.robot, _cells(row)) for number, row in enumerate(rows)]
 
 
 def trajectory_table(accuracies: Sequence[Accuracy]) -> Table | None:

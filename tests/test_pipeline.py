@@ -40,6 +40,7 @@ name = "simulated"
 dictionary = "DICT_4X4_100"
 marker_length_m = {length}
 marker_height_m = 0.1
+marker_height_sigma_m = 0.0001
 [[reference_points]]
 name = "A"
 x_m = 1.2192

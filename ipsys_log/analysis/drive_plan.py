@@ -160,7 +160,7 @@ def _whitened_slopes(
     flat = model.modes.shape[0] - floor_modes.shape[1]
     by_modes = now.by_camera @ model.modes[:flat] + by_height * (floor_modes @ model.modes[flat:])[:, None]
     tilts = now.by_pose[:, :, 3:5] * settings.wobble_sigma_rad
-    noise_px2 = (_CORNER_SIGMA_PX**2 + model.corner_floor_px**2) * np.eye(8)
+    noise_px2 = _CORNER_SIGMA_PX**2 * np.eye(8)
     whitening = np.linalg.inv(np.linalg.cholesky(noise_px2 + tilts @ tilts.swapaxes(1, 2)))
     slopes = np.concatenate([by_modes, by_height * settings.robot_height_sigma_m], axis=2)
     return whitening @ slopes, whitening @ by_pose

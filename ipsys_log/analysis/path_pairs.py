@@ -85,6 +85,10 @@ def _longest_step_m(apart_m: Array, steps_s: Array) -> float:
 
 
 def common_instants(pairs: Sequence[PathPair], offset_s: float) -> CommonInstants:
+    """Return the positions of all pairs at the instants of their tracks, without gaps of the truth.
+
+    ``offset_s`` is added to the times of the truth.
+    """
     parts: list[tuple[Array, Array, Array, Array]] = []
     for number, pair in enumerate(pairs):
         true_m, velocity_m_s, known = _interpolate(pair.true_s, pair.true_m, pair.track_s - offset_s)

@@ -17,9 +17,6 @@ from ipsys_log.geometry.rotations import cross
 __all__ = ["Residuals", "TruthAlignment", "align_truth", "residuals_of"]
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-
 _LEAST_SPREAD_M = 0.1
 _SINGULAR = 1e-9
 _LARGEST_TURN_SIGMA_RAD, _LARGEST_OFFSET_SIGMA_S = np.radians(2.0), 0.1
@@ -67,8 +64,7 @@ def align_truth(
     The coarse offsets of :func:`~ipsys_log.analysis.time_offset_search.search_offsets_s` start a Gauss-Newton
     estimate of offset and alignment together. It compares the tracks with the true positions at their
     instants, by cubic Hermite interpolation. Residuals above 5 sigma are left out. All robots share one
-    offset and one alignment. The standard deviations hold
-    for errors that are alike over 2 s.
+    offset and one alignment. The standard deviations hold for errors that are alike over 2 s.
 
     Parameters
     ----------

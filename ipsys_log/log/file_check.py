@@ -3,15 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.agreement import disagreement
 from ipsys_log.log.damage.findings import Survey, Watch
 from ipsys_log.log.damage.survey import survey
 from ipsys_log.log.hashing import ChannelHash
-from ipsys_log.log.summary import Summary, read_summary
+from ipsys_log.log.summary import read_intact_summary
 
 __all__ = ["FileCheck", "check_file"]
 
@@ -46,7 +44,7 @@ def check_file(
     BoundError
         The log exceeds the limits of its file size.
     """
-    findings = survey(view, _summary(view), watch=watch)
+    findings = survey(view, read_intact_summary(view), watch=watch)
     faults = _faults_before(contents.data_end, findings) if contents.cut_short else _faults(view, findings)
     changed = [
         topic
@@ -54,15 +52,6 @@ def check_file(
         if topic in stored and state.valid and _differs(state, stored[topic])
     ]
     return FileCheck(faults, contents.cut_short or view.tail_fd >= 0, tuple(changed))
-
-
-def _summary(view: LogBytes) -> Summary | None:
-    try:
-        return read_summary(view)
-    except BoundError:
-        raise
-    except LogError:
-        return None
 
 
 def _faults(view: LogBytes, findings: Survey) -> tuple[str, ...]:

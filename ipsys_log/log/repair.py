@@ -13,7 +13,6 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
-from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.damage.agreement import count_by_indexes, disagreement
 from ipsys_log.log.damage.findings import Survey
@@ -33,7 +32,7 @@ from ipsys_log.log.hashing import METADATA_NAME, combine, metadata_of_hashes
 from ipsys_log.log.journal import DISK, Storage, replace_tail, roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.records import MAGIC, MESSAGE, to_bytes, walk
-from ipsys_log.log.summary import Summary, read_summary, tail_bytes
+from ipsys_log.log.summary import Summary, read_intact_summary, tail_bytes
 
 __all__ = ["RepairReport", "repair"]
 
@@ -96,7 +95,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         status = os.fstat(fd)
         view = LogBytes(target, fd, status.st_size, status.st_size)
         _check_not_empty(view)
-        known = _summary(view)
+        known = read_intact_summary(view)
         with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
             salvage = Salvage(spool)
             findings = survey(view, known, salvage)
@@ -133,15 +132,6 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
 def _check_not_empty(view: LogBytes) -> None:
     if not view.size:
         raise LogError(f"{view.path} is empty: it cannot be repaired; delete it")
-
-
-def _summary(view: LogBytes) -> Summary | None:
-    try:
-        return read_summary(view)
-    except BoundError:
-        raise
-    except LogError:
-        return None
 
 
 class _Plan(NamedTuple):
@@ -268,7 +258,7 @@ def _check(view: LogBytes, findings: Survey, plan: _Plan) -> None:
     """
     size = findings.end + plan.tail_size
     new = LogBytes(view.path, view.fd, size, findings.end, plan.tail.fileno(), 0, patches=plan.patches)
-    new_findings = survey(new, _summary(new))
+    new_findings = survey(new, read_intact_summary(new))
     streamed = sum(new_findings.contents.counts.values())
     difference = disagreement(new, new_findings)
     if not difference and not plan.messages == streamed == count_by_indexes(new):

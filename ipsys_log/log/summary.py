@@ -9,6 +9,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, parse, parse_chunk_index, to_bytes, walk
@@ -19,6 +20,7 @@ __all__ = [
     "NoFooterError",
     "Summary",
     "load_contents",
+    "read_intact_summary",
     "read_summary",
     "tail_bytes",
     "temporary_tail_bytes",
@@ -100,6 +102,22 @@ class Summary(NamedTuple):
     contents: Contents
     statistics: mcap.Statistics | None
     checked: bool
+
+
+def read_intact_summary(view: LogBytes) -> Summary | None:
+    """Read only the summary; None if the log has none, or if its end is missing or damaged.
+
+    Raises
+    ------
+    BoundError
+        The log exceeds the limits of its file size.
+    """
+    try:
+        return read_summary(view)
+    except BoundError:
+        raise
+    except LogError:
+        return None
 
 
 def read_summary(view: LogBytes) -> Summary | None:

@@ -24,7 +24,7 @@ _WINDOW_NS, _SHORTEST_NS = NS_PER_S // 5, NS_PER_S // 20
 _FEWEST_POSES = 3
 _NS_PER_MS = NS_PER_S // 1000
 
-Number = TypeVar("Number", Mat33, float)
+_Value = TypeVar("_Value", Mat33, float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ class PoseSource:
         )
 
 
-def _finite(value: Number | None) -> Number | None:
+def _finite(value: _Value | None) -> _Value | None:
     """Return a value; None if a part of it is no number: a log of another program may hold such values."""
     return value if value is not None and np.isfinite(value).all() else None
 

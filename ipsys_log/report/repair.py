@@ -90,7 +90,7 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
             if run_of_topic(topic) is None and channel.message_count:
                 images = channel.schema is not None and channel.schema.name in IMAGE_SCHEMAS
                 times_ns = [int(time_ns) for time_ns in log.times(topic)]
-                gone = _gone(times_ns, end_ns) if images else ""
+                gone = _gone(log, topic, times_ns, end_ns) if images else ""
                 table.add_row(topic, str(len(times_ns)), _clock(times_ns[-1]), gone)
     yield table
     if copied:
@@ -102,11 +102,20 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
         )
 
 
-def _gone(times_ns: Sequence[int], end_ns: int | None) -> str:
-    """Return the possible number of messages of a channel with a constant rate, after its last message."""
+def _gone(log: LogReader, topic: str, times_ns: Sequence[int], end_ns: int | None) -> str:
+    """Return the possible number of messages of a channel with a constant rate, after its last message.
+
+    The rate is that of the publish times: frames that wait at the start of a recording have log times that
+    are too close together.
+    """
     if end_ns is None or len(times_ns) < 2:
         return "not known"
-    rate_hz = (len(times_ns) - 1) * NS_PER_S / max(times_ns[-1] - times_ns[0], 1)
+    first = next(log.messages([topic]))
+    *_, last = log.messages([topic], start_ns=times_ns[-1])
+    span_ns = last.publish_time_ns - first.publish_time_ns
+    if span_ns <= 0:  # a recorder of others has no publish times
+        span_ns = max(times_ns[-1] - times_ns[0], 1)
+    rate_hz = (len(times_ns) - 1) * NS_PER_S / span_ns
     return f"{ceil(max(end_ns - times_ns[-1], 0) * rate_hz / NS_PER_S)} at {rate_hz:.1f}/s"
 
 

@@ -12,15 +12,17 @@ the interrupt is raised again until the command receives it.
 from __future__ import annotations
 
 import functools
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-from ipsys_log.interrupts import defer, is_undivided
+from ipsys_log.interrupts import defer, is_undivided, undivided
 
 __all__ = [
     "InterruptError",
@@ -33,11 +35,13 @@ __all__ = [
     "say_kept",
     "stop_on_signal",
     "suppress_interrupt",
+    "wake_input",
     "writes_nothing",
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
+_WAKE_S = 0.05
 _KEPT = "complete results are kept; nothing else is changed"
 _NOTHING_WRITTEN = "no file was changed"
 
@@ -146,6 +150,64 @@ def suppress_interrupt() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         _settle()
+
+
+@contextmanager
+def wake_input() -> Iterator[None]:
+    """Let a signal end `input` in the block whenever it comes; for the main thread only.
+
+    With readline, `input` misses a signal between its check for signals and its wait for a key: the handler
+    would run after the next key.
+    """
+    waker = None
+    try:
+        with undivided():
+            waker = _Waker()
+        yield
+    finally:
+        with undivided():
+            if waker is not None:
+                waker.stop()
+
+
+class _Waker:
+    """A thread that sends a signal again until its handler has run, in an `input` that has missed it."""
+
+    def __init__(self) -> None:
+        self._handled, self._ended = False, threading.Event()
+        self._handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+        _handle(self._handle_once)
+        self._receiver, self._sender = os.pipe()
+        os.set_blocking(self._sender, False)
+        self._previous = signal.set_wakeup_fd(self._sender, warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._work, name="wakes the input", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._ended.set()
+        signal.set_wakeup_fd(self._previous)
+        os.close(self._sender)
+        self._thread.join()
+        os.close(self._receiver)
+        for number, handler in self._handlers.items():
+            if signal.getsignal(number) == self._handle_once:
+                signal.signal(number, handler)
+
+    def _handle_once(self, number: int, frame: FrameType | None) -> None:
+        """Call the usual handler once: a signal that is sent again is no second one of the user."""
+        if self._handled:
+            return
+        self._handled = not is_undivided()
+        handler = self._handlers[signal.Signals(number)]
+        if callable(handler):
+            handler(number, frame)
+
+    def _work(self) -> None:
+        main = threading.main_thread().ident
+        assert main is not None
+        while number := os.read(self._receiver, 1):
+            while number[0] in _SIGNALS and not self._handled and not self._ended.wait(_WAKE_S):
+                signal.pthread_kill(main, number[0])
 
 
 def runs_until_stopped(command: Callable[..., None]) -> Callable[..., None]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pty
+import select
 import shutil
 import signal
 import subprocess
@@ -50,6 +52,17 @@ try:
 finally:
     ready = False
     print(f"events {events}", file=sys.stderr)
+"""
+
+# A program that asks a numbered question in a terminal, again after each interrupt.
+ASKS = """
+import readline
+from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt, wake_input
+
+allow_interrupt()
+for number in range(1_000_000):
+    with suppress_interrupt(), wake_input():
+        input(f"question {number}> ")
 """
 
 
@@ -133,6 +146,27 @@ def test_interrupt_right_after_the_creation_of_a_file_leaves_no_file(
 
 
 @pytest.mark.usefixtures("handlers")
+def test_interrupt_at_the_start_of_a_question_is_never_lost() -> None:
+    """Without `wake_input`, readline misses one of about 1,000 interrupts soon after the question."""
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", ASKS])
+    try:
+        for number in range(2000):
+            question, told = f"question {number}> ".encode(), b""
+            while question not in told:
+                assert select.select([terminal], [], [], LIMIT_S)[0], (number, told)
+                told += os.read(terminal, 1 << 16)
+            begin_ns = time.perf_counter_ns()
+            while time.perf_counter_ns() - begin_ns < number % 20 * 5_000:
+                pass
+            os.write(terminal, b"\x03")
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(terminal)
+
+
 def test_interrupt_does_not_stop_the_cleanup() -> None:
     cleaned: list[bool] = []
 

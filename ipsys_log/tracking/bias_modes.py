@@ -103,12 +103,14 @@ class BiasModes:
         cells, shares = self._cells(points_m)
         i, j = cells[:, 0], cells[:, 1]
         s, t = shares[:, 0, None, None], shares[:, 1, None, None]
+        u, v = 1 - s, 1 - t
         table = self.tables[camera]
         near, right, above, far = table[i, j], table[i + 1, j], table[i, j + 1], table[i + 1, j + 1]
         sensitivities = np.empty((count, 4, self.count))
-        sensitivities[:, :3] = (near * (1 - s) + right * s) * (1 - t) + (above * (1 - s) + far * s) * t
-        by_x = (right - near) * (1 - t) + (far - above) * t
-        by_y = (above - near) * (1 - s) + (far - right) * s
+        sensitivities[:, :3] = (near * u + right * s) * v + (above * u + far * s) * t
+        near, right, above, far = near[:, :2], right[:, :2], above[:, :2], far[:, :2]
+        by_x = (right - near) * v + (far - above) * t
+        by_y = (above - near) * u + (far - right) * s
         sensitivities[:, 3] = _turns(by_x, by_y, headings_rad) / self.grid.spacing_m
         return sensitivities
 
@@ -118,13 +120,14 @@ class BiasModes:
 
     def _cells(self, points_m: Array) -> tuple[NDArray[np.intp], Array]:
         last = np.array(self.grid.shape) - 1
-        places = np.clip((points_m[:, :2] - self.grid.origin_m) / self.grid.spacing_m, 0, last)
+        places = (points_m[:, :2] - self.grid.origin_m) / self.grid.spacing_m
+        places = np.minimum(np.maximum(places, 0), last)  # faster than np.clip
         cells = np.minimum(places.astype(np.intp), last - 1)
         return cells, places - cells
 
 
 def _turns(by_x: Array, by_y: Array, headings_rad: Array) -> Array:
-    """Return the turns (k, m) of headings by the slopes (k, 3, m) of the errors of positions."""
+    """Return the turns (k, m) of headings by the slopes (k, 2, m) of the errors of positions."""
     cos, sin = np.cos(headings_rad)[:, None], np.sin(headings_rad)[:, None]
     along_x, along_y = by_x[:, 0] * cos + by_y[:, 0] * sin, by_x[:, 1] * cos + by_y[:, 1] * sin
     turns: Array = along_y * cos - along_x * sin

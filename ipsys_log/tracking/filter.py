@@ -43,7 +43,9 @@ class States:
     fade_m: Array | None = None
 
     def take(self, rows: NDArray[np.intp]) -> States:
-        """Return the states of some robots."""
+        """Return the states of some robots; themselves for all of them in their order."""
+        if _are_all(rows, len(self.means)):
+            return self
         return States(self.means[rows], self.covariances[rows], self.cross[rows], self.fade_m)
 
     def replace(self, rows: NDArray[np.intp], states: States) -> States:
@@ -72,7 +74,9 @@ class Sightings:
     clock_s: Array
 
     def take(self, rows: NDArray[np.intp]) -> Sightings:
-        """Return the sightings of some robots."""
+        """Return the sightings of some robots; themselves for all of them in their order."""
+        if _are_all(rows, len(self.poses)):
+            return self
         return Sightings(self.poses[rows], self.noise[rows], self.sensitivities[rows], self.clock_s[rows])
 
 
@@ -98,6 +102,10 @@ class Innovations:
         covariances = self.covariances if more is None else self.covariances + more
         solved = np.linalg.solve(covariances, self.differences[:, :, None])
         return np.asarray((self.differences[:, None] @ solved)[:, 0, 0])
+
+
+def _are_all(rows: NDArray[np.intp], count: int) -> bool:
+    return len(rows) == count and bool((rows == np.arange(count)).all())
 
 
 def start(sightings: Sightings, noise: MotionNoise, fade_m: Array | None = None) -> States:

@@ -12,19 +12,17 @@ from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.bodies import Bodies
 from ipsys_log.tracking.filter import Sightings
 from ipsys_log.tracking.position_sightings import is_usable, read_sightings
+from ipsys_log.tracking.tracks import Robot
 
 __all__ = ["FrameReader", "FrameSightings"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSightings:
-    """The sightings of one frame, (k,) of each: the arguments of ``RobotTracks.observe``.
-
-    A robot is a pair of its name and of the id of its marker.
-    """
+    """The sightings of one frame, (k,) of each: the arguments of ``RobotTracks.observe``."""
 
     camera: str
-    robots: Sequence[tuple[str, int]]
+    robots: Sequence[Robot]
     times_ns: Sequence[int]
     sightings: Sightings
     inside: Sequence[bool | None]
@@ -42,6 +40,7 @@ class FrameReader:
     def __init__(self, model: Model | None) -> None:
         self._model = model
         self._rig: Rig | None = None
+        self._robots: dict[int, Robot] = {}
         self.modes = BiasModes.none()
         self._bodies, self._has_bodies = Bodies(), False
 
@@ -49,6 +48,7 @@ class FrameReader:
         """Use a rig for the next frames."""
         names = [marker.robot for marker in rig.markers if marker.robot is not None]
         self._rig, self._has_bodies = rig, len(names) > len(set(names))
+        self._robots = {}
         if self._model is not None:
             # Late: the modes of a joint model need scipy.
             from ipsys_log.tracking.calibration_modes import calibration_modes
@@ -57,12 +57,11 @@ class FrameReader:
 
     def read(self, camera: str, time_ns: int, positions: Sequence[Position]) -> FrameSightings | None:
         """Return the sightings of a frame of a camera at a time; None if it shows no robot."""
-        assert self._rig is not None
         positions = [position for position in positions if is_usable(position)]
         if not positions:
             return None
         sightings, has_covariance = read_sightings(camera, positions, self.modes)
-        robots = [(self._rig.robot_of(position.id), position.id) for position in positions]
+        robots = [self._robots.get(p.id) or self._robot_of(p.id) for p in positions]
         if self._has_bodies:
             self._bodies.learn(robots, sightings)
             rows = [row for row, robot in enumerate(robots) if self._bodies.knows(*robot)]
@@ -78,3 +77,8 @@ class FrameReader:
             [position.inside for position in positions],
             has_covariance.tolist(),
         )
+
+    def _robot_of(self, marker_id: int) -> Robot:
+        assert self._rig is not None
+        robot = self._robots[marker_id] = (self._rig.robot_of(marker_id), marker_id)
+        return robot

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -36,11 +36,13 @@ class Record(NamedTuple):
 class History:
     """The records of one robot, for as long as a late sighting can change them.
 
-    ``rows_ns`` are the instants of the poses that were given out. A ``complete`` history forgets nothing, for
-    processing after the recording. ``began_ns`` is the time of the first record.
+    ``times_ns`` are the times of the records, ``rows_ns`` the instants of the poses that were given out, and
+    ``began_ns`` is the time of the first record. A ``complete`` history forgets nothing, for processing after
+    the recording.
     """
 
     records: list[Record] = field(default_factory=list)
+    times_ns: list[int] = field(default_factory=list)
     rows_ns: set[int] = field(default_factory=set)
     complete: bool = False
     began_ns: int = 0
@@ -52,30 +54,24 @@ class History:
 
     def place_of(self, time_ns: int) -> int:
         """Return the number of records at or before a time; those of the same time come first."""
-        if time_ns >= self.records[-1].time_ns:
-            return len(self.records)
-        return bisect_right(self.records, time_ns, key=lambda record: record.time_ns)
+        return bisect_right(self.times_ns, time_ns)
 
     def replace_from(self, place: int, records: list[Record]) -> None:
         """Replace the records from a place on, and forget those that no late sighting can reach."""
         if not self.records or records[0].time_ns < self.began_ns:
             self.began_ns = records[0].time_ns
         self.records[place:] = records
+        self.times_ns[place:] = [record.time_ns for record in records]
         if self.complete:
             return
-        oldest_ns = self.newest.time_ns - HISTORY_NS
+        oldest_ns = self.times_ns[-1] - HISTORY_NS
         # The last record before the oldest time stays: a sighting at that time starts from it.
-        kept = 0
-        while kept + 1 < len(self.records) and self.records[kept + 1].time_ns <= oldest_ns:
-            kept += 1
-        del self.records[:kept]
+        forgotten = max(bisect_right(self.times_ns, oldest_ns) - 1, 0)
+        del self.records[:forgotten], self.times_ns[:forgotten]
         if len(self.rows_ns) > _MOST_ROWS:
             self.rows_ns = {time_ns for time_ns in self.rows_ns if time_ns >= oldest_ns}
 
     def recent(self, time_ns: int, window_ns: int) -> list[Record]:
         """Return the records of a window that ends at a time."""
-        place = self.place_of(time_ns)
-        first = place
-        while first and self.records[first - 1].time_ns >= time_ns - window_ns:
-            first -= 1
-        return self.records[first:place]
+        first = bisect_left(self.times_ns, time_ns - window_ns)
+        return self.records[first : self.place_of(time_ns)]

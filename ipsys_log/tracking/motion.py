@@ -16,7 +16,9 @@ POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)
 MOTION = 10
 # Gauss-Legendre nodes on 0 to 1: the integrals of the noise are exact to 1e-9 for up to 1 s.
 _NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(7))
-_NODES = _NODES + 0.5
+_NODES_AND_END = np.append(_NODES + 0.5, 1.0)
+# Poses and rates.
+_STAYS = np.arange(8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +67,14 @@ def transition(durations_s: Array, speeds_m_s: Array, noise: MotionNoise) -> tup
     ----------
     Singer, IEEE Trans. AES 1970.
     """
-    # The robots of one message mostly have the same duration.
+    count = len(durations_s)
+    variances = (noise.acceleration_m_s2**2 + (noise.bend_rad_s * speeds_m_s) ** 2)[:, None, None]
+    if count and (durations_s == durations_s[0]).all():  # mostly, for the robots of one message
+        forward, other, by_acceleration = _steps(durations_s[:1], noise)
+        return np.broadcast_to(forward, (count, MOTION, MOTION)), other + variances * by_acceleration
     durations_s, places = np.unique(durations_s, return_inverse=True)
     forward, other, by_acceleration = _steps(durations_s, noise)
-    variances = noise.acceleration_m_s2**2 + (noise.bend_rad_s * speeds_m_s) ** 2
-    return forward[places], other[places] + variances[:, None, None] * by_acceleration[places]
+    return forward[places], other[places] + variances * by_acceleration[places]
 
 
 def _steps(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array, Array]:
@@ -78,11 +83,12 @@ def _steps(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array, Array]
     All are (k, 10, 10).
     """
     forward, other, by_acceleration = np.zeros((3, len(durations_s), MOTION, MOTION))
-    diagonal = np.arange(8)
-    forward[:, diagonal, diagonal] = 1.0
-    forward[:, diagonal[:4], diagonal[4:]] = durations_s[:, None]
-    by_position, by_velocity, rest = _of_acceleration(durations_s, noise.hold_s)
-    unit = _acceleration_noise(durations_s, noise.hold_s)
+    forward[:, _STAYS, _STAYS] = 1.0
+    forward[:, _STAYS[:4], _STAYS[4:]] = durations_s[:, None]
+    effects = _of_acceleration(durations_s[:, None] * _NODES_AND_END, noise.hold_s)
+    by_position, by_velocity, rest = effects[:, :, -1].T
+    weights = (2 / noise.hold_s * durations_s)[:, None] * _WEIGHTS
+    unit = (effects[:, :, :-1] * weights[:, None]) @ effects[:, :, :-1].swapaxes(1, 2)
     for axis in (0, 1):
         own = 8 + axis
         forward[:, axis, own], forward[:, 4 + axis, own] = by_position, by_velocity
@@ -95,16 +101,14 @@ def _steps(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array, Array]
     return forward, other, by_acceleration
 
 
-def _of_acceleration(durations_s: Array, hold_s: float) -> tuple[Array, Array, Array]:
-    """Return the effects of a unit acceleration on position, velocity and acceleration after a duration."""
+def _of_acceleration(durations_s: Array, hold_s: float) -> Array:
+    """Return the effects (k, 3, n) of a unit acceleration on position, velocity and acceleration.
+
+    They are the effects after durations (k, n). The integral of their products over a duration is the
+    covariance of the noise.
+    """
     share = durations_s / hold_s
     lost = -np.expm1(-share)
-    return hold_s**2 * (share - lost), hold_s * lost, 1.0 - lost
-
-
-def _acceleration_noise(durations_s: Array, hold_s: float) -> Array:
-    """Return the covariances (k, 3, 3) of position, velocity and an acceleration of 1 m/s^2."""
-    effects = np.stack(_of_acceleration(durations_s[:, None] * _NODES, hold_s), axis=1)
-    weights = (2 / hold_s * durations_s)[:, None] * _WEIGHTS
-    covariance: Array = (effects * weights[:, None]) @ effects.swapaxes(1, 2)
-    return covariance
+    effects = np.empty((len(share), 3, share.shape[1]))
+    effects[:, 0], effects[:, 1], effects[:, 2] = hold_s**2 * (share - lost), hold_s * lost, 1.0 - lost
+    return effects

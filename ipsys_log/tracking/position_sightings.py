@@ -25,6 +25,9 @@ _UNKNOWN_M = 0.005
 # No lab is larger, and no heading has a larger error.
 _FARTHEST_M, _LARGEST_RAD = 1e6, 10.0
 _PLACE, _UNKNOWN = np.arange(3), np.full((3, 3), np.nan)
+_LEAST_EYE_M2, _USUAL_EYE_M2, _UNKNOWN_EYE_M2 = (
+    sigma_m**2 * np.eye(3) for sigma_m in (_LEAST_M, _USUAL_M, _UNKNOWN_M)
+)
 
 
 def is_usable(position: Position) -> bool:
@@ -53,9 +56,8 @@ def read_sightings(
     has_covariance : (k,), whether the covariance of a position is known and positive definite.
     """
     count = len(positions)
-    noise, headings = np.zeros((count, 4, 4)), np.zeros(count)
-    for row, position in enumerate(positions):
-        headings[row], noise[row, 3, 3] = _heading(position)
+    noise, measured = np.zeros((count, 4, 4)), np.array([_heading(position) for position in positions])
+    headings, noise[:, 3, 3] = measured[:, 0], measured[:, 1]
     noise[:, :3, :3], has_covariance = _position_noise(positions, camera in modes.tables)
     noise[:, _PLACE, _PLACE] += _LEAST_M**2
     poses = np.column_stack([[(p.x_m, p.y_m, p.z_m) for p in positions], headings])
@@ -68,21 +70,26 @@ def _position_noise(positions: Sequence[Position], has_modes: bool) -> tuple[Arr
 
     Without modes, all errors of a position count as noise.
     """
-    covariances_m2 = np.array([_UNKNOWN if p.covariance_m2 is None else p.covariance_m2 for p in positions])
-    known = _are_covariances(covariances_m2)
-    noise_m2 = covariances_m2
-    if has_modes:
-        noise_m2 = np.array([_UNKNOWN if p.noise_m2 is None else p.noise_m2 for p in positions])
+    covariances_m2 = [_UNKNOWN if p.covariance_m2 is None else p.covariance_m2 for p in positions]
+    if not has_modes:
+        noise_m2 = np.array(covariances_m2)
+        known = _are_covariances(noise_m2)
+    else:
+        noises_m2 = [_UNKNOWN if p.noise_m2 is None else p.noise_m2 for p in positions]
+        both_m2 = np.array([covariances_m2, noises_m2])
+        noise_m2 = both_m2[1].copy()
         # The noise of a marker on a flat floor has no vertical part.
-        stated = _are_covariances(noise_m2 + _LEAST_M**2 * np.eye(3))
-        noise_m2 = np.where(stated[:, None, None], noise_m2, _USUAL_M**2 * np.eye(3))
-    return np.where(known[:, None, None], noise_m2, _UNKNOWN_M**2 * np.eye(3)), known
+        both_m2[1] += _LEAST_EYE_M2
+        known, stated = _are_covariances(both_m2)
+        noise_m2 = np.where(stated[:, None, None], noise_m2, _USUAL_EYE_M2)
+    return np.where(known[:, None, None], noise_m2, _UNKNOWN_EYE_M2), known
 
 
 def _are_covariances(matrices_m2: Array) -> NDArray[np.bool_]:
-    """Return a mask (k,) of the positive definite ones of matrices (k, 3, 3), by their minors."""
-    xx, xy, xz, _, yy, yz, _, _, zz = matrices_m2.reshape(-1, 9).T
-    usable = (np.abs(matrices_m2) < _FARTHEST_M).all(axis=(1, 2))
+    """Return a mask (...) of the positive definite ones of matrices (..., 3, 3), by their minors."""
+    rows = matrices_m2.reshape(*matrices_m2.shape[:-2], 9)
+    xx, xy, xz, _, yy, yz, _, _, zz = np.moveaxis(rows, -1, 0)
+    usable = (np.abs(rows) < _FARTHEST_M).all(axis=-1)
     with np.errstate(over="ignore", invalid="ignore"):
         minor = xx * yy - xy * xy
         determinant = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)

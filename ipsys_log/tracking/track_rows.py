@@ -18,7 +18,7 @@ def make_track(pose: Pose) -> Track:
     mean, covariance = pose.states.means[pose.state], pose.states.covariances[pose.state]
     robot, marker_id = pose.robot
     x_m, y_m, z_m, heading_rad, _, _, _, turn_rate, _, _ = mean.tolist()
-    heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance[3, 3]), sqrt(covariance[7, 7])
+    heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance.item(3, 3)), sqrt(covariance.item(7, 7))
     has_heading = heading_sigma_rad < _UNKNOWN_HEADING_RAD
     return Track(
         robot,

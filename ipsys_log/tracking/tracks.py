@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,7 @@ class TrackSettings:
     window_ns: int = NS_PER_S // 10
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pose:
+class Pose(NamedTuple):
     """The pose of one robot at one instant: a row of ``states``.
 
     Its covariance means nothing without ``has_covariance``: the position has none.
@@ -121,6 +121,7 @@ class RobotTracks:
         self, settings: TrackSettings | None = None, fade_m: Array | None = None, complete: bool = False
     ) -> None:
         self._settings, self._fade_m = settings or TrackSettings(), fade_m
+        self._slack = np.diag([self._settings.slack_m**2] * 3 + [self._settings.slack_rad**2])
         self._complete = complete
         self._tracks: dict[Robot, _Track] = {}
         # Instants at which another frame may still show a robot.
@@ -318,9 +319,7 @@ class RobotTracks:
 
     def _agrees(self, innovations: Innovations) -> NDArray[np.bool_]:
         """Return a mask (k,) of the sightings within the gate."""
-        settings = self._settings
-        slack = np.diag([settings.slack_m**2] * 3 + [settings.slack_rad**2])
-        return np.asarray(innovations.chi2(slack) < settings.gate)
+        return np.asarray(innovations.chi2(self._slack) < self._settings.gate)
 
     def _contradict(self, robot: Robot, track: _Track, record: Record) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
@@ -365,11 +364,14 @@ class RobotTracks:
 
 def _gather(records: Sequence[Record]) -> States:
     """Return the states of records of different messages together."""
+    states = records[0].states
+    if all(record.states is states for record in records):
+        return states.take(np.array([record.state for record in records]))
     return States(
         np.array([record.states.means[record.state] for record in records]),
         np.array([record.states.covariances[record.state] for record in records]),
         np.array([record.states.cross[record.state] for record in records]),
-        records[0].states.fade_m,
+        states.fade_m,
     )
 
 

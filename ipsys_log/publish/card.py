@@ -51,7 +51,7 @@ _FIELDS = {
     "title": "Title of the dataset. Required.",
     "authors": 'Names of the authors, such as ["Name One", "Name Two"]. Required.',
     "licence": "Licence of the data, by its SPDX name such as CC-BY-4.0 or CC0-1.0. Required.",
-    "version": "Version of the dataset, such as 1.0.0.",
+    "version": "Version of the dataset. Default: 1.0.0.",
     "description": "A description in some sentences.",
     "place": "Place of the recording: building, room, size of the floor.",
     "hardware": "Cameras, lenses, mounting heights, computer, robots.",
@@ -100,7 +100,7 @@ def read_card(path: Path) -> Card:
     table = _read_toml(path)
     for name, value in table.items():
         if name not in _FIELDS:
-            raise IpsysError(f"{path}: {plain_text(name)!r} is not a key of a card: {', '.join(_FIELDS)}")
+            raise IpsysError(f"{path}: '{plain_text(name)}' is not a key of a card: {', '.join(_FIELDS)}")
         table[name] = _texts(value, path) if name == "authors" else _text(name, value, path)
     missing = [name for name in _REQUIRED if not table.get(name)]
     if missing:
@@ -147,7 +147,7 @@ def _check_date(text: str, path: Path) -> None:
     except ValueError:
         valid = False
     if not valid:
-        raise IpsysError(f"{path}: published must be a day such as 2026-05-04, not {plain_text(text)!r}")
+        raise IpsysError(f"{path}: published must be a day such as 2026-05-04, not '{plain_text(text)}'")
 
 
 # Inline marks, references, tags, tables, mathematics, and the first sign of addresses, mentions and emoji.

@@ -36,6 +36,7 @@ __all__ = ["PACK_VERSION", "Manifest", "build_manifest", "json_text", "parse_jso
 PACK_VERSION = 1
 _VERSION_KEY = "ipsys:packVersion"
 _CROISSANT = "http://mlcommons.org/croissant/1.0"
+_FIRST_VERSION = "1.0.0"
 _REFUSED = "pack the dataset again with ipsys pack"
 
 _FORMATS = {
@@ -50,42 +51,26 @@ _CONTENTS = {
     SCORES: "The expected errors of all models, with tolerances.",
 }
 
-# The context of the specification, section "Appendix 1: JSON-LD context".
+# The context of the specification, appendix 1.
+_TERMS = (
+    *("citeAs", "column", "equivalentProperty", "extract", "field", "fileObject", "fileProperty", "fileSet"),
+    *("format", "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet"),
+    *("references", "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField"),
+    "transform",
+)
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
+    "sc": "https://schema.org/",
     "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "dct": "http://purl.org/dc/terms/",
+    "ipsys": "urn:ipsys:",
+    "conformsTo": "dct:conformsTo",
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
     "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileObject": "cr:fileObject",
-    "fileProperty": "cr:fileProperty",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-    "ipsys": "urn:ipsys:",
+    **{term: f"cr:{term}" for term in _TERMS},
 }
 _TYPES = {"text": "sc:Text", "integer": "sc:Integer", "number": "sc:Float"}
 
@@ -120,9 +105,9 @@ def build_manifest(
         "description": card.description or card.title,
         "license": card.licence,
         "url": card.url,
-        "citeAs": card.citation,
+        "citeAs": card.citation or f"{', '.join(card.authors)}: {card.title}, {published[:4]}",
         "datePublished": published,
-        "version": card.version,
+        "version": card.version or _FIRST_VERSION,
     }
     return {
         "@context": _CONTEXT,

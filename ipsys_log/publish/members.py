@@ -68,7 +68,7 @@ def check_member_name(name: str, where: str) -> str:
     """
     if len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
         raise IpsysError(
-            f"{where}: the name {plain_text(name, longest=80)!r} is refused: names of files in a pack are "
+            f"{where}: the name '{plain_text(name, longest=80)}' is refused: names of files in a pack are "
             "relative, of letters, digits, _, - and .; pack the dataset again with ipsys pack"
         )
     return name

@@ -110,12 +110,13 @@ def _check_space(size: int, folder: Path, where: str) -> None:
 
 def _check_checksums(folder: Path, members: Iterable[Member], where: str) -> None:
     """Check that the file of checksums names the files of the manifest, and the manifest as it is."""
-    stated = (folder / CHECKSUMS).read_bytes().decode(errors="replace").splitlines()
+    stated = (folder / CHECKSUMS).read_bytes().decode(errors="replace")
     manifest = (folder / MANIFEST).read_bytes()
     own = Member(MANIFEST, len(manifest), hashlib.sha256(manifest).hexdigest())
-    expected = checksum_lines([*members, own]).splitlines()
-    if sorted(stated) != sorted(expected):
-        wrong = sorted(set(expected) - set(stated)) or sorted(set(stated) - set(expected))
+    expected = checksum_lines([*members, own])
+    if stated != expected:
+        lines = stated.split("\n")
+        wrong = [line for line in expected.split("\n") if line not in lines] or lines
         raise IpsysError(
             f"{where}: {CHECKSUMS} and {MANIFEST} contradict each other at "
             f"{plain_text(wrong[0].split('  ')[-1], longest=80)}; "

@@ -215,6 +215,6 @@ def _parse_score(row: object, where: str) -> Score:
             )
     if not is_known(row["model"]):
         raise IpsysError(
-            f"{where}: model {plain_text(row['model'], longest=80)!r} is not known; update ipsys"
+            f"{where}: model '{plain_text(row['model'], longest=80)}' is not known; update ipsys"
         )
     return Score(**row)

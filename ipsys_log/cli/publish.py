@@ -10,6 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.signals import say_kept
 
 __all__ = ["add_commands"]
 
@@ -52,6 +53,12 @@ def pack(
         bool,
         typer.Option("--without-images", help="Leave out the images, and keep the detected markers."),
     ] = False,
+    blur: Annotated[
+        bool,
+        typer.Option(
+            "--blur", help="Blur the images outside of the detected markers: a new recording, in grey."
+        ),
+    ] = False,
     every: Annotated[int, typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera.")] = 1,
 ) -> None:
     """Write logs as a dataset: the recorded channels, the rig, a card, checksums and the expected scores.
@@ -71,13 +78,14 @@ def pack(
         raise IpsysError("pack needs logs and a dataset: ipsys pack lab.mcap -o dataset --card card.toml")
     if card is None:
         raise IpsysError("pack needs --card FILE; to write an empty form: ipsys pack --card-form card.toml")
-    with progress_bar() as progress:
+    with say_kept(lambda _: f"{output} was not written"), progress_bar() as progress:
         result = pack_logs(
             logs,
             output,
             card,
             models=model or (),
             without_images=without_images,
+            blur=blur,
             every=every,
             progress=progress,
             say=say,
@@ -109,7 +117,7 @@ def score(
     from ipsys_log import api
     from ipsys_log.report.pack_scores import score_answer, score_json, score_tables
 
-    with progress_bar() as progress:
+    with say_kept(lambda _: f"{dataset} is unchanged"), progress_bar() as progress:
         result = api.score(dataset, models=model or (), progress=progress, say=say)
     if as_json:
         print(json.dumps(score_json(result), indent=2, allow_nan=False))  # noqa: T201

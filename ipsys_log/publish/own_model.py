@@ -136,9 +136,8 @@ def _error_rows(
 def _predict(model: OwnModel, training: CalibrationPoints, places: CalibrationPoints) -> Array:
     """Fit a new estimator; return its predictions (n, 3) in m for all calibration points of a camera."""
     estimator = model.create()
-    for method in ("fit", "predict"):
-        if not callable(getattr(estimator, method, None)):
-            raise IpsysError(f"--model {model.name}: has no method {method}; a model needs fit and predict")
+    if not callable(getattr(estimator, "fit", None)) or not callable(getattr(estimator, "predict", None)):
+        raise IpsysError(f"--model {model.name}: needs the methods fit and predict; add them")
     estimator.fit(_inputs(estimator, training), training.world_m.copy())
     predicted_m = np.asarray(estimator.predict(_inputs(estimator, places)), dtype=np.float64)
     if predicted_m.shape != places.world_m.shape:

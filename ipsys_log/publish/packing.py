@@ -15,6 +15,7 @@ from pathlib import Path
 from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.publish.blurred_images import blur_log, marker_corners
 from ipsys_log.publish.card import Card, read_card
 from ipsys_log.publish.kept_channels import cut_options, kept_channels
 from ipsys_log.publish.manifest import build_manifest, json_text
@@ -62,6 +63,7 @@ def pack(
     *,
     models: Sequence[str] = (),
     without_images: bool = False,
+    blur: bool = False,
     every: int = 1,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
@@ -77,6 +79,7 @@ def pack(
     card : the filled form of the dataset card.
     models : names of the models to score; none: all that the logs allow.
     without_images : leave out the images, and keep the detected markers instead.
+    blur : blur the images outside of the detected markers, as a new recording in grey.
     every : keep each n-th frame of each camera.
 
     Raises
@@ -84,10 +87,14 @@ def pack(
     IpsysError
         The output exists, the card has a fault, or no model can be evaluated on the logs.
     """
+    if blur and without_images:
+        raise IpsysError("--blur and --without-images cannot be used together; leave out one")
     _check_output(output)
     author = read_card(card)
     with _work_folder(output) as folder:
         logs = _cut_logs(paths, folder, without_images, every, progress, say)
+        if blur:
+            _blur_logs(paths, logs, progress)
         with tempfile.TemporaryDirectory(prefix="ipsys_pack_") as other:
             scores = compute_scores(logs, Path(other) / "results.mcap", models, progress, say)
         if not scores:
@@ -146,6 +153,17 @@ def _cut_logs(
     if not names:
         raise IpsysError(f"{', '.join(map(str, paths))}: no recorded messages; give a log with frames")
     return [folder / name for name in names]
+
+
+def _blur_logs(paths: Sequence[Path], logs: Sequence[Path], progress: Progress) -> None:
+    """Replace each new log by one with blurred images."""
+    with Session(paths) as session:
+        corners = marker_corners(session)
+    for log in logs:
+        sharp = log.with_suffix(".sharp")
+        log.rename(sharp)
+        blur_log(sharp, log, corners, progress)
+        sharp.unlink()
 
 
 def _write_texts(folder: Path, logs: Sequence[Path], card: Card, scores: Sequence[Score]) -> list[Member]:

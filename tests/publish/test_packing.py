@@ -323,7 +323,7 @@ _FAULTS = (
     ("best", "states no score of best; it has rigid, poly"),
     ("mine.py:Flat", "predict returns the shape (40, 2) for 40 points; return world points (40, 3) in m"),
     ("mine.py:Unknown", "predict returns numbers that are not finite"),
-    ("mine.py:Nothing", "has no method fit"),
+    ("mine.py:Nothing", "needs the methods fit and predict"),
 )
 
 

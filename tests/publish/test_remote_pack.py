@@ -12,7 +12,6 @@ import pytest
 
 import ipsys_log
 from ipsys_log.errors import IpsysError
-from tests.test_extras import run_without
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -60,11 +59,3 @@ def test_download_larger_than_the_disk_ends(
         ipsys_log.score(f"{address}/dataset.zip")
     assert len([*pieces]) == 994
     assert list(temporary.iterdir()) == []
-
-
-def test_address_needs_the_optional_library(tmp_path: Path) -> None:
-    ((code, _, err),) = run_without(tmp_path, ["score", "https://example.org/x.zip"])
-    assert (code, err) == (
-        1,
-        "ipsys: the address of a dataset needs fsspec: pip install 'ipsys_log[remote]'\n",
-    )

@@ -3,8 +3,8 @@
     python benchmarks/leaderboard.py paper.zip lab/
     python benchmarks/leaderboard.py paper.zip lab/ --own mine.py:Estimator --markdown
 
-Each dataset of ``ipsys pack`` is scored again, as ``ipsys score`` does. A cell is the mean error in mm, and a
-star marks scores that do not come out as stated. The first row has the lowest mean rank over the datasets.
+Each dataset of ``ipsys pack`` is scored again, as ``ipsys score`` does. A cell is the mean error in mm, and
+≠ marks scores that do not come out as stated. The first row has the lowest mean rank over the datasets.
 The errors of a dataset are cross-validated and in 3D, if all of its models have such errors.
 """
 
@@ -16,11 +16,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import ipsys_log as ipsys
+from ipsys_log.report.advice import HEIGHT_NOTE, label
 from ipsys_log.report.pack_scores import ranked_scores
 
 __all__ = ["leaderboard", "table_lines"]
 
-_STAR = "*"
+_DIFFERS = "≠"
 
 
 def dataset_scores(path: str, own: Sequence[str]) -> dict[str, tuple[float, bool]]:
@@ -50,7 +51,11 @@ def leaderboard(datasets: Mapping[str, Mapping[str, tuple[float, bool]]]) -> lis
     # A model that is missing in a dataset comes after all that have scores in more of them.
     best_first = sorted(mean_ranks, key=lambda model: (-len(ranks[model]), mean_ranks[model], model))
     return [
-        (model, f"{mean_ranks[model]:.1f}", *(_cell(scores.get(model)) for scores in datasets.values()))
+        (
+            label(model),
+            f"{mean_ranks[model]:.1f}",
+            *(_cell(scores.get(model)) for scores in datasets.values()),
+        )
         for model in best_first
     ]
 
@@ -59,7 +64,7 @@ def _cell(score: tuple[float, bool] | None) -> str:
     if score is None:
         return "-"
     mean_mm, as_stated = score
-    return f"{mean_mm:.2f}{'' if as_stated else _STAR}"
+    return f"{'' if as_stated else _DIFFERS}{mean_mm:.2f}"
 
 
 def table_lines(head: Sequence[str], rows: Sequence[Sequence[str]], markdown: bool) -> list[str]:
@@ -102,8 +107,11 @@ def main() -> None:
         sys.exit(str(error))
     rows = leaderboard(scores)
     print(*table_lines(("model", "mean rank", *scores), rows, options.markdown), sep="\n")
-    if any(_STAR in cell for row in rows for cell in row[2:]):
-        print(f"\n{_STAR} does not come out as stated")
+    notes = {
+        HEIGHT_NOTE: any(row[0].endswith("*") for row in rows),
+        f"{_DIFFERS} does not come out as stated": any(_DIFFERS in cell for row in rows for cell in row[2:]),
+    }
+    print("", *(note for note, needed in notes.items() if needed), sep="\n")
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def pack(
                 f"{', '.join(map(str, paths))}: no model can be evaluated: a pack needs calibration points "
                 "in the logs; add them with ipsys measure"
             )
-        members = _write_texts(folder, logs, author, scores)
+        members = _write_texts(folder, logs, author, scores, blur)
         size = sum(member.size for member in members)
         if output.suffix.lower() == ".zip":
             size = _write_zip(folder, members, output)
@@ -166,12 +166,14 @@ def _blur_logs(paths: Sequence[Path], logs: Sequence[Path], progress: Progress) 
         sharp.unlink()
 
 
-def _write_texts(folder: Path, logs: Sequence[Path], card: Card, scores: Sequence[Score]) -> list[Member]:
+def _write_texts(
+    folder: Path, logs: Sequence[Path], card: Card, scores: Sequence[Score], blurred: bool
+) -> list[Member]:
     """Write all files beside the logs; return all files of the pack, with manifest and checksums."""
     with Session(logs) as session:
         rig, from_images = rig_with_offsets(session), bool(session.images)
         day = datetime.fromtimestamp(session.end_ns // NS_PER_S, UTC).date().isoformat()
-        facts = readme_text(card, session, rig, scores)
+        facts = readme_text(card, session, rig, scores, blurred)
     log_names = [f"{LOGS}/{log.name}" for log in logs]
     texts = {
         README: facts,

@@ -32,7 +32,9 @@ _SCHEMES = {"cross_validation": "cross-validated", "held_out": "held-out points"
 _REFERENCES = {"tape": "tape", "truth": "ground truth"}
 
 
-def readme_text(card: Card, session: Session, rig: Rig, scores: Sequence[Score]) -> str:
+def readme_text(
+    card: Card, session: Session, rig: Rig, scores: Sequence[Score], blurred: bool = False
+) -> str:
     """Return the dataset card in Markdown.
 
     All texts of the author and all names from the logs are escaped.
@@ -41,6 +43,7 @@ def readme_text(card: Card, session: Session, rig: Rig, scores: Sequence[Score])
     ----------
     session : the packed logs.
     rig : the newest rig of the logs.
+    blurred : True if the images are blurred outside of the markers.
     """
     lines = [f"# {escape_markdown(card.title)}", ""]
     if card.description:
@@ -48,7 +51,7 @@ def readme_text(card: Card, session: Session, rig: Rig, scores: Sequence[Score])
     texts = ((name, escape_markdown(text_of(card))) for name, text_of in _CARD_ROWS.items())
     lines += _table(("", ""), ((name, text) for name, text in texts if text))
     lines += ["", "## Content", "", *_table(("file", "size", "messages", "start (UTC)"), _log_rows(session))]
-    lines += ["", *_facts(session, rig)]
+    lines += ["", *_facts(session, rig, blurred)]
     lines += ["", "## Expected scores", "", *_score_lines(scores)]
     lines += ["", "## Check of the scores", "", *_CHECK]
     return "\n".join(lines) + "\n"
@@ -76,7 +79,7 @@ def _log_rows(session: Session) -> Iterator[tuple[str, str, str, str]]:
         yield f"{LOGS}/{Path(reader.path).name}", size, str(reader.message_count), start
 
 
-def _facts(session: Session, rig: Rig) -> list[str]:
+def _facts(session: Session, rig: Rig, blurred: bool) -> list[str]:
     """Return what the logs and their rig contain."""
     seconds = (session.end_ns - session.start_ns) / NS_PER_S
     cameras = sorted({*session.images, *session.calibrations, *(camera.name for camera in rig.cameras)})
@@ -84,13 +87,19 @@ def _facts(session: Session, rig: Rig) -> list[str]:
     rows = (
         ("Duration", f"{seconds:.0f} s"),
         ("Cameras", ", ".join(cameras)),
-        ("Images", "yes" if session.images else "no: detected markers or camera points only"),
+        ("Images", _describe_images(bool(session.images), blurred)),
         ("Calibration points", str(len(measured(LogView(session))))),
         ("Marker dictionary", rig.dictionary),
         ("Marker side", ", ".join(f"{length_m * 100:g} cm" for length_m in lengths)),
     )
     lines = _table(("", ""), ((name, escape_markdown(text)) for name, text in rows))
     return [*lines, "", f"`{RIG_FILE}` is the rig. The logs contain it too."]
+
+
+def _describe_images(present: bool, blurred: bool) -> str:
+    if not present:
+        return "no, only detected markers or camera points"
+    return "blurred outside of the markers, in grey" if blurred else "yes"
 
 
 def _score_lines(scores: Sequence[Score]) -> list[str]:

@@ -14,6 +14,7 @@ from ipsys_log.analysis.accuracy import CROSS_VALIDATION
 from ipsys_log.publish.packing import PackResult
 from ipsys_log.publish.scores import Score
 from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
+from ipsys_log.report.advice import HEIGHT_NOTE, label, uses_height
 from ipsys_log.report.tables import name_cell, plain_table, wrap_text
 from ipsys_log.units import format_bytes
 
@@ -135,14 +136,22 @@ def _comparison_table(comparisons: Sequence[ScoreComparison]) -> Table:
         differences = [comparison.difference_mm for comparison in own]
         known = [value_mm for value_mm in differences if value_mm is not None]
         table.add_row(
-            name_cell(stated.model),
+            name_cell(label(stated.model)),
             *(["-"] * len(_HEADS) if computed is None else map(_two, computed.figures)),
             _mm(max(known)) if len(known) == len(differences) else "-",
             f"{stated.tolerance_mm:g}",
             "yes" if all(comparison.as_stated for comparison in own) else "no",
         )
-    table.caption, table.caption_justify, table.caption_style = Text(_CAPTION), "left", ""
+    _add_caption(table, ranked, _CAPTION)
     return table
+
+
+def _add_caption(table: Table, scores: Iterable[Score], text: str = "") -> None:
+    """Add a text below a table, and the note on models that get heights."""
+    notes = [HEIGHT_NOTE] if any(uses_height(score.model) for score in scores) else []
+    lines = [*([text] if text else []), *notes]
+    if lines:
+        table.caption, table.caption_justify, table.caption_style = Text("\n".join(lines)), "left", ""
 
 
 _CAPTION = "difference: the largest of all scores of a model, also held out and in 2D"
@@ -155,7 +164,8 @@ def _own_table(result: ScoreResult) -> Table:
     table = plain_table(f"Errors in mm, {_kind(ranked[0])}", ["model"], ["points", *_HEADS, "source"])
     for score in ranked:
         source = "computed" if score.model in own else "as stated"
-        table.add_row(name_cell(score.model), str(score.points), *map(_two, score.figures), source)
+        table.add_row(name_cell(label(score.model)), str(score.points), *map(_two, score.figures), source)
+    _add_caption(table, ranked)
     return table
 
 

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
         Player,
         ReplayResult,
         SampledTrack,
+        Score,
+        ScoreComparison,
+        ScoreResult,
         Tracker,
         calibrate,
         check,
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
         open,
         play,
         replay,
+        score,
         verify,
     )
     from ipsys_log.errors import IpsysError
@@ -54,6 +58,9 @@ __all__ = [
     "Player",
     "ReplayResult",
     "SampledTrack",
+    "Score",
+    "ScoreComparison",
+    "ScoreResult",
     "Tracker",
     "calibrate",
     "check",
@@ -62,6 +69,7 @@ __all__ = [
     "open",
     "play",
     "replay",
+    "score",
     "verify",
 ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.opened_log import Export, Listing, Log, StrPath
 from ipsys_log.player import Player
+from ipsys_log.publish.scores import Score
+from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sampled_track import SampledTrack
@@ -49,6 +52,9 @@ __all__ = [
     "Player",
     "ReplayResult",
     "SampledTrack",
+    "Score",
+    "ScoreComparison",
+    "ScoreResult",
     "Tracker",
     "calibrate",
     "check",
@@ -57,6 +63,7 @@ __all__ = [
     "open",
     "play",
     "replay",
+    "score",
     "verify",
 ]
 
@@ -225,6 +232,46 @@ def verify(
     from ipsys_log.runs.verify import verify as verify_runs
 
     return verify_runs([Path(path) for path in paths], run, progress, say)
+
+
+def score(
+    dataset: StrPath,
+    *,
+    models: Sequence[str] = (),
+    own: Mapping[str, Callable[[], object]] | None = None,
+    progress: Progress = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> ScoreResult:
+    """Check a dataset of ``ipsys pack``, compute its scores again, and compare them with the stated ones.
+
+    The pipeline runs in a temporary copy; the dataset is not changed.
+
+    Parameters
+    ----------
+    dataset : a folder, a zip archive, or the address of a zip archive.
+    models : names of models to repeat; ``FILE.py:CLASS`` is a model of your own. None: all models.
+    own : classes of your own models by name. Each has ``fit(points_m, world_m)`` and ``predict(points_m)``:
+        camera points (n, 3) to world points (n, 3), in m. They are scored in the same folds.
+
+    Returns
+    -------
+    ScoreResult : its ``as_stated`` is the answer; ``own`` has the scores of your models.
+
+    Raises
+    ------
+    IpsysError
+        The dataset is damaged or refused, or a model has a fault.
+
+    Examples
+    --------
+    >>> score("dataset").as_stated  # doctest: +SKIP
+    True
+    """
+    from ipsys_log.publish.own_model import OwnModel
+    from ipsys_log.publish.scoring import score as score_pack
+
+    of_user = [OwnModel(name, create) for name, create in (own or {}).items()]
+    return score_pack(os.fspath(dataset), [*models, *of_user], progress, say)
 
 
 class FittedModel:

@@ -31,6 +31,7 @@ LIBRARIES = {
     "rosbags": Library("rosbags", "ros2"),
     "xxhash": Library("xxhash", "ros2"),
     "websockets": Library("websockets", "foxglove"),
+    "fsspec": Library("fsspec", "remote"),
 }
 
 

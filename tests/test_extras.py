@@ -125,6 +125,8 @@ REFUSED = {
             *("calibrate lab.mcap --board 6x4", "calibrate --rig lab.toml --board 6x4"),
         )
     },
+    "score https://example.org/x.zip": "the address of a dataset needs fsspec: pip install "
+    "'ipsys_log[remote]'",
     "record --measure -o x.mcap": "--measure needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
     **{
         f"measure {more}": "the measuring page needs Starlette and Uvicorn: pip install 'ipsys_log[web]'"

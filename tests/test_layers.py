@@ -30,6 +30,7 @@ LAYERS = (
     ("pipeline",),
     ("restore",),
     ("survey",),
+    ("publish",),
     ("tracker",),
     ("player",),
     ("closed_loop",),

@@ -30,6 +30,7 @@ __all__ = [
     "learning_curve",
     "learning_sizes",
     "leave_one_out",
+    "leave_out",
     "make_folds",
     "predict_without",
     "published_curve",
@@ -100,7 +101,7 @@ def predict_without(
     FitError
         Too few calibration points remain.
     """
-    rest = {camera: _without(places, left_out) for camera, places in cameras.items()}
+    rest = {camera: leave_out(places, left_out) for camera, places in cameras.items()}
     models = fit_cameras(name, rest)
     return {
         camera: predict_array(models[camera], inputs(name, places.points_m, places.world_m[:, 2]))
@@ -108,7 +109,8 @@ def predict_without(
     }
 
 
-def _without(places: CalibrationPoints, left_out: Collection[str]) -> CalibrationPoints:
+def leave_out(places: CalibrationPoints, left_out: Collection[str]) -> CalibrationPoints:
+    """Return the calibration points of a camera without some measurements."""
     keep = np.array([name not in left_out for name in places.names], dtype=bool)
     names, points = (
         tuple(name for name, kept in zip(all_names, keep, strict=True) if kept)
@@ -117,7 +119,9 @@ def _without(places: CalibrationPoints, left_out: Collection[str]) -> Calibratio
     return CalibrationPoints(places.points_m[keep], places.world_m[keep], names, points)
 
 
-def cross_validate(name: str, cameras: Mapping[str, CalibrationPoints], seed: int) -> dict[str, Array]:
+def cross_validate(
+    name: str, cameras: Mapping[str, CalibrationPoints], seed: int, predict: Predict | None = None
+) -> dict[str, Array]:
     """Predict held-out points by repeated k-fold cross-validation, for each camera.
 
     Parameters
@@ -125,6 +129,7 @@ def cross_validate(name: str, cameras: Mapping[str, CalibrationPoints], seed: in
     name : name in the table of models.
     cameras : all calibration points.
     seed : random seed of the folds.
+    predict : predictions of a fit to some points; None for those of :func:`predict_without`.
 
     Returns
     -------
@@ -135,13 +140,14 @@ def cross_validate(name: str, cameras: Mapping[str, CalibrationPoints], seed: in
     FitError
         Too few calibration points remain without a fold.
     """
+    predict = predict or partial(predict_without, name, cameras)
     rng = np.random.default_rng(seed)
     predictions = {
         camera: np.full((REPEATS, *places.world_m.shape), np.nan) for camera, places in cameras.items()
     }
     for repeat in range(REPEATS):
         for fold in make_folds(cameras, FOLDS, rng):
-            predicted = predict_without(name, cameras, fold)
+            predicted = predict(fold)
             for camera, places in cameras.items():
                 rows = [row for row, place in enumerate(places.names) if place in fold]
                 predictions[camera][repeat, rows] = predicted[camera][rows]

@@ -25,6 +25,7 @@ from ipsys_log.cli import (
     markers,
     measure,
     plan,
+    publish,
     record,
     setup,
     stages,
@@ -47,6 +48,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
         *("cut", "verify", "diff", "latency", "repair"),
     ),
+    "Publish a dataset": ("pack", "score"),
     _STAGES: (),
     "Without cameras": ("simulate", "drive", "import"),
 }
@@ -173,6 +175,15 @@ ipsys latency monday.mcap --plot latency.pdf
     "repair": """
 ipsys repair monday.mcap
 """,
+    "pack": """
+ipsys pack --card-form card.toml                   # write the empty form
+ipsys pack calibration.mcap -o dataset/ --card card.toml
+ipsys pack calibration.mcap -o small.zip --card card.toml --without-images
+""",
+    "score": """
+ipsys score dataset/                               # exit code 0 or 1
+ipsys score small.zip --model mine.py:Estimator    # your own model
+""",
     "drive": """
 ipsys drive --model-from cal.mcap -o run.mcap      # robot run of the paper
 ipsys drive --model-from cal.mcap -o run.mcap --model poly --model best
@@ -234,7 +245,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, drift, inspect, contents, export, stream, cut, compare, drive),
+    *(plan, drift, inspect, contents, export, stream, cut, compare, publish, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

@@ -46,6 +46,15 @@ def cut(
         Optional[list[str]],  # noqa: UP045
         typer.Option("--runs", "--run", metavar="NAME", help="Keep this run; repeat it for several."),
     ] = None,
+    exclude_runs: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--exclude-runs",
+            "--exclude-run",
+            metavar="NAME",
+            help="Leave out this run with its record; repeat it for several.",
+        ),
+    ] = None,
     robots: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
@@ -79,6 +88,7 @@ def cut(
         exclude_topics=exclude_topics or (),
         cameras=cameras or (),
         runs=runs or (),
+        exclude_runs=exclude_runs or (),
         robots=robots or (),
         every=every,
     )

@@ -40,6 +40,7 @@ class CutOptions:
     start, end : UTC as text, or seconds from the first message of the log; the end is not included.
     topics, exclude_topics : patterns of topics, with ``*`` and ``?``.
     cameras, runs : names.
+    exclude_runs : names; the records of these runs are left out, too.
     robots : names; only frames that show one of these robots are kept, with their results.
     every : only each n-th of these frames of each camera is kept, with its results.
     """
@@ -50,6 +51,7 @@ class CutOptions:
     exclude_topics: Sequence[str] = ()
     cameras: Sequence[str] = ()
     runs: Sequence[str] = ()
+    exclude_runs: Sequence[str] = ()
     robots: Sequence[str] = ()
     every: int = 1
 
@@ -62,6 +64,7 @@ class CutOptions:
             "exclude_topics": " ".join(self.exclude_topics),
             "cameras": " ".join(self.cameras),
             "runs": " ".join(self.runs),
+            "exclude_runs": " ".join(self.exclude_runs),
             "robots": " ".join(self.robots),
             "every": "" if self.every == 1 else str(self.every),
         }
@@ -169,6 +172,8 @@ class _TopicRule:
 
     def _is_excluded(self, topic: str) -> bool:
         options, run, camera = self.options, run_of_topic(topic), self.cameras.get(topic)
+        if run in options.exclude_runs:
+            return True
         if run is not None and options.runs and run not in options.runs:
             is_read = run in self.read_too and topic in self.lasting
             if not is_read:
@@ -271,7 +276,7 @@ def _matches(topic: str, patterns: Iterable[str]) -> bool:
 def _check_names(session: Session, options: CutOptions, cameras: Mapping[str, str]) -> None:
     topics = sorted({topic for reader in session.readers for topic in reader.channels})
     _check_known(session, "camera", options.cameras, set(cameras.values()))
-    _check_known(session, "run", options.runs, session.run_names())
+    _check_known(session, "run", (*options.runs, *options.exclude_runs), session.run_names())
     if options.robots:
         rigs = session.payloads(session.topics(RIG))
         robots = {marker.robot for rig in rigs for marker in rig.markers if marker.robot is not None}

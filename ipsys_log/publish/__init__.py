@@ -1,0 +1,1 @@
+"""Packs: datasets with checksums and expected scores, and their re-scoring."""

@@ -1,0 +1,197 @@
+"""Scores of a dataset: the answer of a re-scoring, its table, and plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION
+from ipsys_log.publish.packing import PackResult
+from ipsys_log.publish.scores import Score
+from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
+from ipsys_log.report.advice import HEIGHT_NOTE, label, uses_height
+from ipsys_log.report.tables import name_cell, plain_table, wrap_text
+from ipsys_log.units import format_bytes
+
+__all__ = ["pack_text", "ranked_scores", "score_answer", "score_json", "score_tables"]
+
+_HEADS = ("mean", "median", "p95", "RMSE")
+_NAMED = 3  # differences that the answer names
+
+
+def pack_text(result: PackResult) -> str:
+    """Return the summary of a pack that was written."""
+    models = len({score.model for score in result.scores})
+    return wrap_text(
+        f"{result.path} written: {len(result.files)} files, {format_bytes(result.size)}, expected scores of "
+        f"{models} {'model' if models == 1 else 'models'}. To check it: ipsys score {result.path}"
+    )
+
+
+def score_answer(result: ScoreResult) -> Group:
+    """Return the answer in sentences: the comparison with the stated scores, and the rank of own models."""
+    lines = [*_comparison_lines(result), *_own_lines(result)]
+    return Group(*(Text(wrap_text(line), style="bold" if not n else "") for n, line in enumerate(lines)))
+
+
+def _comparison_lines(result: ScoreResult) -> Iterator[str]:
+    wrong = [comparison for comparison in result.comparisons if not comparison.as_stated]
+    if not result.comparisons:
+        return
+    models = len({comparison.stated.model for comparison in result.comparisons})
+    named = f"{models} {'model' if models == 1 else 'models'}"
+    title = name_cell(result.title).plain
+    if not wrong:
+        largest_mm = max(comparison.difference_mm or 0.0 for comparison in result.comparisons)
+        yield f"{title}: the scores of {named} come out as stated. Largest difference: {_mm(largest_mm)} mm."
+    else:
+        yield (
+            f"{title}: {len(wrong)} of {len(result.comparisons)} scores of {named} do not come out as stated."
+        )
+        yield from (f"{_describe(comparison)}." for comparison in wrong[:_NAMED])
+    if result.other_versions:
+        yield f"The pack was scored with other versions of {', '.join(result.other_versions)}."
+
+
+def _describe(comparison: ScoreComparison) -> str:
+    stated, computed = comparison.stated, comparison.computed
+    what = f"{stated.model} ({_kind(stated)})"
+    if computed is None:
+        return f"{what}: the model cannot be evaluated here"
+    if computed.points != stated.points:
+        return f"{what}: {computed.points} points, stated are {stated.points}"
+    pairs = zip(_HEADS, computed.figures, stated.figures, strict=True)
+    head, here_mm, stated_mm = max(pairs, key=lambda pair: abs(pair[1] - pair[2]))
+    return (
+        f"{what}: {head} {_mm(here_mm)} mm, stated is {_mm(stated_mm)} mm; the tolerance is "
+        f"{_mm(stated.tolerance_mm)} mm"
+    )
+
+
+def _kind(score: Score) -> str:
+    scheme = "cross-validated" if score.scheme == CROSS_VALIDATION else "held out"
+    against = ", against the ground truth" if score.against == "truth" else ""
+    return f"{score.dimensions.upper()}, {scheme}{against}"
+
+
+def _mm(value_mm: float | None) -> str:
+    if value_mm is None:
+        return "-"
+    return f"{value_mm:.0f}" if value_mm >= 1e4 else f"{value_mm:.3f}" if value_mm else "0"
+
+
+def _own_lines(result: ScoreResult) -> Iterator[str]:
+    names = dict.fromkeys(score.model for score in result.own)
+    ranked = ranked_scores((*result.stated, *result.own))
+    for name in names:
+        place, score = next((n, one) for n, one in enumerate(ranked, 1) if one.model == name)
+        yield (
+            f"{name}: mean error {_mm(score.mean_mm)} mm, RMSE {_mm(score.rmse_mm)} mm ({_kind(score)}). "
+            f"Rank {place} of {len(ranked)} models."
+        )
+
+
+def ranked_scores(scores: Iterable[Score]) -> list[Score]:
+    """Return one score of each model, the lowest mean first.
+
+    The scores are those against the tape: cross-validated and in space, if all models have them.
+    """
+    rows = [score for score in scores if score.against == "tape"]
+    models = {score.model for score in rows}
+    for scheme, dimensions in (
+        *((CROSS_VALIDATION, "3d"), (CROSS_VALIDATION, "2d")),
+        *(("held_out", "3d"), ("held_out", "2d")),
+    ):
+        same = [score for score in rows if (score.scheme, score.dimensions) == (scheme, dimensions)]
+        if {score.model for score in same} == models:
+            return sorted(same, key=lambda score: score.mean_mm)
+    return sorted(rows, key=lambda score: score.mean_mm)
+
+
+def score_tables(result: ScoreResult) -> Iterator[Table]:
+    """Yield the table of a re-scoring: a row for each model, within 80 columns."""
+    if result.comparisons:
+        yield _comparison_table(result.comparisons)
+    if result.own:
+        yield _own_table(result)
+
+
+def _comparison_table(comparisons: Sequence[ScoreComparison]) -> Table:
+    """Return the repeated errors of each model, and the largest difference of all its figures."""
+    ranked = ranked_scores(comparison.stated for comparison in comparisons)
+    table = plain_table(
+        f"Errors in mm, {_kind(ranked[0])}" if ranked else "Errors in mm",
+        ["model"],
+        [*_HEADS, "difference", "tolerance", "agrees"],
+    )
+    by_key = {comparison.stated.key: comparison for comparison in comparisons}
+    for stated in ranked:
+        own = [comparison for comparison in comparisons if comparison.stated.model == stated.model]
+        computed = by_key[stated.key].computed
+        differences = [comparison.difference_mm for comparison in own]
+        known = [value_mm for value_mm in differences if value_mm is not None]
+        table.add_row(
+            name_cell(label(stated.model)),
+            *(["-"] * len(_HEADS) if computed is None else map(_two, computed.figures)),
+            _mm(max(known)) if len(known) == len(differences) else "-",
+            f"{stated.tolerance_mm:g}",
+            "yes" if all(comparison.as_stated for comparison in own) else "no",
+        )
+    _add_caption(table, ranked, _CAPTION)
+    return table
+
+
+def _add_caption(table: Table, scores: Iterable[Score], text: str = "") -> None:
+    """Add a text below a table, and the note on models that get heights."""
+    notes = [HEIGHT_NOTE] if any(uses_height(score.model) for score in scores) else []
+    lines = [*([text] if text else []), *notes]
+    if lines:
+        table.caption, table.caption_justify, table.caption_style = Text("\n".join(lines)), "left", ""
+
+
+_CAPTION = "difference: the largest of all scores of a model, also held out and in 2D"
+
+
+def _own_table(result: ScoreResult) -> Table:
+    """Return the errors of the user's models beside the stated ones, the lowest mean first."""
+    ranked = ranked_scores((*result.stated, *result.own))
+    own = {score.model for score in result.own}
+    table = plain_table(f"Errors in mm, {_kind(ranked[0])}", ["model"], ["points", *_HEADS, "source"])
+    for score in ranked:
+        source = "computed" if score.model in own else "as stated"
+        table.add_row(name_cell(label(score.model)), str(score.points), *map(_two, score.figures), source)
+    _add_caption(table, ranked)
+    return table
+
+
+def _two(value_mm: float) -> str:
+    return f"{value_mm:.2f}" if value_mm < 1e4 else f"{value_mm:.0f}"
+
+
+def score_json(result: ScoreResult) -> dict[str, Any]:
+    """Return the result of a re-scoring as plain data, in mm."""
+    return {
+        "title": result.title,
+        "as_stated": result.as_stated if result.comparisons else None,
+        "comparisons": [
+            {
+                "stated": asdict(comparison.stated),
+                "computed": None if comparison.computed is None else _figures(comparison.computed),
+                "difference_mm": comparison.difference_mm,
+                "as_stated": comparison.as_stated,
+            }
+            for comparison in result.comparisons
+        ],
+        "own": [_figures(score) for score in result.own],
+        "other_versions": list(result.other_versions),
+    }
+
+
+def _figures(score: Score) -> dict[str, Any]:
+    """Return a computed score, which has no tolerance."""
+    return {name: value for name, value in asdict(score).items() if name != "tolerance_mm"}

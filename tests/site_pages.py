@@ -117,13 +117,13 @@ def _build(folder: Path) -> None:
     text = re.sub(r"(?m)^docs_dir: .*$", f"docs_dir: {pages}", text)
     text = text.replace("paths: [.]", f"paths: [{ROOT}]").replace("[scripts/", f"[{ROOT}/scripts/")
     (folder / "mkdocs.yml").write_text(text, encoding="utf-8")
+    # Not --quiet: it also hides the warnings from --strict.
     command = [
         sys.executable,
         "-m",
         "mkdocs",
         "build",
         "--strict",
-        "--quiet",
         "-f",
         str(folder / "mkdocs.yml"),
     ]

@@ -71,6 +71,8 @@ def test_markers_in_a_log_of_the_writer_are_detected(tmp_path: Path, ipsys: Ipsy
     done = ipsys("detect", log, "--rig", rig, "--corners", "stock")
     assert done.code == 0, done.err
     read = runpy.run_path(str(_EXAMPLES / "read_log.py"))["read"]
+    images = [fields["format"] for *_, fields in read(log, ["/cameras/red/image"])]
+    assert images == ["jpeg"] * 3
     markers = [fields["markers"] for *_, fields in read(log, ["/runs/stock/cameras/red/markers"])]
     assert [[marker["id"] for marker in row] for row in markers] == [[7]] * 3
     assert markers[0][0]["corners_px"][:2] == pytest.approx([199.5, 119.5], abs=1.0)

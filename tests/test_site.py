@@ -183,7 +183,11 @@ def test_equations_are_mathml_and_not_tex(pages: dict[Path, SiteParser], site: P
     shown = re.sub(r"(?s)<annotation.*?</annotation>", "", page)
     assert pages[site / "docs" / "equations.html"].article["math"] > 25
     assert [text for text in ("\\frac", "\\sum", "```math", "$`") if text in shown] == []
-    assert "<mo>&#x00026;</mo>" not in shown  # an alignment that the converter does not know
+
+
+def test_alignment_of_equations_is_refused() -> None:
+    with pytest.raises(SystemExit, match="use a block for each line"):
+        staging["draw_equations"]("```math\n\\begin{aligned} a &= b \\end{aligned}\n```")
 
 
 def test_reference_has_every_public_name(pages: dict[Path, SiteParser], site: Path) -> None:

@@ -151,7 +151,7 @@ def counted(parser: SiteParser) -> dict[str, int]:
 
 def test_pages_have_the_structure_that_github_shows(site: Path, pages: dict[Path, SiteParser]) -> None:
     """A list that Python-Markdown does not see is a paragraph with hyphens."""
-    differences = {}
+    differences: dict[str, tuple[dict[str, int], dict[str, int]]] = {}
     for path in PAGES:
         name = path.relative_to(ROOT)
         source = re.sub(r"(?ms)^```math.*?^```$", "", path.read_text(encoding="utf-8"))

@@ -23,7 +23,8 @@ from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Message
 from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.sinks.player import play
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.scene import draw_places, draw_rig, layout
+from ipsys_log.sinks.rerun.scene import draw_legend, draw_places, draw_rig, layout
+from ipsys_log.sinks.rerun.series import DISAGREEMENT, LATENCY_MS, draw_series, read_series
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 
 __all__ = [
@@ -122,6 +123,8 @@ def last_line(complaints: IO[bytes]) -> str:
 
 # Frames stay longer than positions: between two calibration points the log may have a gap.
 _FRAME_FACTOR = 10
+# Titles of the plots, with their units.
+_PLOTS = {DISAGREEMENT: "Disagreement of cameras, mm", LATENCY_MS: "Latency, ms"}
 # Number of messages between two writes to the viewer: enough for its speed, small in memory.
 _BATCH = 64
 
@@ -199,9 +202,13 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
     measurements = session.payloads(session.topics(MEASUREMENTS))
     places, faults = locate_measurements(measurements, rig)
     trails = [trail_entity(run) for run in (*shown.runs, *([None] if TRUTH_TOPIC in shown.moving else []))]
-    recording.send_blueprint(layout(shown.cameras, trails, rig, events=bool(shown.events or faults)))
+    series = read_series(session, shown.runs)
+    plots = {entity: title for entity, title in _PLOTS.items() if any(one.is_below(entity) for one in series)}
+    recording.send_blueprint(layout(shown.cameras, trails, rig, bool(shown.events or faults), plots))
     draw_rig(recording, rig)
     draw_places(recording, places)
+    draw_legend(recording)
+    draw_series(recording, series)
     for fault in faults:
         recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
     fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)

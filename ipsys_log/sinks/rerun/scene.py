@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -13,10 +13,23 @@ from ipsys_log.analysis.pairs import KINDS, Place
 from ipsys_log.messages import Floor, Rig
 from ipsys_log.sinks.colours import KIND_COLOURS
 
-__all__ = ["TIMELINES", "draw_places", "draw_rig", "layout"]
+__all__ = ["LEGEND", "TIMELINES", "draw_legend", "draw_places", "draw_rig", "layout"]
 
 # The viewer shows the first timeline; the times in the payloads belong to it.
 TIMELINES = ("publish_time", "log_time")
+
+LEGEND = "legend"
+_LEGEND = """\
+| sign | meaning |
+|---|---|
+| large point, arrow, line | track of a robot, its heading, its last 15 s |
+| small point | position from one camera, in the colour of the camera |
+| grey point, thin grey line | ground truth |
+| grey points | calibration points; yellow: test points |
+| white points | reference points of the tape |
+| red and green arrows | x and y axes of the floor |
+| green outline in an image | corners of a detected marker, with its id |
+"""
 
 _GRID_M = 0.5
 _MOST_LINES = 100
@@ -83,18 +96,27 @@ def draw_places(recording: rr.RecordingStream, places: Iterable[Place]) -> None:
             recording.log(["world", "places", kind], points, static=True)
 
 
-def layout(cameras: Sequence[str], trails: Sequence[str], rig: Rig | None, events: bool) -> rrb.Blueprint:
-    """Return the layout: cameras on the left, the floor from above on the right, events below the floor.
+def layout(
+    cameras: Sequence[str],
+    trails: Sequence[str],
+    rig: Rig | None,
+    events: bool,
+    plots: Mapping[str, str] | None = None,
+) -> rrb.Blueprint:
+    """Return the layout: cameras on the left, the floor from above on the right, the rest below the floor.
 
     Parameters
     ----------
     cameras : the cameras with frames or markers.
     trails : paths of the entities whose last seconds are shown together.
+    plots : titles of the plots of time series, by the entity above the series.
     """
     right: list[rrb.View | rrb.Container] = [_floor_view(trails, rig)]
-    if events:
-        right.append(rrb.TextLogView(origin="/events", name="Events"))
-    floor = rrb.Vertical(*right, row_shares=[5, 1][: len(right)])
+    right += [_plot(entity, title) for entity, title in (plots or {}).items()]
+    below = [rrb.TextDocumentView(origin=f"/{LEGEND}", name="Legend")]
+    lists = [rrb.TextLogView(origin="/events", name="Events"), *below] if events else below
+    right.append(rrb.Tabs(*lists))
+    floor = rrb.Vertical(*right, row_shares=[5, *[1.2] * len(plots or {}), 1.2])
     views = [rrb.Spatial2DView(origin=f"/cameras/{camera}", name=camera) for camera in cameras]
     # Frames are wide: up to three of them fit best in one column, beside a square floor.
     columns = 1 if len(views) <= 3 else 2
@@ -110,6 +132,16 @@ def layout(cameras: Sequence[str], trails: Sequence[str], rig: Rig | None, event
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
     )
+
+
+def _plot(entity: str, title: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(origin=f"/{entity}", name=title, plot_legend=rrb.PlotLegend(visible=True))
+
+
+def draw_legend(recording: rr.RecordingStream) -> None:
+    """Describe the signs of the floor view."""
+    text = rr.TextDocument(_LEGEND, media_type="text/markdown")
+    recording.log(LEGEND, text, static=True)
 
 
 def _floor_view(trails: Sequence[str], rig: Rig | None) -> rrb.Spatial3DView:

@@ -23,7 +23,7 @@ _ERRORS = frozenset(
 # The recording is complete, but a part of it needs attention.
 _WARNINGS = frozenset(
     (
-        *(CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, "ambiguous_marker", "camera_setting", "camera_size"),
+        *(CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, "ambiguous_marker", "camera_size"),
         *("corrupt_frame", "frames_missed", "no_keyframe", "no_keyframes", "sink_dropped", "wrong_size"),
     )
 )

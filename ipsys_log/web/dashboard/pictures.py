@@ -21,7 +21,7 @@ __all__ = ["Pictures", "shrink"]
 # At most five pictures of a camera per second.
 _EVERY_NS = NS_PER_S // 5
 # A frame without results of the stages is shown after this time.
-_UNMARKED_NS = NS_PER_S
+_UNMARKED_NS = 3 * NS_PER_S
 # Frames that wait for their markers, and pictures that a page may still ask for.
 _WAITING, _KEPT = 60, 10
 _WIDTH_PX, _QUALITY = 480, 60

@@ -148,7 +148,9 @@ def positions(time_ns: int, camera: str, x_m: float) -> Message:
 
 
 @contextmanager
-def page_of(dashboard: Dashboard, host: str | None = None, **options: Any) -> Iterator[PageServer]:
-    with serve_app(build_dashboard(dashboard), host, 0, has_viewers=True, **options) as page:
+def page_of(
+    dashboard: Dashboard, host: str | None = None, port: int = 0, **options: Any
+) -> Iterator[PageServer]:
+    with serve_app(build_dashboard(dashboard), host, port, has_viewers=True, **options) as page:
         yield page
         assert page.exceptions.count == 0, page.exceptions.first

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def test_trail_of_a_new_page_has_ten_seconds(lab: LiveLab) -> None:
         lab.feed(tracks(BEGIN_NS + n * NS_PER_S // 20, robot(0, n / 100, 1.0)))
     trail = lab.dashboard.scene(True)["trails"]["robot_0"]
     assert trail[-1][0] - trail[0][0] == pytest.approx(10_000, abs=100)
-    assert {b[0] - a[0] for a, b in zip(trail, trail[1:], strict=False)} == {100}
+    assert {b[0] - a[0] for a, b in pairwise(trail)} == {100}
     assert all(x == pytest.approx(time / 50 / 100, abs=1e-9) for time, x, _ in trail)
 
 

@@ -148,7 +148,7 @@ function robotElement(robot) {
   const trail = element("polyline", { class: "trail", stroke: robot.colour });
   const ellipse = element("ellipse", { class: "ellipse", stroke: robot.colour });
   const arrow = element("path", { d: "M12,0L24,0M18,-5L25,0L18,5", class: "arrow" });
-  body.append(ellipse, arrow, element("circle", { r: 11, fill: robot.colour }),
+  body.append(ellipse, arrow, element("circle", { r: 11, stroke: robot.colour }),
     element("text", { y: 4, class: "id" }, String(robot.id)),
     element("text", { x: 0, y: -16, class: "name" }, robot.name, age));
   whole.append(trail, body);

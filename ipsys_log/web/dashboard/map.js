@@ -120,6 +120,8 @@ export class FloorMap {
     if (drawn.arrow) drawn.arrow.setAttribute("visibility", robot.heading === undefined ? "hidden" : "visible");
     if (drawn.arrow && robot.heading !== undefined) drawn.arrow.setAttribute("transform", `rotate(${(-robot.heading * 180) / Math.PI})`);
     if (!robot.colour) return;
+    // The name does not cover the arrow.
+    drawn.name.setAttribute("y", Math.sin(robot.heading ?? -1) > 0.2 ? 26 : -16);
     const [long, short, angle] = robot.ellipse ?? [0, 0, 0], k = this.scale * growth;
     set(drawn.ellipse, { rx: (long * k).toFixed(1), ry: (short * k).toFixed(1), transform: `rotate(${(-angle * 180) / Math.PI})` });
     drawn.trail.setAttribute("points", this.trails.get(robot.name).map(([, a, b]) => this.at(a, b).map((v) => v.toFixed(1)).join(",")).join(" "));
@@ -147,10 +149,10 @@ function robotElement(robot) {
   }
   const trail = element("polyline", { class: "trail", stroke: robot.colour });
   const ellipse = element("ellipse", { class: "ellipse", stroke: robot.colour });
+  const name = element("text", { x: 0, class: "name" }, robot.name, age);
   const arrow = element("path", { d: "M12,0L24,0M18,-5L25,0L18,5", class: "arrow" });
   body.append(ellipse, arrow, element("circle", { r: 11, stroke: robot.colour }),
-    element("text", { y: 4, class: "id" }, String(robot.id)),
-    element("text", { x: 0, y: -16, class: "name" }, robot.name, age));
+    element("text", { y: 4, class: "id" }, String(robot.id)), name);
   whole.append(trail, body);
-  return { whole, body, trail, ellipse, arrow, age };
+  return { whole, body, trail, ellipse, arrow, name, age };
 }

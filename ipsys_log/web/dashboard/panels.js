@@ -24,7 +24,7 @@ function table(where, headings, rows, empty) {
 export function showRobots(data) {
   if (performance.now() - robotsShown < ROBOTS_MS) return;
   robotsShown = performance.now();
-  const rows = data.robots.filter((robot) => robot.colour).map((robot) => {
+  const rows = data.robots.filter((robot) => robot.colour).sort((a, b) => a.id - b.id).map((robot) => {
     const unseen = Math.max(data.now - robot.seen, 0);
     return [`${robot.id} ${robot.name}`, robot.x.toFixed(2), robot.y.toFixed(2),
       robot.heading === undefined ? "–" : `${Math.round((robot.heading * 180) / Math.PI)}°`,

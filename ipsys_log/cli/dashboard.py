@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["DashboardPlan", "first_run", "plan_dashboard", "serve_dashboard"]
 
 _USUAL_PORT = 8000
-_GAP = "    "
+_GAP = 4
 
 
 class DashboardPlan(NamedTuple):
@@ -137,10 +137,14 @@ def _print_addresses(page: PageServer) -> None:
         return
     from ipsys_log.web.server import qr_code
 
-    codes = [qr_code(url).splitlines() for url in (page.view_url, page.url)]
-    for view, operate in zip(*codes, strict=True):
-        console.print(f"{view}{_GAP}{operate}", style="#ffffff on #000000", markup=False)
-    gap = " " * (len(codes[0][0]) + len(_GAP) - len("view"))
-    console.print(f"view{gap}operate", markup=False)
+    codes = [
+        [*qr_code(url).splitlines(), name] for url, name in ((page.view_url, "view"), (page.url, "operate"))
+    ]
+    width = max(map(len, codes[0])) + _GAP
+    rows = [f"{left:<{width}}{right}" for left, right in zip(*codes, strict=False)]
+    if len(codes[0]) != len(codes[1]) or 2 * width > console.width:
+        rows = [*codes[0], *codes[1]]  # one above the other
+    for row in rows:
+        console.print(row, style="#ffffff on #000000", markup=False)
     remarks.print(f"dashboard, to view:    {page.view_url}", markup=False)
     remarks.print(f"dashboard, to operate: {page.url}", markup=False)

@@ -86,8 +86,9 @@ class LiveLab:
     def feed(self, *messages: Message) -> None:
         """Let the sink consume messages; return after that."""
         consumed = threading.Event()
-        for item in (*messages, consumed):
-            self._queue.put(item)
+        for message in messages:
+            self._queue.put(message)
+        self._queue.put(consumed)
         assert consumed.wait(WAIT_LIMIT_S)
 
     def end(self) -> None:

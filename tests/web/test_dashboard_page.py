@@ -267,6 +267,22 @@ def test_connection_of_a_page_ends_after_the_limit(lab: LiveLab) -> None:
                 break
 
 
+def test_new_connections_do_not_end_a_stream(lab: LiveLab) -> None:
+    limits = PageLimits(12, 8)
+    with page_of(lab.dashboard, limits=limits) as page, ExitStack() as stack:
+        readers = [stack.enter_context(closing(Reader(page.url))) for _ in range(4)]
+        for reader in readers:
+            reader.next("status")
+        parts = urlsplit(page.url)
+        address = str(parts.hostname), parts.port or 0
+        idle = [stack.enter_context(socket.create_connection(address)) for _ in range(limits.per_address)]
+        assert Caller(page.url).ask("GET", "/")[0] == 200  # the connections before it are accepted, too
+        lab.feed(event(BEGIN_NS, "mark", "now"))
+        for reader in readers:
+            reader.until("status", lambda data: data["events"])
+        assert len(idle) == limits.per_address
+
+
 class Pages(threading.Thread):
     """Ten pages of a recording: seven read, one never reads, one vanishes, one asks for all pictures."""
 

@@ -273,9 +273,13 @@ def parts(data: bytes) -> dict[str, Any]:
 
 
 def test_data_are_made_once_for_all_pages(lab: LiveLab, monkeypatch: pytest.MonkeyPatch) -> None:
-    feed, made = Feed(lab.dashboard), list[str]()
-    dumps = json.dumps
-    monkeypatch.setattr(json, "dumps", lambda *a, **k: made.append("x") or dumps(*a, **k))
+    feed, made, dumps = Feed(lab.dashboard), list[str](), json.dumps
+
+    def note(*values: Any, **options: Any) -> str:
+        made.append(dumps(*values, **options))
+        return made[-1]
+
+    monkeypatch.setattr(json, "dumps", note)
     pages: list[dict[str, int]] = [{} for _ in range(10)]
     assert {*parts(feed.newest(pages[0], 0.0))} == {"robots", "tiles", "status"}
     for page in pages[1:]:

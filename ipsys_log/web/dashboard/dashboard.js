@@ -7,7 +7,7 @@ import { showTiles } from "./tiles.js";
 const $ = (id) => document.getElementById(id);
 // Without data for this time, the page says so.
 const QUIET_MS = 3000;
-let map, operation, source, heard = 0, end = null, hidden = false;
+let map, operation, source, heard = 0, end = null;
 
 function show(kind, text) {
   const chip = $("state");
@@ -54,7 +54,7 @@ function connect() {
 }
 
 function reconnect() {
-  if (!hidden && !end && source.readyState === EventSource.CLOSED) connect();
+  if (!document.hidden && !end && (!source || source.readyState === EventSource.CLOSED)) connect();
 }
 
 async function begin() {
@@ -71,16 +71,14 @@ async function begin() {
   $("lab").textContent = scene.floor.lab;
   map = new FloorMap($("floor"), $("legend"), $("growth"), scene);
   operation = new Operation(scene.may_operate);
-  connect();
+  reconnect();
   setInterval(judge, 500);
 }
 
 // A page that nobody sees needs no data, and a browser opens only six connections to a server.
 document.addEventListener("visibilitychange", () => {
-  hidden = document.hidden;
-  if (!source) return;
-  if (hidden) source.close();
-  else reconnect();
+  if (document.hidden) source?.close();
+  else if (map) reconnect();
 });
 
 begin();

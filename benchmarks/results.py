@@ -31,6 +31,7 @@ BENCHMARKS = {
     "joint": "error over the floor of calibrations, in simulated labs",
     "tracks": "error of the tracks of driving robots, in simulated labs",
     "track_cost": "time of a message with the positions of 20 robots",
+    "dashboard": "share of a core for the dashboard of ipsys live, with one page and ten",
 }
 
 

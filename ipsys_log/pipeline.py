@@ -219,8 +219,7 @@ def measure(
         Backlog(cameras, recent, cameras.now_ns) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
-            if message is not TICK:
-                show(message)
+            _show_all(show, frames.take_events(), *(() if message is TICK else (message,)))
     log.check_disk()
     show.check()
     return log.counts
@@ -271,11 +270,13 @@ def live(
         Backlog(cameras, log, cameras.now_ns) as frames,
     ):
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
-        fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show)
+        events = frames.take_events
+        fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show, events)
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in frames:
-                show(None if message is TICK else message)
+                _show_all(show, events(), None if message is TICK else message)
+        _show_all(show, events())
     if fault is not None:
         raise IpsysError(
             f"{fault}; {target} has all frames; to process them: ipsys replay {target}"
@@ -305,22 +306,37 @@ def _through(
 
 
 def _put_through(
-    frames: Iterable[Message], stages: Sequence[WiredStage], ledger: Ledger, log: Recording, show: Consumers
+    frames: Iterable[Message],
+    stages: Sequence[WiredStage],
+    ledger: Ledger,
+    log: Recording,
+    show: Consumers,
+    events: Callable[[], Iterable[Message]],
 ) -> IpsysError | None:
-    """Write the results of the stages for incoming frames, then show them; return the error of a stage."""
+    """Write the results of the stages for incoming frames, then show them; return the error of a stage.
+
+    The results are shown with their latencies, and with the ``events`` that were written meanwhile.
+    """
     try:
         for message in _through(stages, frames, ledger):
             if message is TICK:
-                show(None)
+                _show_all(show, events(), None)
                 continue
+            made = [message]
             if run_of_topic(message.topic) is not None:  # all other messages are written already
-                log.put(message)
                 entry = ledger.entry(message)
-                if entry is not None:
-                    log.put(entry)
-            show(message)
+                made += [] if entry is None else [entry]
+                for result in made:
+                    log.put(result)
+            _show_all(show, events(), *made)
     except (LogError, SourceError):
         raise
     except IpsysError as fault:
         return fault
     return None
+
+
+def _show_all(show: Consumers, events: Iterable[Message], *messages: Message | None) -> None:
+    """Show events and then messages."""
+    for message in chain(events, messages):
+        show(message)

@@ -113,6 +113,8 @@ REFUSED = {
     "'ipsys_log[ros2]'",
     "live --foxglove --model-from model.mcap -o x.mcap": "--foxglove needs websockets: pip install "
     "'ipsys_log[foxglove]'",
+    "live --web --model-from model.mcap -o x.mcap": "--web needs Starlette and Uvicorn: pip install "
+    "'ipsys_log[web]'",
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.lenses import undistort
+from ipsys_log.analysis.floor_cameras import FloorCamera, outline_view
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import restore_joint
@@ -23,10 +23,6 @@ Size = tuple[int, int]
 _CELLS = 16
 # A cell with fewer corners has no reliable mean.
 _LEAST_CORNERS = 3
-# Points on each side of an image, whose rays outline the field of view.
-_OUTLINE = 16
-# Tangent of the largest angle of a drawn ray: beyond it, a ray meets the floor far away or never.
-_GRAZED = 3.0
 # A clock that the fit keeps constant has a smaller standard deviation, by rounding.
 _NO_SIGMA_S = 1e-9
 
@@ -108,7 +104,10 @@ def _describe(
 ) -> CalibratedCamera:
     variances = (model.modes**2).sum(axis=1)
     clock_sigma_s = float(np.sqrt(variances[6 + len(model.lens) + 1]))
-    outline_m = np.zeros((0, 2)) if size_px is None else _outline(model, size_px)
+    outline_m = np.zeros((0, 2))
+    if size_px is not None:
+        lens = replace(model.calibration, width=size_px[0], height=size_px[1])
+        outline_m = outline_view(FloorCamera(name, lens, model.camera_from_world, model.origin_m))
     return CalibratedCamera(
         name,
         size_px,
@@ -120,23 +119,6 @@ def _describe(
         clock_sigma_s if clock_sigma_s > _NO_SIGMA_S else 0.0,
         residuals,
     )
-
-
-def _outline(model: JointModel, size_px: Size) -> Array:
-    """Return the outline (k, 2) of the field of view on the plane z = 0."""
-    width, height = size_px
-    along, ends = np.linspace(0.0, 1.0, _OUTLINE, endpoint=False), np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    sides = [
-        start + along[:, None] * (end - start) for start, end in zip(ends, np.roll(ends, -1, 0), strict=True)
-    ]
-    pixels = np.concatenate(sides) * [width - 1, height - 1]
-    uv = undistort(pixels, model.calibration)
-    uv = uv[np.isfinite(uv).all(axis=1)]
-    rays = np.column_stack([uv, np.ones(len(uv))]) @ model.camera_from_world
-    across = np.hypot(rays[:, 0], rays[:, 1])
-    # A grazing ray keeps its direction, and ends where a steeper ray meets the floor.
-    depths = np.maximum(-rays[:, 2], across / _GRAZED)
-    return np.asarray(model.origin_m[:2] + rays[:, :2] * (model.origin_m[2] / depths)[:, None])
 
 
 def _residuals(fit: JointFit, number: int, size_px: Size) -> ImageResiduals | None:

@@ -9,19 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.lenses import check_calibration, in_image
+from ipsys_log.geometry.lenses import check_calibration, in_image, undistort
 from ipsys_log.geometry.poses import rotation
 from ipsys_log.messages import CameraCalibration, CameraModel, Floor, Model
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import reads_corners
 
-__all__ = ["FloorCamera", "floor_grid", "move_camera", "read_floor_cameras", "shift_floor_map"]
+__all__ = [
+    "FloorCamera",
+    "floor_grid",
+    "move_camera",
+    "outline_view",
+    "read_floor_cameras",
+    "shift_floor_map",
+]
 
 Array = NDArray[np.float64]
 
 _STEP_M = 0.25
 # Without a floor in the rig, the map reaches this multiple of the camera's height to each side.
 _REACH = 1.5
+# Points on each side of an image, whose rays outline the field of view.
+_OUTLINE = 16
+# Tangent of the largest angle of a drawn ray: beyond it, a ray meets the floor far away or never.
+_GRAZED = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +116,22 @@ def floor_grid(camera: FloorCamera, floor: Floor | None) -> Array:
     flat_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     points_m = np.column_stack([flat_m, np.zeros(len(flat_m))])
     return np.asarray(points_m[in_image(camera.transform(points_m), camera.lens)])
+
+
+def outline_view(camera: FloorCamera) -> Array:
+    """Return the outline (k, 2) of the field of view of a camera on the floor, z = 0, in m."""
+    along, ends = np.linspace(0.0, 1.0, _OUTLINE, endpoint=False), np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    sides = [
+        start + along[:, None] * (end - start) for start, end in zip(ends, np.roll(ends, -1, 0), strict=True)
+    ]
+    pixels = np.concatenate(sides) * [camera.lens.width - 1, camera.lens.height - 1]
+    uv = undistort(pixels, camera.lens)
+    uv = uv[np.isfinite(uv).all(axis=1)]
+    rays = np.column_stack([uv, np.ones(len(uv))]) @ camera.camera_from_world
+    across = np.hypot(rays[:, 0], rays[:, 1])
+    # A grazing ray keeps its direction, and ends where a steeper ray meets the floor.
+    depths = np.maximum(-rays[:, 2], across / _GRAZED)
+    return np.asarray(camera.origin_m[:2] + rays[:, :2] * (camera.origin_m[2] / depths)[:, None])
 
 
 def move_camera(camera: FloorCamera, motion: Array) -> FloorCamera:

@@ -116,7 +116,8 @@ class Backlog:
 
     A separate thread writes the messages of a source and passes the frames on. If the stages are slower than
     the cameras, frames are skipped as in :class:`~ipsys_log.capture.backlog.Waiting`. The recording loses no
-    frame, and an event names each skipped frame. After all waiting messages comes a :data:`TICK`.
+    frame, and an event names each skipped frame. After all waiting messages, and after an event, comes a
+    :data:`TICK`. The events that no stage reads do not pass the stages: :meth:`take_events` returns them.
 
     Parameters
     ----------
@@ -129,6 +130,7 @@ class Backlog:
         self.skipped: Counter[str] = Counter()
         self._source, self._log, self._now_ns = source, log, now_ns
         self._waiting = Waiting()
+        self._events: list[Message] = []
         self._ended = False
         self._fault: BaseException | None = None
         self._changed = threading.Condition()
@@ -147,21 +149,31 @@ class Backlog:
     def __iter__(self) -> Iterator[Message]:
         while True:
             with self._changed:
-                while not self._waiting and not self._ended:
+                while not self._waiting and not self._events and not self._ended:
                     self._changed.wait()
-                taken = self._waiting.take()
-            if not taken:
+                taken, has_ended = self._waiting.take(), self._ended
+            if not taken and has_ended:
                 if self._fault is not None:
                     raise self._fault
                 return
             yield from taken
             yield TICK
 
+    def take_events(self) -> list[Message]:
+        """Return the written events since the last call, without those that a stage reads."""
+        with self._changed:
+            taken, self._events = self._events, []
+            return taken
+
     def _record(self) -> None:
         try:
             for message in write_each(self._source, self._log):
-                if message is not None and (message.camera is not None or _is_read(message)):
+                if message is None:
+                    continue
+                if message.camera is not None or _is_read(message):
                     self._hand_on(message)
+                elif isinstance(message.payload, Event):
+                    self._note(message)
         except BaseException as fault:  # raised again in the thread that takes the messages
             self._fault = fault
         finally:
@@ -178,7 +190,14 @@ class Backlog:
             self.skipped[camera] += 1
             text = f"a frame of camera {camera} is skipped: processing cannot keep up. The frame is recorded"
             event = Event(late.log_time_ns, FRAME_SKIPPED, text, camera)
-            self._log.put(Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event))
+            report = Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event)
+            self._log.put(report)
+            self._note(report)
+
+    def _note(self, event: Message) -> None:
+        with self._changed:
+            self._events.append(event)
+            self._changed.notify()
 
 
 def _is_read(message: Message) -> bool:

@@ -112,6 +112,7 @@ ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
 ipsys live --model-from calibration.mcap -o monday.mcap
 ipsys live --model-from calibration.mcap --model best --view -o b.mcap
 ipsys live --model-from calibration.mcap -o monday.mcap --udp 9870
+ipsys live --model-from calibration.mcap -o monday.mcap --web
 """,
     "evaluate": """
 ipsys evaluate calibration.mcap                    # all models

@@ -107,12 +107,10 @@ def serve_live_page(scene: LiveScene, host: str | None, port: int) -> Iterator[N
             say_faults(page)
 
 
-def say_faults(page: PageServer) -> None:
+def say_faults(page: PageServer, name: str = "the measuring page") -> None:
     """Print the faults of the page's server at the end, when the screen is free for a traceback."""
     if page.exceptions.count:
-        remarks.print(
-            f"internal errors of the measuring page: {page.exceptions.count}; the first one:", style="red"
-        )
+        remarks.print(f"internal errors of {name}: {page.exceptions.count}; the first one:", style="red")
         remarks.print(page.exceptions.first, markup=False, highlight=False)
 
 

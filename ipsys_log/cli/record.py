@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import remarks, say
+from ipsys_log.cli.dashboard import first_run, plan_dashboard, serve_dashboard
 from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
     Calibrations,
@@ -29,8 +30,8 @@ from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_st
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import Message
-    from ipsys_log.runs.options import Request
     from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
 
 __all__ = ["add_commands"]
@@ -40,6 +41,21 @@ Seconds = Annotated[
     typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
 ]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
+
+Web = Annotated[
+    bool,
+    typer.Option("--web", help="Show the recording on a page, the dashboard, for any number of browsers."),
+]
+WebPort = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--web-port",
+        min=0,
+        max=65535,
+        metavar="PORT",
+        help="Serve the dashboard on this port instead of 8000; 0 for any free port.",
+    ),
+]
 
 _NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
 
@@ -134,6 +150,8 @@ def live(
     corners: Corners = None,
     method: Method = "perimeter",
     view: View = False,
+    web: Web = False,
+    web_port: WebPort = None,
     *,
     streams: StreamOptions,
     seconds: Seconds = None,
@@ -151,39 +169,34 @@ def live(
     for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
         if is_wanted:
             check_installed(f"{option} needs", "rerun")
+    if web:
+        check_installed("--web needs", "starlette", "uvicorn")
     lab = prepare_lab(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
     models = tuple(dict.fromkeys(model or ()))
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         remarks.print(line, style="yellow", markup=False)
-    streamed = choose_streams(lab.rig, rig.parent, **streams)
+    planned = plan_dashboard(web, streams["host"], web_port, request)
+    streamed = choose_streams(lab.rig, rig.parent, has_page=web, **streams)
     for line in check_streams(streamed):
         say(line)
     robots = lab.rig.robot_heights_m()
     if streamed and not robots:
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
         remarks.print(text, style="yellow", markup=False)
-    shown_run = _first_run(request)
+    shown_run = first_run(request)
     with (
         open_cameras(lab, output, seconds) as (cameras, settings, status),
         open_streams(
             streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, heights_m=robots
         ) as senders,
         _page_viewer(settings, cameras, shown_run, streamed) as pages,
+        serve_dashboard(planned, (cameras, settings, status), output, shown_run, senders) as dashboards,
     ):
         viewer = [_viewer(settings, cameras, shown_run)] if view else []
-        sinks = [*viewer, *pages, *senders]
+        sinks: list[Sink] = [*viewer, *pages, *dashboards, *senders]
         pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
-
-
-def _first_run(request: Request) -> str:
-    """Return the run of the first model: streams and the viewer show one run."""
-    from ipsys_log.runs.select import wanted_models
-    from ipsys_log.stages.fit import model_run
-
-    first, *_ = wanted_models(request)
-    return model_run(first)
 
 
 def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView:

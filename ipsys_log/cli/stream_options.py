@@ -115,7 +115,7 @@ StreamHost = Annotated[
         "--host",
         metavar="ADDRESS",
         help="Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. "
-        "Default: only this machine.",
+        "The dashboard of --web is then open to the network, too. Default: only this machine.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -172,13 +172,16 @@ def _expand(parameter: inspect.Parameter) -> Iterator[inspect.Parameter]:
         yield inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
-def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSettings:
+def choose_streams(
+    rig: Rig | None, folder: Path, *, has_page: bool = False, **options: Any
+) -> StreamSettings:
     """Return the streams of the options; where an option is missing, those of the rig file.
 
     Parameters
     ----------
     rig : the rig of a file, never of a log: a log opens no socket.
     folder : the folder of the rig file.
+    has_page : the command also serves a page at the address of ``host``.
     options : fields of `StreamSettings`, and ``is_vrpn``, ``is_ros2`` and ``is_foxglove`` for the usual
         port; None, False and empty lists are missing.
 
@@ -199,7 +202,7 @@ def choose_streams(rig: Rig | None, folder: Path, **options: Any) -> StreamSetti
         if value is not None and value is not False and value != []
     }
     settings = replace(settings_of_rig(None if rig is None else rig.stream, folder), **given)
-    _check_effect(given, settings)
+    _check_effect(given.keys() - {"host"} if has_page else given, settings)
     if rig is not None:
         check_robots(rig, settings.named_robots, "--robot")
     return settings

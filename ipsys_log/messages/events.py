@@ -6,7 +6,17 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["CAMERA_MOVED", "FRAME_SKIPPED", "STAMP_UNRELIABLE", "Event", "Latency"]
+__all__ = [
+    "CAMERA_MOVED",
+    "FRAME_SKIPPED",
+    "MARK",
+    "OPERATOR_KINDS",
+    "SEGMENT_ENDED",
+    "SEGMENT_STARTED",
+    "STAMP_UNRELIABLE",
+    "Event",
+    "Latency",
+]
 
 # The kind of an event whose timestamp is the log time of a frame that live processing skipped.
 FRAME_SKIPPED = "frame_skipped"
@@ -14,6 +24,9 @@ FRAME_SKIPPED = "frame_skipped"
 STAMP_UNRELIABLE = "stamp_unreliable"
 # The kind of an event for a camera that was knocked during a live recording.
 CAMERA_MOVED = "camera_moved"
+# The kinds of events of an operator: a remark at an instant, and the start and the end of a named segment.
+MARK, SEGMENT_STARTED, SEGMENT_ENDED = "mark", "segment_started", "segment_ended"
+OPERATOR_KINDS = frozenset((MARK, SEGMENT_STARTED, SEGMENT_ENDED))
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +34,9 @@ class Event:
     """An event that a reader of the log must know, such as a corrupt frame.
 
     ``start`` and ``end`` are the first and the last time of the frames that an event of kind
-    ``stamp_unreliable`` affects; without ``end``, the last time is not known yet.
+    ``stamp_unreliable`` affects; without ``end``, the last time is not known yet. ``segment`` is the name of
+    the segment that an event of kind ``segment_started`` or ``segment_ended`` begins or ends; the second has
+    its ``start`` and ``end``.
     """
 
     timestamp: TimeNs
@@ -31,6 +46,7 @@ class Event:
     marker_id: int | None = None
     start: TimeNs | None = None
     end: TimeNs | None = None
+    segment: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,6 +65,11 @@ class LiveStatus:
         self._tracks: dict[str, Track] = {}
         self._overlap = OverlapSummary()
 
+    @property
+    def checks(self) -> Mapping[str, FrameCheck]:
+        """The last check of each camera."""
+        return self._monitor.checks
+
     def __call__(self, message: Message | None) -> None:
         """Handle one recorded message."""
         self._monitor(message)

@@ -1,1 +1,1 @@
-"""The measuring page: a small web server for the phone of the person who measures."""
+"""The pages: a small web server for the measuring page and for the dashboard."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hmac
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -12,10 +12,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ipsys_log.sinks.streams.addresses import is_own_host
 
-__all__ = ["HEADER", "Guard"]
+__all__ = ["HEADER", "MAY_WRITE", "Guard"]
 
 # Only a script of the page can send this header. Before another site sends it, the browser asks this server.
 HEADER = "x-ipsys"
+# The key in the scope of an accepted request: True if requests of this device may write.
+MAY_WRITE = "ipsys.may_write"
 
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; "
@@ -36,10 +38,14 @@ class Guard:
         names that lead to this machine (DNS rebinding).
     token : token of the first request as ``?token=``, and of the cookie of later requests. None: no token is
         needed.
+    view_token : a second token, for devices that may only read. None: there is no such token.
     """
 
-    def __init__(self, app: ASGIApp, names: frozenset[str], token: str | None) -> None:
+    def __init__(
+        self, app: ASGIApp, names: frozenset[str], token: str | None, view_token: str | None = None
+    ) -> None:
         self._app, self._token = app, token
+        self._tokens = [one for one in (token, view_token) if one is not None]
         self._names = names | {"localhost"}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -62,25 +68,32 @@ class Guard:
         host = headers.get("host", "")
         if not is_own_host(host, self._names):
             return _refuse("this is not an address of this machine")
+        scope[MAY_WRITE] = True
         if self._token is not None:
             token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-            if scope["method"] == "GET" and scope["path"] == "/" and self._fits(token):
-                return self._welcome(scope)
-            if not any(map(self._fits, self._cookies(headers, scope))):
+            if scope["method"] == "GET" and scope["path"] == "/" and self._fitting([token]):
+                return self._welcome(scope, token)
+            fitting = self._fitting(self._cookies(headers, scope))
+            if not fitting:
                 return _refuse("open the page with the full address that ipsys printed")
+            scope[MAY_WRITE] = self._token in fitting
         if scope["method"] not in ("GET", "HEAD"):
             origin = headers.get("origin")
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
-                return _refuse("only the measuring page may write")
+                return _refuse("only the page of ipsys may write")
+            if not scope[MAY_WRITE]:
+                return _refuse("this device may only view; open the address to operate that ipsys printed")
         return None
 
-    def _fits(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), (self._token or "").encode())
+    def _fitting(self, given: Iterable[str]) -> set[str]:
+        """Return the tokens of this page among the given texts."""
+        texts = [text.encode() for text in given]
+        return {own for own in self._tokens for text in texts if hmac.compare_digest(text, own.encode())}
 
-    def _welcome(self, scope: Scope) -> Response:
+    def _welcome(self, scope: Scope, token: str) -> Response:
         """Move the token from the address line, where other people could read it, to a cookie."""
         response = RedirectResponse("/", 303)
-        response.set_cookie(self._name(scope), self._token or "", httponly=True, samesite="strict")
+        response.set_cookie(self._name(scope), token, httponly=True, samesite="strict")
         return response
 
     def _cookies(self, headers: Headers, scope: Scope) -> Iterator[str]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
@@ -28,6 +26,7 @@ from ipsys_log.survey.scene import (
     visible_markers,
 )
 from ipsys_log.units import CM_PER_M, NS_PER_S
+from ipsys_log.web.requests import ERROR_HANDLERS, MOST_DIGITS, answer_file, read_json, whole_number
 
 __all__ = ["build_app", "checked_json", "history_json", "scene_json", "views_json"]
 
@@ -148,10 +147,9 @@ def checked_json(checked: EntryCheck) -> dict[str, Any]:
 _FILES = {
     "/": ("measure.html", "text/html"),
     "/measure.css": ("measure.css", "text/css"),
+    "/theme.css": ("theme.css", "text/css"),
     **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("measure", "cameras", "floor", "make")},
 }
-_LARGEST = 16 << 10
-_MOST_DIGITS = 20
 # Number of images that are kept for later requests, after the page got their addresses.
 _KEPT = 30
 
@@ -161,7 +159,7 @@ def build_app(scene: MeasuringScene) -> Starlette:
     questions = _Questions(scene)
     return Starlette(
         routes=[
-            *(Route(path, _file(*names)) for path, names in _FILES.items()),
+            *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
             Route("/picture/{camera}/{time_ns}", questions.picture),
             Route("/api/scene", questions.scene),
             Route("/api/views", questions.views),
@@ -169,37 +167,8 @@ def build_app(scene: MeasuringScene) -> Starlette:
             Route("/api/measure", questions.measure, methods=["POST"]),
             Route("/api/undo", questions.undo, methods=["POST"]),
         ],
-        exception_handlers={
-            IpsysError: _handle_refusal,
-            ClientDisconnect: _handle_disconnect,
-            Exception: _handle_failure,
-        },
+        exception_handlers=ERROR_HANDLERS,
     )
-
-
-def _file(name: str, kind: str) -> Any:
-    content = files("ipsys_log.web").joinpath(name).read_bytes()
-
-    async def answer(_: Request) -> Response:
-        return Response(content, media_type=kind)
-
-    return answer
-
-
-async def _handle_refusal(_: Request, error: Exception) -> Response:
-    return JSONResponse({"error": str(error)}, 400)
-
-
-async def _handle_disconnect(_: Request, __: Exception) -> Response:
-    return Response(status_code=400)  # the client has disconnected
-
-
-async def _handle_failure(_: Request, error: Exception) -> Response:
-    text = (
-        f"internal error of ipsys: {type(error).__name__}: {error}; the terminal shows "
-        "it when the command ends"
-    )
-    return JSONResponse({"error": text}, 500)
 
 
 class _Questions:
@@ -222,11 +191,11 @@ class _Questions:
                 self._pictures[view.camera, view.time_ns] = view.jpeg
         while len(self._pictures) > max(_KEPT, 2 * len(views)):
             del self._pictures[next(iter(self._pictures))]
-        marker_id = _whole_number(request.query_params.get("marker", ""))
+        marker_id = whole_number(request.query_params.get("marker", ""))
         return JSONResponse(views_json(self._scene, views, marker_id))
 
     async def picture(self, request: Request) -> Response:
-        time_ns = _whole_number(request.path_params["time_ns"])
+        time_ns = whole_number(request.path_params["time_ns"])
         jpeg = None if time_ns is None else self._pictures.get((request.path_params["camera"], time_ns))
         if jpeg is None:
             return Response(status_code=404)
@@ -234,11 +203,11 @@ class _Questions:
         return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})
 
     async def check(self, request: Request) -> Response:
-        return JSONResponse(checked_json(self._checked(await _body(request))))
+        return JSONResponse(checked_json(self._checked(await read_json(request))))
 
     async def measure(self, request: Request) -> Response:
         """Append the measurement if it has no faults, and the user has accepted all its warnings."""
-        body = await _body(request)
+        body = await read_json(request)
         checked = self._checked(body)
         accepted = body.get("accepted", [])
         if checked.measurement is None or not set(checked.warnings) <= set(map(str, accepted)):
@@ -247,7 +216,7 @@ class _Questions:
         return JSONResponse({"saved": checked.id, "history": history_json(self._scene)})
 
     async def undo(self, request: Request) -> Response:
-        name = str((await _body(request)).get("id", ""))
+        name = str((await read_json(request)).get("id", ""))
         self._scene.add([withdrawal_of(self._scene.history(), name)])
         return JSONResponse({"withdrawn": name, "history": history_json(self._scene)})
 
@@ -267,28 +236,7 @@ class _Questions:
     def _stop(self, given: Any) -> int | None:
         if not self._scene.intervals:
             return None
-        number = _whole_number(str(given))
+        number = whole_number(str(given))
         if number is None or number >= len(self._scene.intervals):
-            raise IpsysError(f"there is no stationary interval {str(given)[:_MOST_DIGITS]} in this log")
+            raise IpsysError(f"there is no stationary interval {str(given)[:MOST_DIGITS]} in this log")
         return number
-
-
-def _whole_number(text: str) -> int | None:
-    """Return the number in a request; None for other values, and for too many digits."""
-    return int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else None
-
-
-async def _body(request: Request) -> dict[str, Any]:
-    data = b""
-    async for part in request.stream():
-        data += part
-        if len(data) > _LARGEST:
-            raise IpsysError("the request is too large")
-    try:
-        body = json.loads(data)
-        json.dumps(body, ensure_ascii=False).encode()  # raises for half of a surrogate pair
-    except (ValueError, RecursionError) as error:
-        raise IpsysError("the request is not JSON") from error
-    if not isinstance(body, dict):
-        raise IpsysError("the request is not a JSON object")
-    return body

@@ -108,7 +108,12 @@ class _Connection(H11Protocol):
         super().__init__(config, state, {})
         self._owner, self._request_s = owner, request_s
         self._timer: asyncio.TimerHandle | None = None
-        self.is_answered = False
+        self._is_answered = False
+
+    @property
+    def is_answered(self) -> bool:
+        """True if the guard has accepted a request: an answer is complete, or a long one has begun."""
+        return self._is_answered or getattr(self.cycle, "response_started", False)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -116,7 +121,7 @@ class _Connection(H11Protocol):
         self._owner.add(self, self.client[0] if self.client else "")
 
     def on_response_complete(self) -> None:
-        self.is_answered = True
+        self._is_answered = True
         self._restart_timer()
         super().on_response_complete()
 

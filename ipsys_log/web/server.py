@@ -1,4 +1,4 @@
-"""The server of the measuring page in a separate thread, and its unexpected exceptions."""
+"""The server of a page in a separate thread, and its unexpected exceptions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ipsys_log.web.access import Guard
 from ipsys_log.web.app import build_app
 from ipsys_log.web.connections import Connections, PageLimits, derive_limits
 
-__all__ = ["PageServer", "ServerExceptions", "check_port_free", "qr_code", "serve"]
+__all__ = ["PageServer", "ServerExceptions", "check_port_free", "qr_code", "serve", "serve_app"]
 
 
 class ServerExceptions:
@@ -65,6 +65,7 @@ _LOOPBACK = "127.0.0.1"
 _STEP_S = 0.02
 _TURN_S = 0.1
 _BACKLOG = 128
+_TOKEN_BYTES = 12
 # A browser also sends cookies of other programs on this machine, up to 4 kB each.
 _MAX_HEADER_BYTES = 64 << 10
 # The server prints nothing, because the recorder uses the terminal. ServerExceptions stores the exceptions.
@@ -78,11 +79,16 @@ _SILENT: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class PageServer:
-    """A running server of the page: its address (with the token if needed), its thread and its exceptions."""
+    """A running server of a page.
+
+    It has its address (with the token if needed), its thread and its exceptions. ``view_url`` is the address
+    for devices that may only read; None if the page has no secret for them.
+    """
 
     url: str
     thread: Thread
     exceptions: ServerExceptions
+    view_url: str | None = None
 
     def wait(self, stopped: Callable[[], bool]) -> None:
         """Wait until the server ends, or until `stopped` is true."""
@@ -94,27 +100,55 @@ class PageServer:
 def serve(
     scene: MeasuringScene, host: str | None = None, port: int = 8000, limits: PageLimits | None = None
 ) -> Iterator[PageServer]:
-    """Serve the page of a scene until the end of the with-block.
+    """Serve the measuring page of a scene until the end of the with-block.
 
     Parameters
     ----------
     scene : a finished log or live cameras.
+    host, port, limits : as for :func:`serve_app`.
+
+    Raises
+    ------
+    IpsysError
+        The errors of :func:`serve_app`.
+    """
+    with serve_app(build_app(scene), host, port, limits) as page:
+        yield page
+
+
+@contextmanager
+def serve_app(
+    app: ASGIApp,
+    host: str | None = None,
+    port: int = 8000,
+    limits: PageLimits | None = None,
+    has_viewers: bool = False,
+    option: str = "--port",
+) -> Iterator[PageServer]:
+    """Serve a page until the end of the with-block.
+
+    Parameters
+    ----------
+    app : the page, without a guard.
     host : address to listen on. None: the page is only for this machine, and needs no token.
     port : port to listen on; 0 means any free port.
     limits : limits of connections. None: the limits of :func:`derive_limits`.
+    has_viewers : a page with a host has a second address, for devices that may only read.
+    option : the option of the port, in errors.
 
     Raises
     ------
     IpsysError
         The port is in use or not allowed, the host is not this machine, or the server does not start.
     """
-    token = None if host is None else secrets.token_urlsafe(12)
-    with _listen(host or _LOOPBACK, port) as listening:
+    token = None if host is None else secrets.token_urlsafe(_TOKEN_BYTES)
+    view_token = secrets.token_urlsafe(_TOKEN_BYTES) if has_viewers and token is not None else None
+    with _listen(host or _LOOPBACK, port, option) as listening:
         names = {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
         names |= {host.lower()} if host else set()
         exceptions = ServerExceptions()
         config = uvicorn.Config(
-            exceptions.watch_app(Guard(build_app(scene), frozenset(names), token)),
+            exceptions.watch_app(Guard(app, frozenset(names), token, view_token)),
             log_config=_SILENT, access_log=False, lifespan="off", ws="none", http="h11", loop="asyncio",
             server_header=False, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
         )  # fmt: skip
@@ -126,8 +160,10 @@ def serve(
             thread.join(_STEP_S)
         if not server.started:
             raise IpsysError(f"the page cannot be served: {exceptions.first.splitlines()[-1]}")
+        own_port = listening.getsockname()[1]
+        view_url = None if view_token is None else _url(host, own_port, view_token)
         try:
-            yield PageServer(_url(host, listening.getsockname()[1], token), thread, exceptions)
+            yield PageServer(_url(host, own_port, token), thread, exceptions, view_url)
         finally:
             server.should_exit = True
             thread.join()
@@ -159,18 +195,18 @@ async def _serve(
             connections.abort()
 
 
-def check_port_free(host: str | None, port: int) -> None:
-    """Check that a page can be served at an address and a port.
+def check_port_free(host: str | None, port: int, option: str = "--port") -> None:
+    """Check that a page can be served at an address and a port; ``option`` names the port in errors.
 
     Raises
     ------
     IpsysError
         The errors of :func:`serve`.
     """
-    _listen(host or _LOOPBACK, port).close()
+    _listen(host or _LOOPBACK, port, option).close()
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int, option: str) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
@@ -179,12 +215,12 @@ def _listen(host: str, port: int) -> socket.socket:
             f"--host {host}: is not an address of this machine; use 0.0.0.0 for all its addresses"
         ) from error
     except OverflowError as error:
-        raise IpsysError(f"--port {port}: is not a port; give one from 1024 to 65535") from error
+        raise IpsysError(f"{option} {port}: is not a port; give one from 1024 to 65535") from error
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise IpsysError(f"--port {port}: is in use by another program; give another port") from error
+            raise IpsysError(f"{option} {port}: is in use by another program; give another port") from error
         if error.errno == errno.EACCES:
-            raise IpsysError(f"--port {port}: is not allowed; give one from 1024 to 65535") from error
+            raise IpsysError(f"{option} {port}: is not allowed; give one from 1024 to 65535") from error
         raise IpsysError(
             f"--host {host}: the server cannot listen on this address: {error.strerror}"
         ) from error

@@ -116,6 +116,11 @@ class FoxgloveStream:
         """The number of clients."""
         return len(self._clients)
 
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
+        return self._drops.count
+
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the messages until they end."""
         for message in messages:

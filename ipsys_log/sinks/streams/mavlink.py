@@ -107,6 +107,11 @@ class MavlinkStream:
             return f"{self.name}: only this machine"
         return f"{self.name}: sent into the network from {self._local}, not encrypted"
 
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
+        return self._drops.count
+
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the poses of the messages until they end."""
         for message in messages:

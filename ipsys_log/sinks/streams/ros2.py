@@ -92,6 +92,11 @@ class Ros2Stream:
             return f"{name}: only this machine"
         return f"{name}: every computer that reaches {self._host} can read the positions"
 
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
+        return self._drops.count
+
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Publish the poses of the messages until they end."""
         for message in messages:

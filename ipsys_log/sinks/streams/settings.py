@@ -27,7 +27,11 @@ _SECRET_BYTES = 12
 
 
 class Stream(SelectiveSink, Protocol):
-    """A sink with open sockets."""
+    """A sink with open sockets; one with connections also has a ``client_count``."""
+
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
 
     def describe(self) -> str:
         """Return one line about the receivers of the positions."""

@@ -134,6 +134,11 @@ class UdpStream:
             return f"{self.name}{signed}: every computer of this network can read the positions"
         return f"{self.name}{signed}: sent into the network from {self._local}, not encrypted"
 
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
+        return self._drops.count
+
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the poses of the messages until they end."""
         for message in messages:

@@ -86,6 +86,11 @@ class VrpnStream:
         """The number of clients that receive positions."""
         return sum(client.is_greeted for client in self._clients)
 
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
+        return self._drops.count
+
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the poses of the messages until they end."""
         for message in messages:

@@ -1,0 +1,125 @@
+"""The app of the dashboard: its files, its data, its pictures, and the actions of the operator."""
+
+from __future__ import annotations
+
+import asyncio
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.web.access import MAY_WRITE
+from ipsys_log.web.dashboard.feed import Feed
+from ipsys_log.web.dashboard.operator import Operator
+from ipsys_log.web.dashboard.pictures import shrink
+from ipsys_log.web.dashboard.state import Dashboard
+from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json, whole_number
+
+__all__ = ["build_dashboard"]
+
+_OWN = "ipsys_log.web.dashboard"
+_SCRIPTS = ("dashboard", "map", "tiles", "panels", "operate")
+_FILES = {
+    "/": ("dashboard.html", "text/html", _OWN),
+    "/dashboard.css": ("dashboard.css", "text/css", _OWN),
+    "/theme.css": ("theme.css", "text/css"),
+    "/make.js": ("make.js", "text/javascript"),
+    **{f"/{name}.js": (f"{name}.js", "text/javascript", _OWN) for name in _SCRIPTS},
+}
+# Encoded pictures for later requests of other pages.
+_KEPT = 30
+
+
+def build_dashboard(dashboard: Dashboard) -> Starlette:
+    """Return the page of a recording, without a guard.
+
+    The guard says which device may write; a request without its word is one of the operator.
+    """
+    answers = _Answers(dashboard)
+    return Starlette(
+        routes=[
+            *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
+            Route("/picture/{camera}/{time_ns}", answers.picture),
+            Route("/api/scene", answers.scene),
+            Route("/api/live", answers.live),
+            Route("/api/operate", answers.operate, methods=["POST"]),
+            Route("/api/mark", answers.mark, methods=["POST"]),
+            Route("/api/segment", answers.segment, methods=["POST"]),
+        ],
+        exception_handlers=ERROR_HANDLERS,
+    )
+
+
+class _Answers:
+    """The handlers of the requests; all run in the thread of the server."""
+
+    def __init__(self, dashboard: Dashboard) -> None:
+        self._dashboard, self._feed = dashboard, Feed(dashboard)
+        self._pictures: dict[tuple[str, int], bytes | None] = {}
+
+    async def scene(self, request: Request) -> Response:
+        return JSONResponse(self._dashboard.scene(request.scope.get(MAY_WRITE, True)))
+
+    async def live(self, _: Request) -> Response:
+        events = self._feed.stream(asyncio.get_running_loop().time, asyncio.sleep)
+        return StreamingResponse(events, media_type="text/event-stream")
+
+    async def picture(self, request: Request) -> Response:
+        camera, time_ns = request.path_params["camera"], whole_number(request.path_params["time_ns"])
+        if time_ns is None:
+            return Response(status_code=404)
+        jpeg = self._encoded(camera, time_ns)
+        if jpeg is None:
+            return Response(status_code=204)  # a slow page asks for a picture that is not kept any more
+        # The address always means the same image.
+        return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})
+
+    async def operate(self, request: Request) -> Response:
+        """Claim the operation for a device, or release it."""
+        body = await read_json(request)
+        operator = self._operator()
+        if "release" in body:
+            operator.release(_number(body["release"]))
+            return JSONResponse({})
+        return JSONResponse({"operator": operator.claim(body.get("take_over") is True)})
+
+    async def mark(self, request: Request) -> Response:
+        body = await read_json(request)
+        self._operator().mark(_number(body.get("operator")), str(body.get("text", "")))
+        return JSONResponse({})
+
+    async def segment(self, request: Request) -> Response:
+        """Start a segment by its name, or end the present one."""
+        body = await read_json(request)
+        operator, number = self._operator(), _number(body.get("operator"))
+        if "start" in body:
+            operator.start_segment(number, str(body["start"]))
+        else:
+            operator.end_segment(number)
+        return JSONResponse({})
+
+    def _operator(self) -> Operator:
+        if self._dashboard.operator is None:
+            raise IpsysError("this page only shows a log; nothing is recorded")
+        return self._dashboard.operator
+
+    def _encoded(self, camera: str, time_ns: int) -> bytes | None:
+        """Return the JPEG of a tile, encoded at the first request; None if it is damaged or too old."""
+        key = camera, time_ns
+        if key not in self._pictures:
+            frame = self._dashboard.frame(camera, time_ns)
+            if frame is None:
+                return None
+            try:
+                self._pictures[key] = shrink(frame)
+            except FrameError:
+                self._pictures[key] = None
+            while len(self._pictures) > _KEPT:
+                del self._pictures[next(iter(self._pictures))]
+        return self._pictures[key]
+
+
+def _number(value: object) -> int:
+    return value if isinstance(value, int) and not isinstance(value, bool) else 0

@@ -1,0 +1,84 @@
+// The dashboard. It shows the events of the server; only the server decides what a device may do.
+import { FloorMap } from "./map.js";
+import { Operation } from "./operate.js";
+import { showRobots, showStatus } from "./panels.js";
+import { showTiles } from "./tiles.js";
+
+const $ = (id) => document.getElementById(id);
+// Without data for this time, the page says so.
+const QUIET_MS = 3000;
+let map, operation, source, heard = 0, end = null;
+
+function show(kind, text) {
+  const chip = $("state");
+  if (chip.textContent === text) return;
+  chip.textContent = text;
+  chip.className = `chip ${kind}`;
+}
+
+function judge() {
+  const quiet = performance.now() - heard;
+  if (end === "ended") show("", "recording ended");
+  else if (end === "failed") show("bad", "display failed: see the terminal");
+  else if (heard && quiet < QUIET_MS) show("good", "live");
+  else if (heard) show("bad", `no data for ${Math.round(quiet / 1000)} s`);
+}
+
+function listen(name, handle) {
+  source.addEventListener(name, (message) => {
+    heard = performance.now();
+    handle(JSON.parse(message.data));
+  });
+}
+
+function connect() {
+  source = new EventSource("api/live");
+  let waiting = null;
+  listen("robots", (data) => {
+    // Several updates may arrive before the browser draws.
+    if (waiting === null) requestAnimationFrame(() => { map.move(waiting); showRobots(waiting); waiting = null; });
+    waiting = data;
+  });
+  listen("tiles", showTiles);
+  listen("status", (data) => {
+    end = data.end;
+    showStatus(data);
+    operation.show(data);
+    judge();
+    if (end) source.close();
+  });
+  // A refused stream is not tried again by the browser.
+  source.addEventListener("error", () => {
+    if (source.readyState === EventSource.CLOSED && !end) setTimeout(reconnect, QUIET_MS);
+  });
+}
+
+function reconnect() {
+  if (!document.hidden && !end && (!source || source.readyState === EventSource.CLOSED)) connect();
+}
+
+async function begin() {
+  let answer;
+  try {
+    answer = await fetch("api/scene");
+    if (!answer.ok) throw new Error(await answer.text());
+  } catch (error) {
+    show("bad", error instanceof TypeError ? "ipsys does not answer" : error.message);
+    setTimeout(begin, QUIET_MS);
+    return;
+  }
+  const scene = await answer.json();
+  $("lab").textContent = scene.floor.lab;
+  map = new FloorMap($("floor"), $("legend"), $("growth"), scene);
+  operation = new Operation(scene.may_operate);
+  reconnect();
+  setInterval(judge, 500);
+}
+
+// A page that nobody sees needs no data, and a browser opens only six connections to a server.
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden) source?.close();
+  else if (map) reconnect();
+});
+
+begin();

@@ -1,0 +1,88 @@
+// The tables beside the map.
+import { make } from "./make.js";
+
+const $ = (id) => document.getElementById(id);
+const ROBOTS_MS = 250;
+let robotsShown = -Infinity;
+
+// Replace the content only if it changed, so that selected text and the focus stay.
+function fill(where, key, parts) {
+  const text = JSON.stringify(key);
+  if (where.dataset.content === text) return;
+  where.dataset.content = text;
+  where.replaceChildren(...parts());
+}
+
+function table(where, headings, rows, empty) {
+  fill(where, [headings, rows], () => rows.length
+    ? [make("thead", {}, make("tr", {}, ...headings.map((text) => make("th", { scope: "col" }, text)))),
+      make("tbody", {}, ...rows.map(([name, ...cells]) => make("tr", {}, make("th", { scope: "row" }, name),
+        ...cells.map((cell) => (Array.isArray(cell) ? make("td", { className: cell[1] }, cell[0]) : make("td", {}, cell))))))]
+    : [make("caption", {}, empty)]);
+}
+
+export function showRobots(data) {
+  if (performance.now() - robotsShown < ROBOTS_MS) return;
+  robotsShown = performance.now();
+  const rows = data.robots.filter((robot) => robot.colour).sort((a, b) => a.id - b.id).map((robot) => {
+    const unseen = Math.max(data.now - robot.seen, 0);
+    return [`${robot.id} ${robot.name}`, robot.x.toFixed(2), robot.y.toFixed(2),
+      robot.heading === undefined ? "–" : `${Math.round((robot.heading * 180) / Math.PI)}°`,
+      robot.ellipse ? (robot.ellipse[0] * 1000).toFixed(0) : "–",
+      unseen > 1000 ? [`${Math.round(unseen / 1000)} s ago`, "bad"] : robot.outside ? ["outside", "warn"] : robot.cameras.join(", ") || "predicted"];
+  });
+  table($("robots"), ["robot", "x / m", "y / m", "heading", "± / mm", "seen by"], rows, "No robot is seen yet.");
+}
+
+export function showStatus(data) {
+  showCameras(data.cameras);
+  showRecording(data);
+  showEvents(data.events);
+  table($("latency"), ["step", "median", "99 %"], data.latency.map((row) => [row.step, `${row.median_ms.toFixed(1)} ms`, `${row.p99_ms.toFixed(1)} ms`]),
+    "No position is published yet.");
+  const lines = data.overlap.length ? data.overlap : ["No robot is in the view of two cameras yet."];
+  fill($("overlap"), lines, () => lines.map((line) => make("li", {}, line)));
+  $("streams-panel").hidden = !data.streams.length;
+  table($("streams"), ["stream", "clients", "dropped"], data.streams.map((row) => [row.name, String(row.clients ?? "–"), count(row.dropped)]), "");
+}
+
+const count = (number) => (number ? [String(number), "bad"] : String(number ?? "–"));
+
+function showCameras(cameras) {
+  const rows = cameras.map((camera) => [camera.name,
+    camera.state !== "up" ? [camera.state, camera.state === "lost" ? "bad" : ""] : camera.rate_hz === undefined ? "–" : `${camera.rate_hz.toFixed(1)} Hz`,
+    count(camera.dropped),
+    camera.skipped ? [String(camera.skipped), "warn"] : "0", camera.delay_ms === undefined ? "–" : `${camera.delay_ms.toFixed(0)} ms`,
+    camera.age_ms === undefined ? "–" : [`${(camera.age_ms / 1000).toFixed(1)} s`, camera.age_ms > 2000 && camera.state !== "ended" ? "bad" : ""]]);
+  table($("cameras"), ["camera", "rate", "dropped", "skipped", "delay", "age"], rows, "There are no cameras.");
+  const texts = cameras.flatMap((camera) => camera.warnings.map((text) => `${camera.name}: ${text}`));
+  fill($("warnings"), texts, () => texts.map((text) => make("li", {}, text)));
+}
+
+const UNITS = ["B", "kB", "MB", "GB", "TB"];
+function size(bytes) {
+  let unit = 0;
+  while (bytes >= 1000 && unit < UNITS.length - 1) { bytes /= 1000; unit += 1; }
+  return `${unit ? bytes.toFixed(1) : bytes} ${UNITS[unit]}`;
+}
+
+function duration(seconds) {
+  const whole = Math.floor(seconds), two = (value) => String(value).padStart(2, "0");
+  return `${Math.floor(whole / 3600)}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
+}
+
+function showRecording({ recording, segment }) {
+  const rows = [["log", recording.file], ["duration", duration(recording.seconds)]];
+  if (recording.bytes !== undefined) rows.push(["size", size(recording.bytes)], ["disk left", size(recording.free_bytes)]);
+  if (recording.left_s !== undefined) rows.push(["enough for", recording.left_s > 360000 ? "more than 100 hours" : duration(recording.left_s)]);
+  if (segment) rows.push(["segment", `${segment.name}, ${duration(segment.seconds)}`]);
+  fill($("recording"), [rows, recording.is_short], () => rows.flatMap(([name, value]) => [make("dt", {}, name),
+    make("dd", { className: recording.is_short && name === "enough for" ? "bad" : "" }, value)]));
+}
+
+function showEvents(events) {
+  fill($("events"), events, () => events.length ? events.map((event) => make("li", { className: event.severity },
+    make("time", { dateTime: new Date(event.time).toISOString() }, new Date(event.time).toLocaleTimeString("en-GB")),
+    make("b", {}, event.severity), make("span", {}, event.text, event.count > 1 ? make("em", {}, ` ×${event.count}`) : "")))
+    : [make("li", { className: "none" }, "No events yet.")]);
+}

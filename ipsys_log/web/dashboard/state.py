@@ -1,0 +1,204 @@
+"""The sink of the dashboard: it keeps the newest state of a recording, and gives it as JSON."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.analysis.overlap_stream import OverlapSummary
+from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.live_check import FrameCheck
+from ipsys_log.log.contents import run_of_topic
+from ipsys_log.messages import (
+    CameraCalibration,
+    CompressedImage,
+    CompressedVideo,
+    Event,
+    Latency,
+    Markers,
+    Message,
+    Model,
+    Positions,
+    RawImage,
+    Rig,
+    Tracks,
+)
+from ipsys_log.sinks.sink import Sink
+from ipsys_log.units import NS_PER_S
+from ipsys_log.web.dashboard.events import RecentEvents
+from ipsys_log.web.dashboard.floor import describe_floor
+from ipsys_log.web.dashboard.operator import Operator
+from ipsys_log.web.dashboard.pictures import Pictures
+from ipsys_log.web.dashboard.robots import Robots
+from ipsys_log.web.dashboard.status import (
+    CameraStatus,
+    describe_latencies,
+    describe_recording,
+    describe_streams,
+)
+
+__all__ = ["Dashboard", "LiveSetting"]
+
+_NS_PER_MS = 1_000_000
+# Number of the last positions whose latencies count.
+_LATENCIES = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSetting:
+    """The parts of a live recording that the dashboard shows.
+
+    Attributes
+    ----------
+    rig, lenses, model : the lab, the intrinsics by camera, and the fitted model.
+    run : the run of the shown tracks.
+    states, checks : states and last checks of the cameras, by name.
+    log : the log that is written.
+    now_ns : the clock of the log times.
+    streams : the streams of positions.
+    """
+
+    rig: Rig
+    lenses: Mapping[str, CameraCalibration]
+    model: Model | None
+    run: str
+    states: Mapping[str, CameraState]
+    checks: Mapping[str, FrameCheck]
+    log: Path
+    now_ns: Callable[[], int]
+    streams: Sequence[Sink] = ()
+
+
+class Dashboard:
+    """A :class:`~ipsys_log.sinks.sink.Sink` that keeps the newest state of a recording.
+
+    The thread of the sink changes the state, and the thread of the page reads it.
+
+    Parameters
+    ----------
+    setting : the recording.
+    operator : its segment and its number are a part of the state; None: the page cannot operate.
+
+    Attributes
+    ----------
+    end : None as long as messages come, then ``ended``, or ``failed`` after an error of this sink.
+
+    Raises
+    ------
+    IpsysError
+        The model or the intrinsics of a camera are not valid.
+    """
+
+    name = "the dashboard"
+    payloads: tuple[type, ...] = (
+        *(CompressedImage, CompressedVideo, RawImage, Markers, Positions, Tracks),
+        *(Event, Latency, Rig),
+    )
+
+    def __init__(self, setting: LiveSetting, operator: Operator | None = None) -> None:
+        self.end: str | None = None
+        self.operator = operator
+        self._setting, self._begin_ns = setting, setting.now_ns()
+        self._floor = describe_floor(setting.rig, setting.model, setting.lenses)
+        self._robots = Robots(setting.rig, self._begin_ns)
+        self._events = RecentEvents()
+        self._pictures = Pictures(setting.states)
+        self._cameras = CameraStatus(setting.states, setting.checks, setting.now_ns)
+        self._latencies: deque[Latency] = deque(maxlen=_LATENCIES)
+        self._overlap = OverlapSummary()
+        self._computed: tuple[int, dict[str, Any]] | None = None
+        self._lock = threading.Lock()
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        """Keep the state of the messages until they end."""
+        try:
+            for message in messages:
+                if message is not None:
+                    with self._lock:
+                        self._add(message)
+            self.end = "ended"
+        finally:
+            self.end = self.end or "failed"
+
+    def scene(self, may_operate: bool) -> dict[str, Any]:
+        """Return the constant content of a page, and the trails so far."""
+        with self._lock:
+            return {
+                "floor": self._floor,
+                "trails": self._robots.trails(),
+                "may_operate": may_operate and self.operator is not None,
+            }
+
+    def robots(self) -> dict[str, Any]:
+        """Return the newest poses; ``now`` is the time of the page in ms."""
+        now_ns = self._setting.now_ns()
+        with self._lock:
+            return {"now": (now_ns - self._begin_ns) // _NS_PER_MS, "robots": self._robots.rows(now_ns)}
+
+    def tiles(self) -> dict[str, Any]:
+        """Return the newest picture of each camera, with its markers."""
+        with self._lock:
+            return {"cameras": self._pictures.rows()}
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of cameras, recording, streams and operator, the latencies and the events."""
+        now_ns = self._setting.now_ns()
+        with self._lock:
+            events, skipped = self._events.newest_first(), dict(self._events.skipped)
+            last_ns = dict(self._pictures.last_ns)
+        return {
+            "now": (now_ns - self._begin_ns) // _NS_PER_MS,
+            "end": self.end,
+            "cameras": self._cameras.rows(last_ns, skipped),
+            "recording": describe_recording(self._setting.log, now_ns - self._begin_ns),
+            "streams": describe_streams(self._setting.streams),
+            **self._statistics(now_ns),
+            "events": events,
+            **self._operation(now_ns),
+        }
+
+    def versions(self) -> tuple[int, int, tuple[int, int, str | None]]:
+        """Return the versions of robots, tiles, and of the urgent part of the status."""
+        operated = 0 if self.operator is None else self.operator.version
+        return self._robots.version, self._pictures.version, (self._events.version, operated, self.end)
+
+    def frame(self, camera: str, time_ns: int) -> CompressedImage | CompressedVideo | RawImage | None:
+        """Return the frame of a tile; None if it is too old, or never existed."""
+        with self._lock:
+            return self._pictures.frame(camera, time_ns)
+
+    def _add(self, message: Message) -> None:
+        payload = message.payload
+        if isinstance(payload, Tracks):
+            if run_of_topic(message.topic) == self._setting.run:
+                self._robots.add(payload)
+        elif isinstance(payload, Event):
+            self._events.add(payload, message.log_time_ns)
+        elif isinstance(payload, Latency):
+            self._latencies.append(payload)
+        elif isinstance(payload, (Positions, Rig)):
+            self._overlap(message)
+        else:
+            self._pictures.add(message)
+
+    def _statistics(self, now_ns: int) -> dict[str, Any]:
+        """Return latencies and disagreement of cameras, computed at most once per second."""
+        if self._computed is None or now_ns - self._computed[0] >= NS_PER_S:
+            with self._lock:
+                latencies, overlap = list(self._latencies), self._overlap.lines()
+            self._computed = now_ns, {"latency": describe_latencies(latencies), "overlap": overlap}
+        return self._computed[1]
+
+    def _operation(self, now_ns: int) -> dict[str, Any]:
+        if self.operator is None:
+            return {}
+        operation: dict[str, Any] = {"operator": self.operator.number}
+        segment = self.operator.segment
+        if segment is not None:
+            seconds = (now_ns - segment.start_ns) // NS_PER_S
+            operation["segment"] = {"name": segment.name, "seconds": seconds}
+        return operation

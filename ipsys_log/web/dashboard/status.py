@@ -1,0 +1,128 @@
+"""The state of cameras, recording and streams, and the durations of the steps, as JSON."""
+
+from __future__ import annotations
+
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.analysis.latency import latency_percentiles, step_times_s
+from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.disk import DiskRoom
+from ipsys_log.capture.live_check import FrameCheck
+from ipsys_log.messages import Latency
+from ipsys_log.sinks.sink import Sink
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["CameraStatus", "describe_latencies", "describe_recording", "describe_streams"]
+
+_NS_PER_MS = 1_000_000
+_MS_PER_S = 1e3
+# The rate of a camera is that of this time.
+_RATE_NS = 3 * NS_PER_S
+# After this time, the measured growth of a log is certain enough.
+_SETTLED_S = 5.0
+
+
+class CameraStatus:
+    """The state of each camera as JSON.
+
+    Parameters
+    ----------
+    states, checks : states and last checks of the cameras, by name; the recorder changes them.
+    now_ns : the clock of the log times.
+    """
+
+    def __init__(
+        self,
+        states: Mapping[str, CameraState],
+        checks: Mapping[str, FrameCheck],
+        now_ns: Callable[[], int],
+    ) -> None:
+        self._states, self._checks, self._now_ns = states, checks, now_ns
+        self._counts: dict[str, deque[tuple[int, int]]] = {name: deque() for name in states}
+
+    def rows(self, last_ns: Mapping[str, int], skipped: Mapping[str, int]) -> list[dict[str, Any]]:
+        """Return a row for each camera; a missing value is a missing key.
+
+        Parameters
+        ----------
+        last_ns : log time of the last frame, by camera.
+        skipped : number of skipped frames, by camera.
+        """
+        now_ns = self._now_ns()
+        return [
+            self._row(name, state, now_ns, last_ns.get(name), skipped.get(name, 0))
+            for name, state in sorted(self._states.items())
+        ]
+
+    def _row(
+        self, name: str, state: CameraState, now_ns: int, last_ns: int | None, skipped: int
+    ) -> dict[str, Any]:
+        row: dict[str, Any] = {
+            "name": name,
+            "state": "ended" if state.finished else "up" if state.up else "lost",
+            "frames": state.frames,
+            "dropped": state.dropped + state.missed,
+            "skipped": skipped,
+            "warnings": list(self._checks[name].warnings) if name in self._checks else [],
+        }
+        rate_hz = self._rate_hz(name, state.frames, now_ns)
+        if rate_hz is not None:
+            row["rate_hz"] = round(rate_hz, 1)
+        if state.delay_s is not None:
+            row["delay_ms"] = round(_MS_PER_S * state.delay_s, 1)
+        if last_ns is not None:
+            row["age_ms"] = max((now_ns - last_ns) // _NS_PER_MS, 0)
+        return row
+
+    def _rate_hz(self, name: str, frames: int, now_ns: int) -> float | None:
+        counts = self._counts[name]
+        counts.append((now_ns, frames))
+        while now_ns - counts[0][0] > _RATE_NS and len(counts) > 2:
+            counts.popleft()
+        took_ns = now_ns - counts[0][0]
+        return None if took_ns <= 0 else (frames - counts[0][1]) * NS_PER_S / took_ns
+
+
+def describe_recording(log: Path, took_ns: int) -> dict[str, Any]:
+    """Return the state of a log that is written since ``took_ns``: its name, its size, and the disk.
+
+    Only the name of the file is given, without its folder.
+    """
+    took_s = took_ns / NS_PER_S
+    recording: dict[str, Any] = {"file": log.name, "seconds": round(took_s, 1)}
+    try:
+        size, free = log.stat().st_size, shutil.disk_usage(log.absolute().parent).free
+    except OSError:
+        return recording  # the file does not exist yet, or the disk has failed, which an event reports
+    recording |= {"bytes": size, "free_bytes": free}
+    room = DiskRoom(log.parent, free, size / took_s if took_s >= _SETTLED_S else 0.0)
+    if room.remaining_s is not None:
+        recording |= {"left_s": round(room.remaining_s), "is_short": room.is_short()}
+    return recording
+
+
+def describe_streams(streams: Iterable[Sink]) -> list[dict[str, Any]]:
+    """Return a row for each stream: its clients if it knows them, and its dropped messages."""
+    rows = []
+    for stream in streams:
+        counts = {"clients": "client_count", "dropped": "dropped_count"}
+        known = {key: getattr(stream, name, None) for key, name in counts.items()}
+        rows.append({"name": stream.name, **{key: n for key, n in known.items() if n is not None}})
+    return rows
+
+
+def describe_latencies(entries: Sequence[Latency]) -> list[dict[str, Any]]:
+    """Return median and 99th percentile of the duration of each step, in ms."""
+    percentiles = latency_percentiles(step_times_s(entries)) if entries else {}
+    return [
+        {
+            "step": step,
+            "median_ms": round(_MS_PER_S * one.median_s, 1),
+            "p99_ms": round(_MS_PER_S * one.p99_s, 1),
+        }
+        for step, one in percentiles.items()
+    ]

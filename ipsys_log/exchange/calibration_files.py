@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration
 
 __all__ = [
@@ -144,7 +145,7 @@ def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: s
 
 def ros_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:  # noqa: ARG001
     """Return a ``camera_info`` YAML; ROS calls the fisheye model ``equidistant``."""
-    model = "equidistant" if lens.distortion_model == "kannala_brandt" else lens.distortion_model
+    model = ROS2_MODELS.get(lens.distortion_model, lens.distortion_model)
     projection = np.column_stack([lens.K, np.zeros(3)])
     lines = [
         *(f"# {line}" for line in comment.splitlines()),

@@ -17,7 +17,7 @@ from ipsys_log.log.bounds import PartCounter
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ROS2_PAYLOADS", "read_ros2"]
+__all__ = ["ROS2_MODELS", "ROS2_PAYLOADS", "read_ros2"]
 
 ROS2_PAYLOADS: dict[str, type] = {
     "sensor_msgs/msg/CameraInfo": CameraCalibration,
@@ -39,8 +39,9 @@ _NESTED = {"Header": "std_msgs", "RegionOfInterest": "sensor_msgs"}
 _PACKAGES = dict.fromkeys(_FIELDS, "sensor_msgs") | _NESTED
 _LONGEST_DEFINITION = 64 << 10  # bytes
 _BYTES_PER_NUMBER = 8
-# Names of lens distortion models that differ from the names of Foxglove.
-_MODELS = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt"}
+# Names of lens distortion models of Foxglove that ROS names differently.
+ROS2_MODELS = {"kannala_brandt": "equidistant"}
+_MODELS = {"fisheye": "kannala_brandt"} | {ros: foxglove for foxglove, ros in ROS2_MODELS.items()}
 
 
 def read_ros2(name: str, data: bytes, definition: bytes, items: PartCounter | None = None) -> Any:

@@ -100,7 +100,7 @@ def _write_data_set(
     from ipsys_log.exchange.coco import write_coco
 
     counts = write_coco(session, str(runs[0]), path, progress)
-    return counts.pictures, f"pictures with {counts.markers} markers"
+    return counts.pictures, f"pictures with {counts.markers} marker{'' if counts.markers == 1 else 's'}"
 
 
 Write = Callable[[Session, Runs, Path, ExportOptions, Progress], tuple[int, str]]

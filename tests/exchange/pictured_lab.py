@@ -32,7 +32,7 @@ STEP_NS = NS_PER_S // 10
 RUN = "lab"
 SIZE = (320, 180)
 # In the order BGR.
-COLOUR = (40, 90, 200)
+COLOUR = (160, 60, 120)
 RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(0, robot="ada", height_m=0.1),), floor=Floor(4.0, 3.0))
 CORNERS = np.array([[100.25, 60.5], [140.0, 61.75], [139.125, 101.0], [99.5, 100.375]])
 

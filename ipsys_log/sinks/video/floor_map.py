@@ -53,7 +53,7 @@ class MapLook:
     ----------
     size_px : width and height.
     font_px : size of the text.
-    colours : by robot.
+    colours : by robot; other robots are not drawn.
     enlarged : factor on the ellipses.
     fade_ns : a robot without a newer pose disappears after this time.
     """
@@ -104,6 +104,8 @@ class FloorMap:
     def add(self, tracks: Tracks, time_ns: int) -> None:
         """Show poses of a log time from now on."""
         for track in tracks.tracks:
+            if track.robot not in self._look.colours or not np.isfinite([track.x_m, track.y_m]).all():
+                continue
             robot = self._robots.setdefault(track.robot, _Robot(track, time_ns))
             robot.track, robot.time_ns = track, time_ns
             # A trail shows the sightings, not predictions.

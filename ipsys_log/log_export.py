@@ -71,7 +71,6 @@ def _write_table(
 def _write_bag(
     session: Session, runs: Runs, path: Path, options: ExportOptions, progress: Progress
 ) -> tuple[int, str]:
-    check_installed("a ROS 2 bag needs", "rosbags")
     from ipsys_log.sinks.ros2_bag import write_bag
 
     robots = () if options.robot is None else (options.robot,)
@@ -85,7 +84,6 @@ def _write_bag(
 def _write_video(
     session: Session, runs: Runs, path: Path, options: ExportOptions, progress: Progress
 ) -> tuple[int, str]:
-    check_installed("a video needs", "matplotlib")
     from ipsys_log.sinks.video.mp4 import write_video
 
     counts = write_video(
@@ -110,13 +108,14 @@ Write = Callable[[Session, Runs, Path, ExportOptions, Progress], tuple[int, str]
 class ExportFormat:
     """A format: the suffix of its files (None: a folder), its channel (None: that of the table), its writer.
 
-    ``text`` names the format in errors.
+    ``text`` names the format in errors, and ``library`` the optional module that it needs.
     """
 
     text: str
     suffix: str | None
     channel: Channel | None
     write: Write
+    library: str | None = None
 
     def check(self, path: Path, options: ExportOptions, runs: Runs) -> None:
         """Check that the options fit the format.
@@ -124,8 +123,10 @@ class ExportFormat:
         Raises
         ------
         IpsysError
-            The format has no tables or robots, or has one run.
+            The format has no tables or robots, or has one run; its library is missing.
         """
+        if self.library is not None:
+            check_installed(f"{self.text} needs", self.library)
         if self.channel is None:
             return
         if options.table != TRACKS.name:
@@ -142,8 +143,8 @@ EXPORT_FORMATS = {
     "parquet": ExportFormat("a Parquet file", ".parquet", None, _write_table),
     "tum": ExportFormat("a TUM trajectory", ".tum", None, _write_table),
     "kitti": ExportFormat("a KITTI trajectory", ".kitti", None, _write_table),
-    "ros2": ExportFormat("a ROS 2 bag", ".mcap", TRACKS, _write_bag),
-    "mp4": ExportFormat("a video", ".mp4", TRACKS, _write_video),
+    "ros2": ExportFormat("a ROS 2 bag", ".mcap", TRACKS, _write_bag, "rosbags"),
+    "mp4": ExportFormat("a video", ".mp4", TRACKS, _write_video, "matplotlib"),
     "coco": ExportFormat("a COCO data set", None, MARKERS, _write_data_set),
 }
 

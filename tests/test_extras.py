@@ -113,6 +113,9 @@ REFUSED = {
     "'ipsys_log[ros2]'",
     "live --foxglove --model-from model.mcap -o x.mcap": "--foxglove needs websockets: pip install "
     "'ipsys_log[foxglove]'",
+    "export lab.mcap -o x.mcap": "a ROS 2 bag needs rosbags: pip install 'ipsys_log[ros2]'",
+    "export lab.mcap -o x.mp4": "a video needs Matplotlib: pip install 'ipsys_log[report]'",
+    "import ros lab.bag -o x.mcap": "import ros needs rosbags: pip install 'ipsys_log[ros2]'",
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",

@@ -18,6 +18,7 @@ from ipsys_log.messages import CompressedImage, RawImage
 
 __all__ = [
     "MAX_PIXELS",
+    "RAW_ENCODINGS",
     "Grey",
     "check_encoded",
     "check_pixel_count",
@@ -120,6 +121,7 @@ _RAW = {
     "rgba8": (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2BGR),
     "bgra8": (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2BGR),
 }
+RAW_ENCODINGS = tuple(_RAW)
 
 
 class _Memory:

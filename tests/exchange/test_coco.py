@@ -89,6 +89,7 @@ def test_frames_of_a_video_become_the_searched_pictures(video_log: Path, tmp_pat
     decoded = [video(frame) for frame in moved.values()]
     for row, expected in zip(data["images"], (decoded[1], decoded[3]), strict=True):
         picture = cv2.imread(str(tmp_path / "coco" / row["file_name"]), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
         assert expected is not None
         rows = np.frombuffer(expected.data, np.uint8).reshape(expected.height, expected.step)
         assert np.array_equal(picture, rows[:, : expected.width])
@@ -99,7 +100,9 @@ def test_raw_pictures_become_png(tmp_path: Path) -> None:
     raw = RawImage(START_NS, "red", 320, 180, "mono8", 320, grey.tobytes())
     log = PicturedLab({0: raw}, {}, frozenset({0})).write(tmp_path / "lab.mcap")
     (row,) = export(log, tmp_path / "coco", run=RUN)["images"]
-    assert np.array_equal(cv2.imread(str(tmp_path / "coco" / row["file_name"]), cv2.IMREAD_UNCHANGED), grey)
+    picture = cv2.imread(str(tmp_path / "coco" / row["file_name"]), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert np.array_equal(picture, grey)
 
 
 def test_markers_of_one_log_find_pictures_of_another(tmp_path: Path) -> None:

@@ -102,6 +102,7 @@ def test_poses_have_the_stored_digits(bag: Path, replayed_log: Path) -> None:
         heading = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_euler("zyx")[0]
         assert heading == pytest.approx(known.heading_rad, abs=1e-12)
         covariance = message.pose.covariance.reshape(6, 6)
+        assert known.covariance_m2 is not None
         assert np.array_equal(covariance[:3, :3], known.covariance_m2)
         expected = UNKNOWN if known.heading_sigma_rad is None else known.heading_sigma_rad**2
         assert covariance[5, 5] == expected

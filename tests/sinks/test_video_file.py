@@ -40,7 +40,9 @@ class Film(NamedTuple):
 def film(path: Path) -> Film:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        pictures = [
+            np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8) for frame in container.decode(stream)
+        ]
         assert stream.duration is not None
         assert stream.time_base is not None
         assert stream.average_rate is not None

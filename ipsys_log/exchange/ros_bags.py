@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,10 +12,7 @@ from typing import Any, NamedTuple
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag1 import ReaderError as Reader1Error
 from rosbags.rosbag2 import Reader as Reader2
-from rosbags.rosbag2 import ReaderError as Reader2Error
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -41,11 +37,6 @@ __all__ = ["BagCameras", "find_bag_cameras", "read_bag"]
 
 _STEP = "bag"
 _Reader = Reader1 | Reader2
-# Errors of the readers for damaged bags.
-_FAULTS = (
-    *(Reader1Error, Reader2Error, SerdeError, struct.error, EOFError),
-    *(ValueError, KeyError, IndexError, TypeError, AssertionError, RuntimeError),
-)
 _IMAGES = (CompressedImage, RawImage)
 # These topics hold depths in a format of their own, though their type is that of images.
 _DEPTHS = "/compressedDepth"
@@ -214,19 +205,22 @@ def _open_bag(path: Path) -> Iterator[_Reader]:
     try:
         yield reader
     finally:
-        reader.close()
+        with _faults(path):
+            reader.close()
 
 
 @contextmanager
 def _faults(path: Path) -> Iterator[None]:
-    """Give the errors of the readers one line; they raise these errors for damaged bags."""
+    """Give the errors of the readers of rosbags one line. The block has only calls of these."""
     try:
         yield
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _FAULTS as error:
+    # The readers and their libraries raise about twenty types of errors, without a common class.
+    except Exception as error:
         raise IpsysError(
-            f"{path}: is no bag that can be read: {error}; repair it with the tools of ROS"
+            f"{path}: is no bag that can be read ({type(error).__name__}: {' '.join(str(error).split())}); "
+            "repair it with the tools of ROS"
         ) from error
 
 

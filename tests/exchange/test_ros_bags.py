@@ -3,97 +3,21 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from rosbags.convert import convert
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, RawImage
 from tests.conftest import Ipsys
 from tests.exchange.pictured_lab import jpeg
+from tests.exchange.ros_rows import NS, STEP, WRITERS, D, K, compressed, info, raw, write_ros1
 from tests.test_foreign_logs import picture
 
-NS = 1_700_000_000_123_456_789
-STEP = 100_000_000
-K = [500.5, 0, 320.25, 0, 510.125, 180, 0, 0, 1]
-D = [0.01, -0.02, 0.003, 1 / 3]
-Row = tuple[str, int, str, dict[str, Any]]
-Write = Callable[[Path, Sequence[Row]], Path]
-
-
-def compressed(number: int, data: bytes, topic: str = "/red/image_raw/compressed", stamp: bool = True) -> Row:
-    values = {"format": "bgr8; jpeg compressed bgr8", "data": np.frombuffer(data, np.uint8)}
-    return topic, (NS + number * STEP) * stamp, "sensor_msgs/msg/CompressedImage", values
-
-
-def raw(number: int, pixels: Any, encoding: str, topic: str = "/white/image_raw") -> Row:
-    height, width, *rest = pixels.shape
-    size = {"height": height, "width": width, "step": width * (rest[0] if rest else 1)}
-    values = {**size, "encoding": encoding, "is_bigendian": 0, "data": pixels.ravel()}
-    return topic, NS + number * STEP, "sensor_msgs/msg/Image", values
-
-
-def info(number: int, k: Sequence[float] = K, topic: str = "/red/camera_info") -> Row:
-    values = {
-        **{"height": 360, "width": 640, "distortion_model": "equidistant"},
-        **{"d": np.array(D), "k": np.array(k, dtype=float), "r": np.eye(3).ravel()},
-        **{"p": np.eye(3, 4).ravel(), "binning_x": 0, "binning_y": 0},
-    }
-    return topic, NS + number * STEP, "sensor_msgs/msg/CameraInfo", values
-
-
-def make(store: Any, kind: str, stamp_ns: int, values: dict[str, Any], is_ros1: bool) -> Any:
-    types = store.types
-    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
-    head = types["std_msgs/msg/Header"](*([7] if is_ros1 else []), stamp, "optical")
-    fields = dict(values)
-    if kind.endswith("CameraInfo"):
-        fields["roi"] = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        if is_ros1:
-            fields |= {name.upper(): fields.pop(name) for name in "dkrp"}
-    return types[kind](header=head, **fields)
-
-
-def write_ros1(folder: Path, rows: Sequence[Row]) -> Path:
-    store, path = get_typestore(Stores.ROS1_NOETIC), folder / "drive.bag"
-    with Writer1(path) as writer:
-        known: dict[str, Any] = {}
-        for number, (topic, stamp_ns, kind, values) in enumerate(rows):
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=store)
-            data = store.serialize_ros1(make(store, kind, stamp_ns, values, True), kind)
-            writer.write(known[topic], NS + number * STEP + 20_000_000, data)
-    return path
-
-
-def write_ros2(folder: Path, rows: Sequence[Row], plugin: StoragePlugin) -> Path:
-    store, path = get_typestore(Stores.ROS2_HUMBLE), folder / "drive"
-    with Writer2(path, version=8, storage_plugin=plugin) as writer:
-        known: dict[str, Any] = {}
-        for number, (topic, stamp_ns, kind, values) in enumerate(rows):
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=store)
-            data = store.serialize_cdr(make(store, kind, stamp_ns, values, False), kind)
-            writer.write(known[topic], NS + number * STEP + 20_000_000, data)
-    return path
-
-
-WRITERS: dict[str, Write] = {
-    "ros1": write_ros1,
-    "sqlite3": lambda folder, rows: write_ros2(folder, rows, StoragePlugin.SQLITE3),
-    "mcap": lambda folder, rows: write_ros2(folder, rows, StoragePlugin.MCAP),
-}
 GREY = np.arange(36 * 64, dtype=np.uint8).reshape(36, 64)
 COLOURS = np.arange(36 * 64 * 3, dtype=np.uint8).reshape(36, 64, 3)
 
@@ -241,22 +165,3 @@ def test_bad_bags_are_refused_in_one_line(tmp_path: Path, ipsys: Ipsys) -> None:
 def test_log_is_refused(lab: Path, tmp_path: Path, ipsys: Ipsys) -> None:
     done = ipsys("import", "ros", shutil.copy(lab, tmp_path / "bag.mcap"), "-o", tmp_path / "log.mcap")
     assert (done.code, "is already a log and needs no import" in done.err) == (1, True)
-
-
-@pytest.mark.parametrize("kind", ["ros1", "sqlite3"])
-def test_damaged_bag_is_read_or_refused(kind: str, tmp_path: Path) -> None:
-    bag = WRITERS[kind](tmp_path, [info(0), compressed(0, jpeg()), raw(1, GREY, "mono8")])
-    file = bag if bag.is_file() else next(bag.glob("*.db3"))
-    data, rng = file.read_bytes(), np.random.default_rng(1)
-    refused = []
-    for _ in range(25):
-        damaged = bytearray(data)
-        for at in rng.integers(0, len(data), 3):
-            damaged[at] = rng.integers(0, 256)
-        file.write_bytes(damaged)
-        try:
-            list(read_bag(bag, find_bag_cameras(bag, {})))
-        except IpsysError as error:
-            refused.append(str(error))
-    assert len(refused) > 5
-    assert not [text for text in refused if "\n" in text]

@@ -110,7 +110,7 @@ class CameraPanel:
         for marker in markers.markers:
             # Points of a log count from the centre of the first pixel, scales from its corner.
             outline = (np.asarray(marker.corners_px) + 0.5) * scale - 0.5 + corner
-            canvas.line(outline, MARKER_COLOUR, 2 if self._font_px > 12 else 1, is_closed=True)
+            canvas.line(outline, MARKER_COLOUR, max(self._font_px // 7, 1), is_closed=True)
             label, size = str(marker.id), self._font_px - 1
             width = text_size(label, size)[0]
             # A label on the marker would hide it.

@@ -55,9 +55,10 @@ class Canvas:
         mask, above = _text_mask(text, size_px)
         left, top = round(at[0]), round(at[1]) - above
         if halo is not None:
-            wide = cv2.copyMakeBorder(mask, 3, 3, 3, 3, cv2.BORDER_CONSTANT, value=0)
-            wide = cv2.dilate(wide, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
-            self._blend(np.asarray(wide, dtype=np.uint8), left - 3, top - 3, halo)
+            rim = max(size_px // 6, 1)
+            wide = cv2.copyMakeBorder(mask, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=0)
+            wide = cv2.dilate(wide, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1,) * 2))
+            self._blend(np.asarray(wide, dtype=np.uint8), left - rim, top - rim, halo)
         self._blend(mask, left, top, colour)
 
     def line(self, points: NDArray[np.float64], colour: RGB, width: int = 1, is_closed: bool = False) -> None:

@@ -86,6 +86,7 @@ class FloorMap:
     def __init__(self, rig: Rig | None, part: MapPart, look: MapLook) -> None:
         self._look, self._robots = look, dict[str, _Robot]()
         (width, height), font_px = look.size_px, look.font_px
+        self._line_px = max(font_px // 7, 1)
         # Room for the numbers of the axes.
         room = np.array([width - 4.6 * font_px, height - 3.2 * font_px])
         low, high = np.array(part.low_m), np.array(part.high_m)
@@ -195,7 +196,7 @@ class FloorMap:
         for n in range(1, len(line)):
             if times_ns[n] - times_ns[n - 1] <= self._look.fade_ns:
                 share = _OLDEST + (1 - _OLDEST) * max(1 - float(ages[n]), 0.0)
-                canvas.line(line[n - 1 : n + 1], _mix(colour, share), 2)
+                canvas.line(line[n - 1 : n + 1], _mix(colour, share), self._line_px)
 
     def _draw_ellipses(self, canvas: Canvas, robots: Mapping[str, _Robot]) -> None:
         outlines = []
@@ -225,14 +226,14 @@ class FloorMap:
             aside = np.array([ahead[1], -ahead[0]])
             length = max(_HEADING_M * self._scale, 2.4 * radius)
             tip = at + length * ahead
-            canvas.line(np.array([at, tip - radius * ahead]), colour, 2)
+            canvas.line(np.array([at, tip - radius * ahead]), colour, self._line_px)
             back = tip - 1.3 * radius * ahead
             canvas.fill(np.array([tip, back + 0.6 * radius * aside, back - 0.6 * radius * aside]), colour)
         if track.coasting_ns is None:
             canvas.disc(at, radius, colour)
         else:
             canvas.disc(at, radius, _FLOOR)
-            canvas.disc(at, radius, colour, 2)
+            canvas.disc(at, radius, colour, self._line_px)
 
     def _draw_name(self, canvas: Canvas, name: str, track: Track) -> None:
         size = self._look.font_px

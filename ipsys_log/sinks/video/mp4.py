@@ -42,7 +42,7 @@ _SILENCE_NS, _SHORTENED_NS = 10 * NS_PER_S, 2 * NS_PER_S
 _RADIUS_SHARE = 0.02
 _SAMPLE = 20_000
 _MARGIN = 0.03
-_LEAST_SIDE_M = 0.5
+_LEAST_SIDE_M, _LEAST_SHAPE = 0.5, 0.6
 _KEYFRAME_S = 2
 _BT709, _LIMITED = 1, 1
 
@@ -171,7 +171,8 @@ def _visible(rig: Rig | None, low: Array, high: Array) -> MapPart:
     elif not np.isfinite(low).all():
         low, high = np.zeros(2), np.ones(2)
     margin = max(_MARGIN * float((high - low).max()), 0.1)
-    short = np.maximum(_LEAST_SIDE_M - (high - low), 0.0) / 2
+    least = max(_LEAST_SIDE_M, _LEAST_SHAPE * float((high - low).max()))
+    short = np.maximum(least - (high - low), 0.0) / 2
     low, high = low - margin - short, high + margin + short
     return MapPart((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, Channel
+from ipsys_log.runs.options import Progress
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.sampled_track import SampledTrack, sample_track, time_in_ns
@@ -74,14 +76,6 @@ class _ChannelRow(NamedTuple):
     run: str | None
     topic: str
     messages: int
-
-
-class Export(NamedTuple):
-    """An exported file: its path, the number of its rows, and their runs."""
-
-    path: Path
-    rows: int
-    runs: tuple[str, ...]
 
 
 class Log:
@@ -191,11 +185,10 @@ class Log:
         IpsysError
             There is no such table or run, or pandas is not installed.
         """
-        from ipsys_log.exchange.data_frames import TABLES, read_table
+        from ipsys_log.exchange.data_frames import read_table
 
-        if name not in TABLES:
-            raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
-        runs = self._runs_of(_channel_named(name), run)
+        wanted = [run] if run is None or isinstance(run, str) else list(run)
+        runs = [self._run_of(channel_of_table(name), one) for one in wanted]
         return read_table(self._session, name, runs, _ns(start), _ns(end))
 
     def export(
@@ -204,36 +197,43 @@ class Log:
         table: str = "tracks",
         run: str | Sequence[str] | None = None,
         robot: str | None = None,
+        *,
+        format: str | None = None,
+        with_images: bool = True,
+        rate_hz: float = 25.0,
+        size_px: tuple[int, int] = (1280, 720),
+        progress: Progress = lambda step, done, total: None,
     ) -> Export:
-        """Write a channel to a file for other programs; the suffix of the file is its format.
+        """Write a channel, or the whole log, to a file for other programs.
 
         Parameters
         ----------
-        path : ``.csv`` or ``.parquet`` for the table; ``.tum`` or ``.kitti`` for the trajectory of a robot.
-        table, run : as for :meth:`table`; a trajectory has one run.
-        robot : only this robot, in a table of tracks.
+        path : ``.csv`` or ``.parquet`` for the table; ``.tum`` or ``.kitti`` for the trajectory of a robot;
+            ``.mcap`` for a ROS 2 bag; ``.mp4`` for a video; a new folder for a COCO data set.
+        table, run : as for :meth:`table`; only a table may have several runs.
+        robot : only this robot.
+        format : ``csv``, ``parquet``, ``tum``, ``kitti``, ``ros2``, ``mp4`` or ``coco``; None: by the suffix.
+        with_images : put the images into a bag.
+        rate_hz, size_px : frames per second, and width and height, of a video.
+        progress : called with the step, the number of messages done, and the number of all messages.
 
         Raises
         ------
         IpsysError
             There is no such format, table, run or robot; a library is missing; the file is one of the
-            logs.
+            logs; the log has no images for a video or a data set.
         """
-        from ipsys_log.exchange.data_frames import TABLES
-        from ipsys_log.exchange.export import export_file
-
         file = Path(path)
         if any(file.exists() and file.samefile(log) for log in self.paths):
             raise IpsysError(f"{file}: this is the log itself; name another file")
-        if table not in TABLES:
-            raise IpsysError(f"table {table!r} is not known; use one of {', '.join(TABLES)}")
-        runs = self._runs_of(_channel_named(table), run)
-        rows = export_file(self._session, table, runs, file, robot)
-        return Export(file, rows, tuple(name for name in runs if name is not None))
-
-    def _runs_of(self, channel: Channel, run: str | Sequence[str] | None) -> list[str | None]:
+        found = find_format(file, format)
+        options = ExportOptions(table, robot, with_images, rate_hz, size_px)
         wanted = [run] if run is None or isinstance(run, str) else list(run)
-        return [self._run_of(channel, name) for name in wanted]
+        found.check(file, options, wanted)
+        channel = found.channel or channel_of_table(table)
+        runs = [self._run_of(channel, name) for name in wanted]
+        rows, content = found.write(self._session, runs, file, options, progress)
+        return Export(file, rows, tuple(name for name in runs if name is not None), content)
 
     def track_at(self, robot: str, times: Any, run: str | None = None) -> SampledTrack:
         """Return the poses of a robot at any times, with covariances, from its track.
@@ -276,7 +276,8 @@ class Log:
                 name for name in sorted(self._session.run_names()) if self._session.topics(channel, name)
             ]
             which = f"run {run} has no {channel.name}" if run else f"no run has {channel.name}"
-            raise IpsysError(f"{self._session}: {which} (it is in: {', '.join(known) or 'none'})")
+            advice = f"; compute them: ipsys replay {self.paths[-1]}" if not known else ""
+            raise IpsysError(f"{self._session}: {which} (it is in: {', '.join(known) or 'none'}){advice}")
         return name
 
 

@@ -34,7 +34,7 @@ LAYERS = (
     ("tracker",),
     ("player",),
     ("closed_loop",),
-    ("sampled_track",),
+    ("log_export", "sampled_track"),
     ("opened_log",),
     ("api",),
     ("report",),

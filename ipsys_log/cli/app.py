@@ -151,6 +151,9 @@ ipsys export monday.mcap -o tracks.csv
 ipsys export monday.mcap -o tracks.parquet --run poly --run best
 ipsys export monday.mcap -o robot.tum --robot robot_0    # for evo
 ipsys export monday.mcap -o truth.tum --robot robot_0 --table truth
+ipsys export monday.mcap -o bag.mcap --format ros2       # with images
+ipsys export monday.mcap -o view.mp4 --size 1920x1080
+ipsys export monday.mcap -o markers --format coco        # a new folder
 """,
     "stream": """
 ipsys stream monday.mcap --udp 127.0.0.1:9870 --rate 2

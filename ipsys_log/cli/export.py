@@ -1,4 +1,4 @@
-"""Export of positions and other channels: ``ipsys export``."""
+"""Export of positions, images and other channels: ``ipsys export``."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from typing import Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.console import console
+from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import ReadLogs
 
 __all__ = ["add_commands"]
+
+_COUNTED = ("bag", "video", "pictures")
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -25,9 +27,18 @@ def export(
             "--output",
             "-o",
             metavar="FILE",
-            help="The file to write: .csv or .parquet for a table, .tum or .kitti for a trajectory.",
+            help="The file to write: .csv or .parquet for a table, .tum or .kitti for a trajectory, "
+            ".mcap for a ROS 2 bag, .mp4 for a video; a new folder for --format coco.",
         ),
     ],
+    format_: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
+        ),
+    ] = None,
     table: Annotated[
         str,
         typer.Option(
@@ -45,17 +56,40 @@ def export(
         Optional[str],  # noqa: UP045
         typer.Option(metavar="NAME", help="Export only this robot."),
     ] = None,
+    without_images: Annotated[
+        bool, typer.Option("--without-images", help="Leave the images out of a ROS 2 bag.")
+    ] = False,
+    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames per second of a video.")] = 25.0,
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a video in pixels, two even numbers.")
+    ] = "1280x720",
 ) -> None:
-    """Export positions or another channel to a file for other programs: one row for each robot and instant.
+    """Export positions, images or another channel to a file for other programs.
 
-    Units are in the names of the columns. Times are in UTC."""
+    A table has one row for each robot and instant; units are in the names of the columns, times are in UTC. A
+    ROS 2 bag has images, intrinsics, poses, odometry and transforms. A video shows the cameras with their
+    markers, and the robots on the floor. A COCO data set has the pictures and the corners of their markers.
+    """
     from ipsys_log import api
+    from ipsys_log.log_export import find_format, parse_size
     from ipsys_log.report.files import check_file
 
-    check_file(output, "-o", logs)
-    with api.open(*logs) as log:
-        exported = log.export(output, table, run, robot)
+    wanted = find_format(output, format_)
+    if wanted.suffix is not None:
+        check_file(output, "-o", logs)
+    with api.open(*logs) as log, progress_bar(_COUNTED) as progress:
+        exported = log.export(
+            output,
+            table,
+            run,
+            robot,
+            format=format_,
+            with_images=not without_images,
+            rate_hz=frame_rate,
+            size_px=parse_size(size),
+            progress=progress,
+        )
     console.print(
-        f"{output} written: {exported.rows} rows of {table}"
+        f"{output} written: {exported.rows} {exported.content}"
         + (f", run {' and '.join(exported.runs)}" if exported.runs else "")
     )

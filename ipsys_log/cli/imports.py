@@ -1,4 +1,4 @@
-"""Import of other data into a log: ``ipsys import imsel``, ``images``, ``videos`` and ``truth``."""
+"""Import of other data into a log: ``ipsys import imsel``, ``images``, ``videos``, ``ros`` and ``truth``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, log_option
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def add_commands(app: typer.Typer) -> None:
     group.command("imsel")(imsel)
     group.command("images")(images)
     group.command("videos")(videos)
+    group.command("ros")(ros)
     group.command("truth")(truth)
     app.add_typer(group, name="import")
 
@@ -108,6 +109,44 @@ def videos(
     counts = write_log(output, read_videos(paths, lab, lenses, parse_start(start), remarks.print))
     text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
     console.print(f"{output} written: frames: {text}")
+
+
+def ros(
+    bag: Annotated[
+        Path,
+        typer.Argument(metavar="BAG", help="A bag of ROS 1 (.bag) or ROS 2 (a folder or a .db3 file)."),
+    ],
+    output: NewLog,
+    camera: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            metavar="NAME=TOPIC",
+            help="Import the images of this topic as the camera NAME; repeat it for each camera. "
+            "Default: all topics with images.",
+        ),
+    ] = None,
+    rig: RigFile = None,
+    calibration: Calibrations = None,
+) -> None:
+    """Import the images and intrinsics of a ROS bag. The times are the stamps of the images.
+
+    Images are CompressedImage, or Image with mono8, bgr8, rgb8 or an alpha channel; their bytes stay as they
+    are. The other commands read MCAP bags of ROS 2 without an import."""
+    from ipsys_log.cli.options import load_calibrations, load_matching_rig
+    from ipsys_log.extras import check_installed
+    from ipsys_log.runs.output import write_log
+
+    check_installed("import ros needs", "rosbags")
+    from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
+
+    _refuse_log(bag)
+    cameras = find_bag_cameras(bag, _topic_of(camera or []))
+    lenses = load_calibrations(calibration, lambda: cameras.images)
+    lab = load_matching_rig(rig, lambda: cameras.images)
+    with progress_bar(("bag",)) as progress:
+        counts = write_log(output, read_bag(bag, cameras, lab, lenses, progress))
+    text = ", ".join(f"{counts.get(f'/cameras/{name}/image', 0)} of {name}" for name in cameras.images)
+    console.print(f"{output} written: images: {text}")
 
 
 def truth(
@@ -210,15 +249,25 @@ def _refuse_log(path: Path) -> None:
 
 
 def _by_camera(files: list[str]) -> dict[str, Path]:
+    named = _split_names(files, "video", "camera=file.mp4")
+    return {camera: Path(name) for camera, name in named.items()}
+
+
+def _topic_of(options: list[str]) -> dict[str, str]:
+    return _split_names(options, "topic", "--camera red=/red/image_raw")
+
+
+def _split_names(options: list[str], kind: str, example: str) -> dict[str, str]:
+    """Return the texts after the equals signs of options such as ``red=red.mp4``, by camera."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import check_name
 
-    paths: dict[str, Path] = {}
-    for option in files:
-        camera, equals, name = option.partition("=")
+    named: dict[str, str] = {}
+    for option in options:
+        camera, equals, text = option.partition("=")
         if not equals:
-            raise IpsysError(f"{option}: has no camera name; write camera=file.mp4")
-        if check_name(camera, f"{option}: camera name") in paths:
-            raise IpsysError(f"{option}: camera {camera!r} has two videos; give one")
-        paths[camera] = Path(name)
-    return paths
+            raise IpsysError(f"{option}: has no camera name; write {example}")
+        if check_name(camera, f"{option}: camera name") in named:
+            raise IpsysError(f"{option}: camera {camera!r} has two {kind}s; give one")
+        named[camera] = text
+    return named

@@ -102,7 +102,7 @@ Calibrations = Annotated[
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
-        help="Use these camera intrinsics: a YAML file of OpenCV or ROS, or a log "
+        help="Use these camera intrinsics: a YAML file of OpenCV, ROS or Kalibr, or a log "
         "with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.kalibr_files import find_cameras, read_camchain
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration
 
 __all__ = [
@@ -144,7 +146,7 @@ def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: s
 
 def ros_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:  # noqa: ARG001
     """Return a ``camera_info`` YAML; ROS calls the fisheye model ``equidistant``."""
-    model = "equidistant" if lens.distortion_model == "kannala_brandt" else lens.distortion_model
+    model = ROS2_MODELS.get(lens.distortion_model, lens.distortion_model)
     projection = np.column_stack([lens.K, np.zeros(3)])
     lines = [
         *(f"# {line}" for line in comment.splitlines()),
@@ -214,7 +216,7 @@ def _row(values: Iterable[float]) -> str:
 
 
 def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
-    """Read the intrinsics of a camera from a YAML file of OpenCV or ROS, or from a log (``.mcap``).
+    """Read the intrinsics of a camera from a YAML file of OpenCV, ROS or Kalibr, or from a log (``.mcap``).
 
     From a log, the newest calibration of the camera is read. If the log holds the calibration of a single
     camera, this camera may have another name.
@@ -225,7 +227,8 @@ def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
         The file does not exist, cannot be read, or holds no calibration of this camera.
     """
     if path.suffix != ".mcap":
-        return read_opencv_calibration(path, camera)
+        read = read_camchain if find_cameras(path) else read_opencv_calibration
+        return read(path, camera)
     with Session([path]) as log:
         topics = log.calibrations
         name = next(iter(topics)) if len(topics) == 1 else camera

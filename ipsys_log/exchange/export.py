@@ -40,6 +40,7 @@ def export_file(
 
     Parameters
     ----------
+    path : of the new file; its suffix is one of ``FORMATS`` or ``TRAJECTORIES``.
     name : one of :data:`~ipsys_log.exchange.data_frames.TABLES`.
     runs : the runs to read, or one None for a recorded channel.
     robot : only this robot.
@@ -47,7 +48,7 @@ def export_file(
     Raises
     ------
     IpsysError
-        The suffix is not that of a format, the table does not fit it, or a library is missing.
+        The table does not fit the format, or a library is missing.
     """
     check_installed("export needs", "pandas")
     suffix = path.suffix.lower()
@@ -59,11 +60,6 @@ def export_file(
         if len(runs) > 1:
             raise IpsysError(f"{path}: a trajectory has one run; choose one")
         return export_trajectory(session, name, runs[0], path, robot)
-    if suffix not in FORMATS:
-        raise IpsysError(
-            f"{path}: the format is not known; use a name that ends in {' or '.join(FORMATS)} for a table, "
-            f"or {' or '.join(TRAJECTORIES)} for a trajectory"
-        )
     if suffix == ".parquet":
         check_installed("Parquet files need", "pyarrow")
     return export_table(session, name, runs, path, robot)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["cross", "left_jacobians", "level_turns", "rotate", "skew_matrices"]
+__all__ = ["cross", "left_jacobians", "level_turns", "quaternion", "rotate", "skew_matrices"]
 
 Array = NDArray[np.float64]
 
@@ -18,6 +18,15 @@ def rotate(vectors_rad: Array) -> Array:
     if not len(vectors_rad):
         return np.zeros((0, 3, 3))
     return np.asarray(Rotation.from_rotvec(vectors_rad).as_matrix(), dtype=np.float64)
+
+
+def quaternion(rotation: Array) -> tuple[float, float, float, float]:
+    """Return the quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
+    # Late: most commands rotate nothing, and scipy takes long to load.
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    return x, y, z, w
 
 
 def level_turns(headings_rad: Array) -> Array:

@@ -18,9 +18,11 @@ from ipsys_log.messages import CompressedImage, RawImage
 
 __all__ = [
     "MAX_PIXELS",
+    "RAW_ENCODINGS",
     "Grey",
     "check_encoded",
     "check_pixel_count",
+    "decode_colour",
     "decode_grey",
     "decode_rows",
     "frame_size",
@@ -109,15 +111,17 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 Grey = NDArray[np.uint8]
 
-_RAW_TO_GREY = {
-    "mono8": (1, None),
-    "8UC1": (1, None),
-    "rgb8": (3, cv2.COLOR_RGB2GRAY),
-    "bgr8": (3, cv2.COLOR_BGR2GRAY),
-    "8UC3": (3, cv2.COLOR_BGR2GRAY),
-    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
-    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+# The channels of a raw image, and its conversions to grey and to BGR.
+_RAW = {
+    "mono8": (1, None, cv2.COLOR_GRAY2BGR),
+    "8UC1": (1, None, cv2.COLOR_GRAY2BGR),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY, cv2.COLOR_RGB2BGR),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY, None),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY, None),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2BGR),
 }
+RAW_ENCODINGS = tuple(_RAW)
 
 
 class _Memory:
@@ -187,8 +191,13 @@ def decode_grey(frame: CompressedImage | RawImage) -> Grey:
     check_encoded(frame.data)
     if frame.data[:2] == b"\xff\xd8":
         return _decode_jpeg(frame.data)
+    return _decode_other(frame, cv2.IMREAD_GRAYSCALE)
+
+
+def _decode_other(frame: CompressedImage, mode: int) -> NDArray[np.uint8]:
+    """Decode an image that is no JPEG."""
     try:
-        decoded = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        decoded = cv2.imdecode(np.frombuffer(frame.data, np.uint8), mode)
     except cv2.error:  # OpenCV asserts on empty data
         decoded = None
     if decoded is None:
@@ -233,17 +242,52 @@ def levels_at(grey: Grey, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDA
 
 
 def _raw_grey(frame: RawImage) -> Grey:
-    if frame.encoding not in _RAW_TO_GREY:
-        known = ", ".join(_RAW_TO_GREY)
+    pixels = _raw_pixels(frame)
+    conversion = _RAW[frame.encoding][1]
+    if conversion is None:
+        return np.ascontiguousarray(pixels[..., 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+
+
+def _raw_pixels(frame: RawImage) -> NDArray[np.uint8]:
+    """Return the pixels (height, width, channels) of a raw image."""
+    if frame.encoding not in _RAW:
+        known = ", ".join(_RAW)
         raise FrameError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
-    channels, conversion = _RAW_TO_GREY[frame.encoding]
+    channels = _RAW[frame.encoding][0]
     rows = np.frombuffer(frame.data, np.uint8)
     step = frame.step or frame.width * channels  # some writers omit the step
     too_few = step < frame.width * channels or rows.size < step * frame.height
     if too_few or min(frame.width, frame.height) < 1:
         raise FrameError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
     rows = rows[: step * frame.height].reshape(frame.height, step)
-    pixels = rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)
-    if conversion is None:
-        return np.ascontiguousarray(pixels[..., 0])
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+    return rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)
+
+
+def decode_colour(frame: CompressedImage | RawImage, least_px: tuple[int, int] = (0, 0)) -> NDArray[np.uint8]:
+    """Decode the colours of a frame for a drawing, (height, width, 3), in the order BGR.
+
+    Parameters
+    ----------
+    least_px : width and height that suffice; a JPEG may then be decoded at a part of its size.
+
+    Raises
+    ------
+    FrameError
+        The data is no image.
+    """
+    if isinstance(frame, RawImage):
+        pixels, conversion = np.ascontiguousarray(_raw_pixels(frame)), _RAW[frame.encoding][2]
+        return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), dtype=np.uint8)
+    check_encoded(frame.data)
+    if frame.data[:2] == b"\xff\xd8":
+        width, height = least_px
+        try:
+            return np.asarray(
+                simplejpeg.decode_jpeg(
+                    frame.data, colorspace="BGR", min_width=width, min_height=height, strict=False
+                )
+            )
+        except ValueError as error:
+            raise FrameError(str(error)) from error
+    return np.asarray(_decode_other(frame, cv2.IMREAD_COLOR), dtype=np.uint8)

@@ -124,6 +124,7 @@ class Video:
     Parameters
     ----------
     format : ``h264`` or ``h265``.
+    with_colours : return images in colour (``bgr8``) instead of grey (``mono8``).
 
     Raises
     ------
@@ -131,16 +132,18 @@ class Video:
         The format is another one.
     """
 
-    def __init__(self, format: str) -> None:
+    def __init__(self, format: str, with_colours: bool = False) -> None:
         if format not in VIDEO_FORMATS:
             raise FrameError(f"video format {format!r} is not read (only {', '.join(VIDEO_FORMATS)})")
         self._decoder = _open(VIDEO_FORMATS[format])
         self._begun = self._keyed = False
         self._fault: str | None = None
+        # The name of the pixels in FFmpeg, and in a raw image.
+        self._pixels = ("bgr24", "bgr8") if with_colours else ("gray", "mono8")
         self._misses = FrameGapDetector() if format == "h264" else lambda data: False
 
     def __call__(self, frame: CompressedVideo) -> RawImage | None:
-        """Return the grey image of a message; None before the first keyframe.
+        """Return the image of a message; None before the first keyframe.
 
         Raises
         ------
@@ -151,9 +154,11 @@ class Video:
         image = self._decode(frame)
         if image is None:
             return None
-        plane = image.reformat(format="gray").planes[0]
+        plane = image.reformat(format=self._pixels[0]).planes[0]
         size = image.width, image.height
-        return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
+        return RawImage(
+            frame.timestamp, frame.frame_id, *size, self._pixels[1], plane.line_size, bytes(plane)
+        )
 
     def skip(self, frame: CompressedVideo) -> None:
         """Decode a message only because later messages need it; ignore damage."""

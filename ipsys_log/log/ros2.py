@@ -17,7 +17,7 @@ from ipsys_log.log.bounds import PartCounter
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ROS2_PAYLOADS", "read_ros2"]
+__all__ = ["ROS2_MODELS", "ROS2_PAYLOADS", "convert_ros", "read_ros2"]
 
 ROS2_PAYLOADS: dict[str, type] = {
     "sensor_msgs/msg/CameraInfo": CameraCalibration,
@@ -39,8 +39,9 @@ _NESTED = {"Header": "std_msgs", "RegionOfInterest": "sensor_msgs"}
 _PACKAGES = dict.fromkeys(_FIELDS, "sensor_msgs") | _NESTED
 _LONGEST_DEFINITION = 64 << 10  # bytes
 _BYTES_PER_NUMBER = 8
-# Names of lens distortion models that differ from the names of Foxglove.
-_MODELS = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt"}
+# Names of lens distortion models of Foxglove that ROS names differently.
+ROS2_MODELS = {"kannala_brandt": "equidistant"}
+_MODELS = {"fisheye": "kannala_brandt"} | {ros: foxglove for foxglove, ros in ROS2_MODELS.items()}
 
 
 def read_ros2(name: str, data: bytes, definition: bytes, items: PartCounter | None = None) -> Any:
@@ -67,11 +68,15 @@ def read_ros2(name: str, data: bytes, definition: bytes, items: PartCounter | No
     if items is not None and ROS2_PAYLOADS[name] is CameraCalibration:
         items.take(len(data) // _BYTES_PER_NUMBER)
     try:
-        message = decoder(data)
-        return _READ[name](message, _time_ns(message.header.stamp))
+        return convert_ros(name, decoder(data))
     # The decoder checks nothing. Invalid bytes raise one of these errors, such as struct.error.
     except (struct.error, ValueError, TypeError, IndexError, AttributeError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
+
+
+def convert_ros(name: str, message: Any) -> Any:
+    """Return the payload of a decoded message with the field names of ROS 2."""
+    return _READ[name](message, _time_ns(message.header.stamp))
 
 
 @cache

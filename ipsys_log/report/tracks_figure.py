@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
+from ipsys_log.geometry.ellipses import covariance_ellipse, enlargement
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Track
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS
@@ -27,8 +28,6 @@ Array = NDArray[np.float64]
 _STEP_M, _GAP_NS = 0.5, 200_000_000
 # One region is drawn after this way. Regions are enlarged, so that a usual one has about this radius.
 _EVERY_M, _RADIUS_M = 0.25, 0.06
-_SIGMAS_95 = float(np.sqrt(-2 * np.log(0.05)))
-_ENLARGED = (1, 2, 5, 10, 20, 50, 100)
 _DPI = 100
 
 
@@ -83,9 +82,7 @@ def _covariances(tracks: Sequence[Track]) -> Array:
 def draw_tracks(axes: Axes, tracks: dict[str, DrawnTrack]) -> int:
     """Draw tracks, their enlarged regions of 95 % and their hand-overs; return the enlargement."""
     regions = np.concatenate([track.regions[1] for track in tracks.values()] or [np.empty((0, 2, 2))])
-    radius_m = _SIGMAS_95 * np.sqrt(np.median(regions[:, [0, 1], [0, 1]])) if len(regions) else _RADIUS_M
-    larger = [factor for factor in _ENLARGED if factor * radius_m <= _RADIUS_M]
-    enlarged = larger[-1] if larger else 1
+    enlarged = enlargement(regions, _RADIUS_M)
     for number, (robot, track) in enumerate(tracks.items()):
         colour = robot_colour(number)
         axes.plot(*track.line_m.T, robot_line(number), color=colour, lw=1.2, label=shorten(robot))
@@ -100,12 +97,11 @@ def draw_tracks(axes: Axes, tracks: dict[str, DrawnTrack]) -> int:
 
 
 def _ellipse(centre_m: Array, covariance_m2: Array, enlarged: int, colour: str) -> Ellipse:
-    variances, directions = np.linalg.eigh(covariance_m2)
-    width_m, height_m = 2 * enlarged * _SIGMAS_95 * np.sqrt(np.maximum(variances[::-1], 0.0))
-    angle_deg = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
+    major_m, minor_m, angle_rad = covariance_ellipse(covariance_m2)
+    size_m = 2 * enlarged * major_m, 2 * enlarged * minor_m
     return Ellipse(
-        (float(centre_m[0]), float(centre_m[1])), width_m, height_m, angle=angle_deg, lw=0.6, ec=colour,
-        fc=colour, alpha=0.35,
+        (float(centre_m[0]), float(centre_m[1])), *size_m, angle=float(np.degrees(angle_rad)), lw=0.6,
+        ec=colour, fc=colour, alpha=0.35,
     )  # fmt: skip
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from ipsys_log.errors import IpsysError
@@ -14,6 +19,7 @@ from ipsys_log.exchange.calibration_files import (
     check_format,
     kalibr_yaml,
     opencv_yaml,
+    read_intrinsics,
     read_opencv_calibration,
     ros_yaml,
 )
@@ -58,6 +64,112 @@ def test_kalibr(model: str, name: str) -> None:
     assert camera["distortion_coeffs"] == list(COEFFICIENTS[model][:4])
     assert camera["intrinsics"] == [1151.6 / 3, 1148.8, 932.9, 504.3]
     assert camera["resolution"] == [1920, 1080]
+
+
+POSITIVE = st.floats(1e-3, 1e6)
+
+
+@given(
+    st.lists(POSITIVE, min_size=4, max_size=4),
+    st.lists(st.floats(-1e3, 1e3), min_size=4, max_size=4),
+    st.sampled_from([("kannala_brandt", 0), ("plumb_bob", 1)]),
+    st.tuples(st.integers(1, 65_535), st.integers(1, 65_535)),
+)
+def test_written_camchain_reads_back_exactly(
+    intrinsics: list[float], coefficients: list[float], model: tuple[str, int], size: tuple[int, int]
+) -> None:
+    fx, fy, cx, cy = intrinsics
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    known = CameraCalibration(0, "red", *size, model[0], np.array(coefficients + [0.0] * model[1]), K)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "camchain.yaml")
+        path.write_text(kalibr_yaml(known, {}, "comment"))
+        found = read_intrinsics(path, "red")
+    assert same_intrinsics(found, known)
+    assert (found.width, found.height, found.frame_id) == (*size, "red")
+
+
+def camchain(**changes: Any) -> dict[str, Any]:
+    """Return a file of two cameras, as Kalibr writes them."""
+    first = {
+        "cam_overlaps": [1],
+        "camera_model": "pinhole",
+        "distortion_coeffs": [0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 2e-4],
+        "distortion_model": "equidistant",
+        "intrinsics": [190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504],
+        "resolution": [512, 480],
+        "rostopic": "/cam0/image_raw",
+    }
+    pose = [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    second = {"T_cn_cnm1": pose, **first, "rostopic": "/lab/red/image_raw/compressed"}
+    second |= {"distortion_model": "radtan", "intrinsics": [500.0, 501.0, 320.0, 240.0], **changes}
+    # Without copies, YAML has references between the cameras.
+    return copy.deepcopy({"cam0": first}) | copy.deepcopy({"cam1": second})
+
+
+@pytest.mark.parametrize("is_flow", [True, False, None])
+def test_camchain_of_several_cameras_is_read_by_topic(is_flow: bool | None, tmp_path: Path) -> None:
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = is_flow if is_flow is not True else None
+    yaml.width = 60
+    path = tmp_path / "camchain.yaml"
+    with path.open("w") as file:
+        yaml.dump(camchain(), file)
+    second, first = read_intrinsics(path, "lab_red"), read_intrinsics(path, "cam0")
+    assert (second.distortion_model, second.K[1, 1], second.D.size) == ("plumb_bob", 501.0, 5)
+    assert (first.distortion_model, first.D.size, first.width, first.height) == (
+        "kannala_brandt",
+        4,
+        512,
+        480,
+    )
+    assert first.D.tolist() == camchain()["cam0"]["distortion_coeffs"]
+    assert first.K[0, 2] == 254.93170605935475
+
+
+@pytest.mark.parametrize(
+    ("camera", "changes", "said"),
+    [
+        ("white", {}, r"has the cameras cam0 \(cam0\), cam1 \(lab_red\), but not one white"),
+        ("cam1", {"camera_model": "omni"}, "cam1: the model omni-radtan is not read; calibrate with"),
+        ("cam1", {"distortion_model": "fov"}, "cam1: the model pinhole-fov is not read"),
+        ("cam1", {"intrinsics": [1.0, 2.0, 3.0]}, "cam1: needs 4 intrinsics"),
+        ("cam1", {"intrinsics": ["a", 2.0, 3.0, 4.0]}, "cam1: intrinsics is not a list of numbers"),
+        ("cam1", {"intrinsics": ["nan", 2.0, 3.0, 4.0]}, "cam1: its matrix or coefficients"),
+        ("cam1", {"resolution": [640, 1e9]}, "cam1: the resolution must be two numbers of pixels"),
+        ("cam1", {"resolution": [640, "nan"]}, "cam1: the resolution must be"),
+    ],
+)
+def test_bad_camchain_is_refused(camera: str, changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    with path.open("w") as file:
+        YAML(typ="safe", pure=True).dump(camchain(**changes), file)
+    with pytest.raises(IpsysError, match=said):
+        read_intrinsics(path, camera)
+
+
+_PIECES = [
+    "intrinsics:",
+    " resolution: [1,2]",
+    "\n",
+    " ",
+    "cam1:",
+    "[",
+    "]",
+    "- 1.0",
+    "\t",
+    "rostopic: /a",
+    "'",
+]
+
+
+@given(st.lists(st.sampled_from(_PIECES) | st.text(max_size=5), max_size=60))
+def test_any_camchain_is_read_or_refused(pieces: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "camchain.yaml")
+        path.write_text("cam0:\n camera_model: pinhole\n distortion_model: radtan\n" + "".join(pieces))
+        with pytest.raises(IpsysError):
+            read_intrinsics(path, "red")
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,10 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.rig.file import rig_toml
+from tests.exchange.ros_rows import WRITERS, compressed, info, raw
 from tests.log.bombs import Attack, message
 
-__all__ = ["RIG", "lens_files", "logs", "mat", "payloads", "pictures", "rig_files", "sheets"]
+__all__ = ["RIG", "bags", "lens_files", "logs", "mat", "payloads", "pictures", "rig_files", "sheets"]
 
 RIG = Rig(
     "lab",
@@ -158,6 +159,16 @@ def lens_files() -> tuple[tuple[str, bytes], ...]:
     storage.write("image_width", 64)
     texts.append((".json", storage.releaseAndGetString()))
     return tuple((kind, text.encode()) for kind, text in texts)
+
+
+@cache
+def bags() -> tuple[tuple[str, bytes], ...]:
+    """Return bags of ROS 1 and ROS 2 with an image and intrinsics, by suffix."""
+    k = [500.0, 0, 32, 0, 500, 24, 0, 0, 1]
+    rows = [info(0, k), compressed(1, b"\xff\xd8 a picture"), raw(2, np.zeros((4, 6), np.uint8), "mono8")]
+    with TemporaryDirectory() as folder:
+        paths = [WRITERS["ros1"](Path(folder), rows), *WRITERS["sqlite3"](Path(folder), rows).glob("*.db3")]
+        return tuple((path.suffix, path.read_bytes()) for path in paths)
 
 
 @cache

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 
 from ipsys_log.calibration import images as calibration_pictures
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.calibration_files import read_opencv_calibration
+from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.exchange.image_folders import find_times
 from ipsys_log.exchange.imsel import read_mat
+from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
 from ipsys_log.images.decode import decode_grey, decode_rows
 from ipsys_log.images.video import Video
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
@@ -110,7 +111,7 @@ def read_rig(data: bytes) -> None:
 def read_lens(given: tuple[str, bytes]) -> None:
     kind, data = given
     with file(data, f"lens{kind}") as path:
-        read_opencv_calibration(path, "red")
+        read_intrinsics(path, "red")
 
 
 def read_measurements(data: bytes) -> None:
@@ -126,6 +127,13 @@ def read_times(data: bytes) -> None:
 def read_tables(data: bytes) -> None:
     with file(data, "a.mat") as path:
         read_mat(path)
+
+
+def read_ros_bag(given: tuple[str, bytes]) -> None:
+    kind, data = given
+    with file(data, f"drive{kind}") as path:
+        for _ in read_bag(path, find_bag_cameras(path, {})):
+            pass
 
 
 def decode_picture(data: bytes) -> None:
@@ -223,10 +231,9 @@ def _payload_bytes() -> st.SearchStrategy[tuple[str, str, bytes]]:
     )
 
 
-def _lens_bytes() -> st.SearchStrategy[tuple[str, bytes]]:
-    return st.sampled_from(seeds.lens_files()).flatmap(
-        lambda one: st.tuples(st.just(one[0]), damaged([one[1]]))
-    )
+def _files(wholes: Sequence[tuple[str, bytes]]) -> st.SearchStrategy[tuple[str, bytes]]:
+    """Return files with their suffixes, damaged."""
+    return st.sampled_from(wholes).flatmap(lambda one: st.tuples(st.just(one[0]), damaged([one[1]])))
 
 
 def _video_bytes() -> st.SearchStrategy[tuple[str, list[bytes]]]:
@@ -242,10 +249,11 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "repair": lambda: (damaged(seeds.logs()), repair_log),
     "codec": lambda: (_payload_bytes(), decode_payload),
     "rig": lambda: (damaged(seeds.rig_files()), read_rig),
-    "lens": lambda: (_lens_bytes(), read_lens),
+    "lens": lambda: (_files(seeds.lens_files()), read_lens),
     "sheet": lambda: (damaged(seeds.sheets()), read_measurements),
     "times": lambda: (damaged([b"file,time\nred/1.jpg,1700000000.5\nred/2.jpg,1700000001\n"]), read_times),
     "mat": lambda: (damaged(seeds.mat()), read_tables),
+    "bag": lambda: (_files(seeds.bags()), read_ros_bag),
     "picture": lambda: (damaged(seeds.pictures()), decode_picture),
     "video": lambda: (_video_bytes(), decode_video),
     "page": lambda: (_REQUEST, ask_page),

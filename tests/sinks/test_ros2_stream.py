@@ -18,10 +18,10 @@ import zenoh
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.sinks.streams import ros2_messages
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Qos, attachment, gid, topic_key
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
+from ipsys_log.sinks.streams.ros2_types import type_hash
 from ipsys_log.units import NS_PER_S
 from tests.sinks.open_sockets import exposed
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
@@ -84,7 +84,7 @@ def stamp_ns(header: Any) -> int:
 
 @pytest.mark.parametrize("ros_type", HASHES)
 def test_type_hashes_are_those_of_ros(ros_type: str) -> None:
-    assert ros2_messages.type_hash(ros_type) == HASHES[ros_type]
+    assert type_hash(ros_type) == HASHES[ros_type]
 
 
 def test_keys_and_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:

@@ -17,6 +17,7 @@ from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
+from ipsys_log.sinks.streams.ros2_types import is_stampable, type_hash
 
 __all__ = ["Ros2Stream"]
 
@@ -125,12 +126,13 @@ class Ros2Stream:
             self._publishers(robot)
         if heights_m:
             self._floors = self._declare("/tf_static", ros2.TF, Qos(1, is_latched=True))
-            self._put(self._floors, ros2.encode_floors(heights_m, self._now_ns()))
+            self._put(self._floors, ros2.encode_static(heights_m, self._now_ns()))
 
     def _declare(self, topic: str, ros_type: str, qos: Qos | None = None) -> Publisher:
         self._number += 1
-        type_hash = ros2.type_hash(ros_type)
-        return Publisher(self._session, self._entity, self._number, topic, ros_type, type_hash, qos or Qos())
+        return Publisher(
+            self._session, self._entity, self._number, topic, ros_type, type_hash(ros_type), qos or Qos()
+        )
 
     def _publishers(self, robot: str) -> tuple[Publisher, Publisher]:
         """Return the publishers of a robot: pose, and odometry."""
@@ -148,7 +150,7 @@ class Ros2Stream:
         sent = [
             (pose, pose.track.heading_rad)
             for pose in poses
-            if pose.is_good and pose.track.heading_rad is not None and ros2.is_stampable(pose.time_ns)
+            if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
         ]
         if sent:
             self._put(self._transforms, ros2.encode_transforms(sent))
@@ -166,7 +168,7 @@ class Ros2Stream:
 
     def _send_clock(self) -> None:
         now_ns = self._now_ns()
-        if self._times is not None and ros2.is_stampable(now_ns):
+        if self._times is not None and is_stampable(now_ns):
             self._put(self._times, ros2.encode_clock(now_ns))
 
     def _tick(self) -> None:
@@ -176,7 +178,7 @@ class Ros2Stream:
             self._send_clock()
             number = (number + 1) % _TICKS_PER_DIAGNOSIS
             now_ns = self._now_ns()
-            if number == 0 and ros2.is_stampable(now_ns):
+            if number == 0 and is_stampable(now_ns):
                 newest = dict(self._newest)
                 text = ros2.encode_diagnostics(newest, self._poses.session, now_ns, self._poses.stale_s)
                 self._put(self._diagnostics, text)

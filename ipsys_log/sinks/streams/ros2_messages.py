@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from math import cos, sin, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
+from ipsys_log.geometry.rotations import quaternion
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
+from ipsys_log.sinks.streams.ros2_types import encode, make, make_header, make_time, message_class
 from ipsys_log.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from ipsys_log.analysis.floor_cameras import FloorCamera
 
 __all__ = [
     "CLOCK",
@@ -26,12 +30,11 @@ __all__ = [
     "TF",
     "encode_clock",
     "encode_diagnostics",
-    "encode_floors",
     "encode_odometry",
     "encode_pose",
+    "encode_static",
     "encode_transforms",
-    "is_stampable",
-    "type_hash",
+    "optical_frame",
 ]
 
 MAP = "map"
@@ -41,78 +44,61 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 # An unknown variance in m^2, rad^2, (m/s)^2 or (rad/s)^2: filters of ROS read 0 as exact, and refuse NaN.
 _UNKNOWN = 1e6
-# Jazzy and Kilted have the same definitions of these messages.
-_STORE = get_typestore(Stores.ROS2_JAZZY)
-_LAST_S = 2**31
 
 
-def type_hash(ros_type: str) -> str:
-    """Return the hash of a message type (REP 2016), ``RIHS01_`` and 64 characters."""
-    return str(_STORE.hash_rihs01(ros_type))
-
-
-def is_stampable(time_ns: int) -> bool:
-    """Return whether a stamp of ROS 2 can hold a time: it ends in 2038."""
-    return 0 <= time_ns < _LAST_S * NS_PER_S
-
-
-def _make(name: str, *values: Any) -> Any:
-    package, _, short = name.partition("/")
-    return _STORE.types[f"{package}/msg/{short}"](*values)
-
-
-def _encode(message: Any, ros_type: str) -> bytes:
-    return bytes(_STORE.serialize_cdr(message, ros_type))
-
-
-def _time(time_ns: int) -> Any:
-    return _make("builtin_interfaces/Time", *divmod(time_ns, NS_PER_S))
-
-
-def _header(time_ns: int, frame: str) -> Any:
-    return _make("std_msgs/Header", _time(time_ns), frame)
+def optical_frame(camera: str) -> str:
+    """Return the coordinate frame of the images of a camera, with the suffix of REP 103."""
+    return f"{camera}_optical_frame"
 
 
 def _rotation(heading_rad: float) -> Any:
-    return _make("geometry_msgs/Quaternion", 0.0, 0.0, sin(heading_rad / 2), cos(heading_rad / 2))
+    return make("geometry_msgs/Quaternion", 0.0, 0.0, sin(heading_rad / 2), cos(heading_rad / 2))
 
 
-def _transform(time_ns: int, parent: str, child: str, xyz_m: tuple[float, ...], heading_rad: float) -> Any:
-    moved = _make("geometry_msgs/Transform", _make("geometry_msgs/Vector3", *xyz_m), _rotation(heading_rad))
-    return _make("geometry_msgs/TransformStamped", _header(time_ns, parent), child, moved)
+def _transform(time_ns: int, parent: str, child: str, xyz_m: Iterable[float], rotation: Any) -> Any:
+    moved = make("geometry_msgs/Transform", make("geometry_msgs/Vector3", *xyz_m), rotation)
+    return make("geometry_msgs/TransformStamped", make_header(time_ns, parent), child, moved)
 
 
 def encode_transforms(poses: Iterable[tuple[StreamPose, float]]) -> bytes:
     """Return the message of ``/tf`` with poses and their headings in rad."""
-    rows = [
-        _transform(
-            pose.time_ns, MAP, pose.track.robot, (pose.track.x_m, pose.track.y_m, pose.track.z_m), heading_rad
-        )
-        for pose, heading_rad in poses
-    ]
-    return _encode(_make("tf2_msgs/TFMessage", rows), TF)
+    rows = []
+    for pose, heading_rad in poses:
+        track = pose.track
+        xyz_m = (track.x_m, track.y_m, track.z_m)
+        rows.append(_transform(pose.time_ns, MAP, track.robot, xyz_m, _rotation(heading_rad)))
+    return encode(make("tf2_msgs/TFMessage", rows), TF)
 
 
-def encode_floors(heights_m: Mapping[str, float], time_ns: int) -> bytes:
-    """Return the message of ``/tf_static``: the frame ``<robot>/floor`` below the marker of each robot."""
+def encode_static(heights_m: Mapping[str, float], time_ns: int, cameras: Iterable[FloorCamera] = ()) -> bytes:
+    """Return the message of ``/tf_static``: a topic that keeps only its last message.
+
+    Parameters
+    ----------
+    heights_m : by robot, the height of its marker: the frame ``<robot>/floor`` is so far below.
+    cameras : cameras with a pose; the frame of their images has x right, y down and z forward (REP 103).
+    """
     rows = [
-        _transform(time_ns, robot, f"{robot}/floor", (0.0, 0.0, -height_m), 0.0)
+        _transform(time_ns, robot, f"{robot}/floor", (0.0, 0.0, -height_m), _rotation(0.0))
         for robot, height_m in heights_m.items()
     ]
-    return _encode(_make("tf2_msgs/TFMessage", rows), TF)
+    for camera in cameras:
+        rotation = make("geometry_msgs/Quaternion", *quaternion(camera.camera_from_world.T))
+        rows.append(_transform(time_ns, MAP, optical_frame(camera.name), camera.origin_m.tolist(), rotation))
+    return encode(make("tf2_msgs/TFMessage", rows), TF)
 
 
 def encode_clock(time_ns: int) -> bytes:
     """Return the message of ``/clock``."""
-    return _encode(_make("rosgraph_msgs/Clock", _time(time_ns)), CLOCK)
+    return encode(make("rosgraph_msgs/Clock", make_time(time_ns)), CLOCK)
 
 
 def encode_pose(pose: StreamPose, heading_rad: float) -> bytes:
     """Return the message PoseWithCovarianceStamped of a pose."""
-    message = _make(
-        "geometry_msgs/PoseWithCovarianceStamped", _header(pose.time_ns, MAP), _pose(pose, heading_rad)
+    message = make(
+        "geometry_msgs/PoseWithCovarianceStamped", make_header(pose.time_ns, MAP), _pose(pose, heading_rad)
     )
-    return _encode(message, POSE)
+    return encode(message, POSE)
 
 
 def encode_odometry(pose: StreamPose, heading_rad: float, velocity: Velocity) -> bytes:
@@ -121,26 +107,26 @@ def encode_odometry(pose: StreamPose, heading_rad: float, velocity: Velocity) ->
         [[cos(heading_rad), sin(heading_rad), 0], [-sin(heading_rad), cos(heading_rad), 0], [0, 0, 1]]
     )
     in_map_m_s = np.array([velocity.x_m_s, velocity.y_m_s, velocity.z_m_s])
-    linear = _make("geometry_msgs/Vector3", *(body_from_map @ in_map_m_s).tolist())
-    angular = _make("geometry_msgs/Vector3", 0.0, 0.0, velocity.yaw_rad_s or 0.0)
+    linear = make("geometry_msgs/Vector3", *(body_from_map @ in_map_m_s).tolist())
+    angular = make("geometry_msgs/Vector3", 0.0, 0.0, velocity.yaw_rad_s or 0.0)
     known = velocity.covariance_m2_s2
     covariance = _covariance(
         None if known is None else body_from_map @ known @ body_from_map.T,
         None if velocity.yaw_rad_s is None else velocity.yaw_sigma_rad_s,
     )
-    twist = _make(
-        "geometry_msgs/TwistWithCovariance", _make("geometry_msgs/Twist", linear, angular), covariance
+    twist = make(
+        "geometry_msgs/TwistWithCovariance", make("geometry_msgs/Twist", linear, angular), covariance
     )
-    header = _header(pose.time_ns, MAP)
-    message = _make("nav_msgs/Odometry", header, pose.track.robot, _pose(pose, heading_rad), twist)
-    return _encode(message, ODOMETRY)
+    header = make_header(pose.time_ns, MAP)
+    message = make("nav_msgs/Odometry", header, pose.track.robot, _pose(pose, heading_rad), twist)
+    return encode(message, ODOMETRY)
 
 
 def _pose(pose: StreamPose, heading_rad: float) -> Any:
     track = pose.track
-    point = _make("geometry_msgs/Point", track.x_m, track.y_m, track.z_m)
-    where = _make("geometry_msgs/Pose", point, _rotation(heading_rad))
-    return _make(
+    point = make("geometry_msgs/Point", track.x_m, track.y_m, track.z_m)
+    where = make("geometry_msgs/Pose", point, _rotation(heading_rad))
+    return make(
         "geometry_msgs/PoseWithCovariance", where, _covariance(pose.covariance_m2, pose.heading_sigma_rad)
     )
 
@@ -169,12 +155,12 @@ def encode_diagnostics(
     newest : the newest pose of each robot; None: no camera has seen it.
     """
     rows = [_status(robot, pose, session, now_ns, stale_s) for robot, pose in newest.items()]
-    message = _make("diagnostic_msgs/DiagnosticArray", _header(now_ns, ""), rows)
-    return _encode(message, DIAGNOSTICS)
+    message = make("diagnostic_msgs/DiagnosticArray", make_header(now_ns, ""), rows)
+    return encode(message, DIAGNOSTICS)
 
 
 def _status(robot: str, pose: StreamPose | None, session: int, now_ns: int, stale_s: float) -> Any:
-    status: Any = _STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
+    status: Any = message_class("diagnostic_msgs/msg/DiagnosticStatus")
     values = {"session": str(session)}
     level, text = status.STALE, "no camera has seen the robot"
     if pose is not None:
@@ -183,7 +169,7 @@ def _status(robot: str, pose: StreamPose | None, session: int, now_ns: int, stal
         if pose.covariance_m2 is not None:
             values["sigma_m"] = f"{sqrt(max(np.trace(pose.covariance_m2) / 3, 0.0)):.4f}"
         level, text = _judge(pose, age_s, stale_s, status)
-    rows = [_make("diagnostic_msgs/KeyValue", key, value) for key, value in values.items()]
+    rows = [make("diagnostic_msgs/KeyValue", key, value) for key, value in values.items()]
     return status(level, f"ipsys: {robot}", text, robot, rows)
 
 

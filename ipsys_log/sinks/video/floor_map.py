@@ -1,0 +1,255 @@
+"""The map of the floor to scale: its grid and reference points, and the robots with their trails."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import cos, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.ellipses import covariance_ellipse
+from ipsys_log.messages import Rig, Track, Tracks
+from ipsys_log.plain_text import plain_text
+from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["FloorMap", "MapLook", "MapPart"]
+
+Array = NDArray[np.float64]
+
+_GROUND: RGB = (24, 24, 28)
+_FLOOR: RGB = (36, 36, 42)
+_GRID: RGB = (52, 52, 59)
+_EDGE: RGB = (130, 130, 138)
+_TEXT: RGB = (190, 190, 196)
+_REFERENCE: RGB = (240, 240, 240)
+_TRAIL_NS = 15 * NS_PER_S
+_HEADING_M = 0.3
+_STEPS_M = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+_MOST_LINES = 12
+_FILL = 0.32
+_LONGEST_NAME = 24
+# Trails fade to this share of their colour.
+_OLDEST = 0.18
+_CIRCLE = np.linspace(0.0, 2 * np.pi, 49)
+
+
+@dataclass(frozen=True, slots=True)
+class MapPart:
+    """The part of the floor on the map: its lowest and highest x and y in m."""
+
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class MapLook:
+    """The look of a map.
+
+    Attributes
+    ----------
+    size_px : width and height.
+    font_px : size of the text.
+    colours : by robot; other robots are not drawn.
+    enlarged : factor on the ellipses.
+    fade_ns : a robot without a newer pose disappears after this time.
+    """
+
+    size_px: tuple[int, int]
+    font_px: int
+    colours: Mapping[str, RGB]
+    enlarged: int
+    fade_ns: int
+
+
+@dataclass(slots=True)
+class _Robot:
+    """The newest pose of a robot, the log time of that pose, and its recent points with their log times."""
+
+    track: Track
+    time_ns: int
+    points: deque[tuple[int, float, float]] = field(default_factory=deque)
+
+
+class FloorMap:
+    """The map of the floor with x to the right and y upward, and the robots that were seen last.
+
+    Parameters
+    ----------
+    rig : the rig, with the floor and its reference points; None: only the grid.
+    part : the visible part of the floor.
+    """
+
+    def __init__(self, rig: Rig | None, part: MapPart, look: MapLook) -> None:
+        self._look, self._robots = look, dict[str, _Robot]()
+        (width, height), font_px = look.size_px, look.font_px
+        self._line_px = max(font_px // 7, 1)
+        # Room for the numbers of the axes.
+        room = np.array([width - 4.6 * font_px, height - 3.2 * font_px])
+        low, high = np.array(part.low_m), np.array(part.high_m)
+        self._scale = float((room / (high - low)).min())
+        self._low_m = low
+        drawn = (high - low) * self._scale
+        self._start_px = np.array([3.2 * font_px, 0.8 * font_px]) + (room - drawn) / 2
+        self._top_px = self._start_px[1] + drawn[1]
+        self._ground = self._draw_ground(rig, low, high)
+
+    def to_px(self, points_m: Array) -> Array:
+        """Return the places (n, 2) on the map, from the centre of its first pixel, of floor points (n, 2)."""
+        offsets = (points_m - self._low_m) * self._scale
+        return np.asarray(np.stack([self._start_px[0] + offsets[:, 0], self._top_px - offsets[:, 1]], axis=1))
+
+    def add(self, tracks: Tracks, time_ns: int) -> None:
+        """Show poses of a log time from now on."""
+        for track in tracks.tracks:
+            if track.robot not in self._look.colours or not np.isfinite([track.x_m, track.y_m]).all():
+                continue
+            robot = self._robots.setdefault(track.robot, _Robot(track, time_ns))
+            robot.track, robot.time_ns = track, time_ns
+            # A trail shows the sightings, not predictions.
+            if track.coasting_ns is None:
+                robot.points.append((time_ns, track.x_m, track.y_m))
+
+    def draw(self, time_ns: int) -> Picture:
+        """Return the map (height, width, 3) at a log time."""
+        for name, robot in list(self._robots.items()):
+            while robot.points and time_ns - robot.points[0][0] > _TRAIL_NS:
+                robot.points.popleft()
+            if not robot.points and time_ns - robot.time_ns > self._look.fade_ns:
+                del self._robots[name]
+        canvas = Canvas(self._ground.copy())
+        seen = {
+            name: robot
+            for name, robot in sorted(self._robots.items())
+            if time_ns - robot.time_ns <= self._look.fade_ns
+        }
+        for name, robot in sorted(self._robots.items()):
+            self._draw_trail(canvas, robot, self._look.colours[name], time_ns)
+        self._draw_ellipses(canvas, seen)
+        for name, robot in seen.items():
+            self._draw_robot(canvas, robot.track, self._look.colours[name])
+        for name, robot in seen.items():
+            self._draw_name(canvas, name, robot.track)
+        return canvas.picture
+
+    def _draw_ground(self, rig: Rig | None, low: Array, high: Array) -> Picture:
+        width, height = self._look.size_px
+        canvas = Canvas(np.full((height, width, 3), _GROUND[::-1], dtype=np.uint8))
+        corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        floor = rig.floor if rig is not None else None
+        if floor is not None:
+            edge = np.array([[0, 0], [floor.width_m, 0], [floor.width_m, floor.depth_m], [0, floor.depth_m]])
+            canvas.fill(self.to_px(edge), _FLOOR)
+        else:
+            canvas.fill(self.to_px(corners), _FLOOR)
+        self._draw_grid(canvas, low, high)
+        if floor is not None:
+            canvas.line(self.to_px(edge), _EDGE, 1, is_closed=True)
+        for point in rig.reference_points if rig is not None else ():
+            self._draw_reference(canvas, point.name, np.array([[point.x_m, point.y_m]]))
+        return canvas.picture
+
+    def _draw_grid(self, canvas: Canvas, low: Array, high: Array) -> None:
+        span = float((high - low).max())
+        step = next((m for m in _STEPS_M if span / m <= _MOST_LINES), span)
+        size = self._look.font_px - 1
+        bottom = self.to_px(low[None])[0]
+        for axis in (0, 1):
+            first, last = int(np.ceil(low[axis] / step - 1e-9)), int(np.floor(high[axis] / step + 1e-9))
+            for value in np.arange(first, last + 1) * step:
+                ends = np.array([low, high])
+                ends[:, axis] = value
+                line = self.to_px(ends)
+                canvas.line(line, _GRID)
+                text = f"{value:g}"
+                if (unit := value + step > high[axis] + 1e-9) and axis == 0:
+                    text += " m"
+                width, height = text_size(text, size)
+                if axis == 0:
+                    canvas.text((line[0, 0] - width / 2, bottom[1] + 1.6 * size), text, size, _TEXT)
+                else:
+                    text = f"{text} m" if unit else text
+                    width = text_size(text, size)[0]
+                    canvas.text((bottom[0] - width - 0.5 * size, line[0, 1] + height / 2), text, size, _TEXT)
+
+    def _draw_reference(self, canvas: Canvas, name: str, point_m: Array) -> None:
+        at, arm, size = self.to_px(point_m)[0], 0.45 * self._look.font_px, self._look.font_px
+        for direction in ([arm, 0.0], [0.0, arm]):
+            canvas.line(np.array([at - direction, at + direction]), _REFERENCE)
+        canvas.text(
+            at + np.array([0.45 * size, -0.45 * size]),
+            plain_text(name, longest=_LONGEST_NAME),
+            size,
+            _REFERENCE,
+            halo=_FLOOR,
+        )
+
+    def _draw_trail(self, canvas: Canvas, robot: _Robot, colour: RGB, time_ns: int) -> None:
+        if len(robot.points) < 2:
+            return
+        times_ns = np.array([point[0] for point in robot.points])
+        line = self.to_px(np.array([point[1:] for point in robot.points]))
+        ages = (time_ns - times_ns) / _TRAIL_NS
+        for n in range(1, len(line)):
+            if times_ns[n] - times_ns[n - 1] <= self._look.fade_ns:
+                share = _OLDEST + (1 - _OLDEST) * max(1 - float(ages[n]), 0.0)
+                canvas.line(line[n - 1 : n + 1], _mix(colour, share), self._line_px)
+
+    def _draw_ellipses(self, canvas: Canvas, robots: Mapping[str, _Robot]) -> None:
+        outlines = []
+        for name, robot in robots.items():
+            track = robot.track
+            if track.covariance_m2 is None or not np.isfinite(track.covariance_m2).all():
+                continue
+            major_m, minor_m, angle = covariance_ellipse(track.covariance_m2[:2, :2])
+            round_m = self._look.enlarged * np.stack([major_m * np.cos(_CIRCLE), minor_m * np.sin(_CIRCLE)])
+            turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]])
+            outline = self.to_px((turn @ round_m).T + np.array([track.x_m, track.y_m]))
+            outlines.append((outline, self._look.colours[name]))
+        filled = Canvas(canvas.picture.copy())
+        for outline, colour in outlines:
+            filled.fill(outline, colour)
+        if outlines:
+            mixed = canvas.picture + _FILL * (filled.picture.astype(np.float32) - canvas.picture)
+            canvas.picture[:] = np.round(mixed).astype(np.uint8)
+        for outline, colour in outlines:
+            canvas.line(outline, colour)
+
+    def _draw_robot(self, canvas: Canvas, track: Track, colour: RGB) -> None:
+        radius = 0.5 * self._look.font_px
+        at = self.to_px(np.array([[track.x_m, track.y_m]]))[0]
+        if track.heading_rad is not None:
+            ahead = np.array([cos(track.heading_rad), -sin(track.heading_rad)])
+            aside = np.array([ahead[1], -ahead[0]])
+            length = max(_HEADING_M * self._scale, 2.4 * radius)
+            tip = at + length * ahead
+            canvas.line(np.array([at, tip - radius * ahead]), colour, self._line_px)
+            back = tip - 1.3 * radius * ahead
+            canvas.fill(np.array([tip, back + 0.6 * radius * aside, back - 0.6 * radius * aside]), colour)
+        if track.coasting_ns is None:
+            canvas.disc(at, radius, colour)
+        else:
+            canvas.disc(at, radius, _FLOOR)
+            canvas.disc(at, radius, colour, self._line_px)
+
+    def _draw_name(self, canvas: Canvas, name: str, track: Track) -> None:
+        size = self._look.font_px
+        at = self.to_px(np.array([[track.x_m, track.y_m]]))[0]
+        text = plain_text(name, longest=_LONGEST_NAME)
+        width = text_size(text, size)[0]
+        x = at[0] + 0.8 * size
+        # A name ends inside of the map.
+        if x + width > self._look.size_px[0] - 0.3 * size:
+            x = at[0] - 0.8 * size - width
+        canvas.text((x, at[1] - 0.6 * size), text, size, self._look.colours[name], halo=_FLOOR)
+
+
+def _mix(colour: RGB, share: float) -> RGB:
+    """Return a colour in front of the floor with a share of cover."""
+    red, green, blue = (
+        round(back + share * (front - back)) for front, back in zip(colour, _FLOOR, strict=True)
+    )
+    return red, green, blue

@@ -160,9 +160,9 @@ def test_script_of_the_latency_equals_the_ledger(
 def test_script_of_the_error_compares_the_same_robot_and_instant(
     scored_layout: dict[str, Any], tmp_path: Path
 ) -> None:
-    def event(topic: str, sec: int, **robots: tuple[float, float]) -> dict[str, Any]:
+    def event(topic: str, nsec: int, **robots: tuple[float, float]) -> dict[str, Any]:
         tracks = [{"robot": name, "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in robots.items()]
-        return {"topic": topic, "message": {"timestamp": {"sec": sec, "nsec": 7}, "tracks": tracks}}
+        return {"topic": topic, "message": {"timestamp": {"sec": 1, "nsec": nsec}, "tracks": tracks}}
 
     source = scored_layout["userNodes"]["position_error"]["sourceCode"]
     truth, tracks = json.loads(re.findall(r"inputs = (.*);", source)[0])
@@ -172,10 +172,13 @@ def test_script_of_the_error_compares_the_same_robot_and_instant(
         event(tracks, 2, ada=(5.0, 5.0)),  # the truth of this instant comes later
         event(tracks, 3, bob=(0.0, 0.0)),  # it has no truth
         event(truth, 2, ada=(5.0, 5.01)),
+        event(tracks, 4, ada=(1.0, 1.0)),
+        event(tracks, 4, ada=(2.0, 2.0)),  # a later pose of the same instant counts
+        event(truth, 4, ada=(2.0, 2.001)),
     ]
     results = run_script(source, events, tmp_path)["results"]
     errors = [one and {row["robot"]: round(row["error_mm"], 9) for row in one["robots"]} for one in results]
-    assert errors == [None, {"ada": 5.0}, None, None, {"ada": 10.0}]
+    assert errors == [None, {"ada": 5.0}, None, None, {"ada": 10.0}, None, None, {"ada": 1.0}]
 
 
 def keys_of(part: Any) -> set[str]:

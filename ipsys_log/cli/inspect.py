@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -23,6 +24,14 @@ Save = Annotated[
     Path | None,
     typer.Option(
         "--save", metavar="FILE", help="Write a Rerun recording (.rrd) instead of opening the viewer."
+    ),
+]
+FoxgloveLayout = Annotated[
+    Path | None,
+    typer.Option(
+        "--foxglove-layout",
+        metavar="FILE",
+        help="Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
     ),
 ]
 _HTML = (
@@ -111,11 +120,15 @@ def repair(
         remarks.print(f"unfinished runs cannot be completed: {error}", style="yellow", markup=False)
 
 
-def view(logs: ReadLogs, run: Runs = None, save: Save = None) -> None:
+def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: FoxgloveLayout = None) -> None:
     """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun."""
     from ipsys_log.extras import check_installed
     from ipsys_log.log.dataset import Session
 
+    if foxglove_layout is not None:
+        _write_layout(logs, run or (), foxglove_layout)
+        if save is None:
+            return
     check_installed("view needs", "rerun")
     if save is not None:
         _check_save(save, logs)
@@ -132,6 +145,23 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None) -> None:
             remarks.print(f"{kind:<21} run {named}")
     if save is not None:
         remarks.print(f"{save} written; to view it: rerun {save}")
+
+
+def _write_layout(logs: list[Path], runs: Sequence[str], path: Path) -> None:
+    from ipsys_log.atomic_files import replacement_of
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.report.files import check_file
+    from ipsys_log.sinks.foxglove_layout import make_layout
+
+    if path.suffix != ".json":
+        raise IpsysError(f"--foxglove-layout {path}: a layout ends in .json; use {path.stem}.json")
+    check_file(path, "--foxglove-layout", logs)
+    with Session(logs) as session:
+        layout = make_layout(session, runs)
+    with replacement_of(path) as file:
+        file.write(json.dumps(layout, indent=2).encode() + b"\n")
+    remarks.print(f"{path} written; in Foxglove: Layouts, Import from file")
 
 
 def _check_save(save: Path, logs: list[Path]) -> None:

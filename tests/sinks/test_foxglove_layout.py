@@ -1,0 +1,218 @@
+"""The layout of Foxglove for a log: its topics, message paths, settings and user scripts."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import foxglove.layouts as fl
+import numpy as np
+import pytest
+
+from ipsys_log.log.dataset import Session
+from ipsys_log.sinks.foxglove_layout import make_layout
+from tests.conftest import ROOT, Ipsys
+
+_SCORED = ROOT / "tests" / "golden" / "v0_1_0.mcap"
+_PATH = re.compile(r'(/[\w/]+?)(?:\.(\w+)\[:\])?\{(\w+)=="(\w+)"\}\.(\w+)')
+# The types of user scripts; Foxglove compiles TypeScript, Node runs what remains.
+_TYPES = re.compile(r"^type Output = .*$|: any\b|: Output( \| undefined)?(?= \{)", re.MULTILINE)
+_DRIVER = """
+import script, { inputs, output } from "./script.mjs";
+const events = JSON.parse(await new Response(process.stdin).text());
+console.log(JSON.stringify({ inputs, output, results: events.map(event => script(event) ?? null) }));
+"""
+
+
+@pytest.fixture(scope="module")
+def layout(recorded: Path) -> dict[str, Any]:
+    with Session([recorded]) as session:
+        return make_layout(session)
+
+
+@pytest.fixture(scope="module")
+def scored_layout() -> dict[str, Any]:
+    """The layout of a log with a ground truth, and without images."""
+    with Session([_SCORED]) as session:
+        return make_layout(session)
+
+
+def panels(tree: Any) -> Iterator[str]:
+    """Yield the panels of a layout."""
+    if isinstance(tree, str):
+        yield tree
+    else:
+        assert 0 < tree["splitPercentage"] < 100
+        yield from (*panels(tree["first"]), *panels(tree["second"]))
+
+
+def messages(log: Path, *topics: str) -> list[dict[str, Any]]:
+    """Return messages as Foxglove gives them to a user script."""
+    read = runpy.run_path(str(ROOT / "examples" / "log" / "read_log.py"))["read"]
+    return [{"topic": topic, "message": stamped(fields)} for topic, _, _, fields in read(log, topics)]
+
+
+def stamped(fields: Any) -> Any:
+    """Replace the times of JSON by seconds and nanoseconds."""
+    if isinstance(fields, dict):
+        return {name: stamped(value) for name, value in fields.items()}
+    if isinstance(fields, list):
+        return [stamped(value) for value in fields]
+    if isinstance(fields, str) and re.fullmatch(r"\d{4}-\d\d-\d\dT[\d:.]+Z", fields):
+        time_ns = int(np.datetime64(fields.removesuffix("Z"), "ns").astype(np.int64))
+        return {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}
+    return fields
+
+
+def run_script(source: str, events: list[dict[str, Any]], folder: Path) -> dict[str, Any]:
+    """Run a user script on messages; return its topics and results."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no Node to run the user scripts with; on Debian: apt-get install nodejs")
+    (folder / "script.mjs").write_text(_TYPES.sub("", source), encoding="utf-8")
+    (folder / "driver.mjs").write_text(_DRIVER, encoding="utf-8")
+    done = subprocess.run(
+        [node, "driver.mjs"],
+        cwd=folder,
+        input=json.dumps(events),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def test_every_panel_is_shown_once(layout: dict[str, Any], scored_layout: dict[str, Any]) -> None:
+    shown = list(panels(layout["layout"]))
+    assert sorted(shown) == sorted(layout["configById"])
+    images = [name for name in shown if name.startswith("Image!")]
+    assert shown == [*images, "3D!floor", "Plot!position", "Plot!latency"]
+    assert list(panels(scored_layout["layout"])) == ["3D!floor", "Plot!position", "Plot!error"]
+
+
+def test_images_have_their_markers_and_calibration(layout: dict[str, Any], recorded: Path) -> None:
+    with Session([recorded]) as session:
+        cameras = sorted(session.images)
+        for camera in cameras:
+            mode = layout["configById"][f"Image!{camera}"]["imageMode"]
+            (annotations,) = mode["annotations"]
+            assert mode["imageTopic"] == f"/cameras/{camera}/image"
+            for topic in (mode["imageTopic"], mode["calibrationTopic"], annotations):
+                assert session.count(topic) > 0
+                assert f"/{camera}/" in topic
+        assert all(session.count(topic) for topic in layout["configById"]["3D!floor"]["topics"])
+    assert len(cameras) > 0
+
+
+def test_paths_of_plots_have_values_in_a_live_log(
+    layout: dict[str, Any], recorded: Path, tmp_path: Path
+) -> None:
+    check_paths(layout, recorded, tmp_path)
+
+
+def test_paths_of_plots_have_values_in_a_log_with_truth(
+    scored_layout: dict[str, Any], tmp_path: Path
+) -> None:
+    check_paths(scored_layout, _SCORED, tmp_path)
+
+
+def check_paths(layout: dict[str, Any], recorded: Path, tmp_path: Path) -> None:
+    """Check that each message path of a plot gives numbers for the log."""
+    scripts = {}
+    for script in layout["userNodes"].values():
+        inputs = json.loads(re.findall(r"inputs = (.*);", script["sourceCode"])[0])
+        result = run_script(script["sourceCode"], messages(recorded, *inputs), tmp_path)
+        scripts[result["output"]] = [one for one in result["results"] if one is not None]
+    plots = [panel for name, panel in layout["configById"].items() if name.startswith("Plot")]
+    paths = [path for panel in plots for path in panel["paths"]]
+    assert len(paths) > 5
+    assert all(path["enabled"] for path in paths)
+    for path in paths:
+        found = _PATH.fullmatch(path["value"])
+        assert found is not None, path
+        topic, rows, key, name, field = found.groups()
+        shown = scripts.get(topic) or [event["message"] for event in messages(recorded, topic)]
+        values = [row for one in shown for row in (one[rows] if rows else [one]) if row[key] == name]
+        assert values, path["value"]
+        assert all(np.isfinite(row[field]) for row in values)
+
+
+def test_script_of_the_latency_equals_the_ledger(
+    layout: dict[str, Any], recorded: Path, tmp_path: Path
+) -> None:
+    source = layout["userNodes"]["latency"]["sourceCode"]
+    results = run_script(source, messages(recorded, "/latency"), tmp_path)["results"]
+    with Session([recorded]) as session:
+        ledger = session.payloads(["/latency"])
+    assert [one["camera"] for one in results] == [one.camera for one in ledger]
+    expected_ms = [(one.published - one.received) / 1e6 for one in ledger]
+    np.testing.assert_allclose([one["latency_ms"] for one in results], expected_ms, atol=1e-6)
+
+
+def test_script_of_the_error_compares_the_same_robot_and_instant(
+    scored_layout: dict[str, Any], tmp_path: Path
+) -> None:
+    def event(topic: str, nsec: int, **robots: tuple[float, float]) -> dict[str, Any]:
+        tracks = [{"robot": name, "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in robots.items()]
+        return {"topic": topic, "message": {"timestamp": {"sec": 1, "nsec": nsec}, "tracks": tracks}}
+
+    source = scored_layout["userNodes"]["position_error"]["sourceCode"]
+    truth, tracks = json.loads(re.findall(r"inputs = (.*);", source)[0])
+    events = [
+        event(truth, 1, ada=(1.0, 2.0), bob=(0.0, 0.0)),
+        event(tracks, 1, ada=(1.003, 2.004)),
+        event(tracks, 2, ada=(5.0, 5.0)),  # the truth of this instant comes later
+        event(tracks, 3, bob=(0.0, 0.0)),  # it has no truth
+        event(truth, 2, ada=(5.0, 5.01)),
+        event(tracks, 4, ada=(1.0, 1.0)),
+        event(tracks, 4, ada=(2.0, 2.0)),  # a later pose of the same instant counts
+        event(truth, 4, ada=(2.0, 2.001)),
+    ]
+    results = run_script(source, events, tmp_path)["results"]
+    errors = [one and {row["robot"]: round(row["error_mm"], 9) for row in one["robots"]} for one in results]
+    assert errors == [None, {"ada": 5.0}, None, None, {"ada": 10.0}, None, None, {"ada": 1.0}]
+
+
+def keys_of(part: Any) -> set[str]:
+    """Return the settings that foxglove-sdk knows for a part of a layout."""
+    return set(part._to_dict())
+
+
+def test_settings_are_those_of_foxglove_sdk(layout: dict[str, Any], scored_layout: dict[str, Any]) -> None:
+    known = {"foxglovePanelTitle"}
+    for name, panel in {**layout["configById"], **scored_layout["configById"]}.items():
+        if name.startswith("Image!"):
+            assert set(panel) <= keys_of(fl.ImageConfig()) | known
+            assert set(panel["imageMode"]) <= keys_of(fl.ImageModeConfig())
+        elif name.startswith("3D!"):
+            assert set(panel) <= keys_of(fl.ThreeDeeConfig()) | known
+            assert set(panel["cameraState"]) <= keys_of(fl.ThreeDeeCameraState())
+            assert set(panel["scene"]["transforms"]) <= keys_of(fl.BaseRendererTransforms())
+            assert set(panel["layers"]["grid"]) <= keys_of(fl.BaseRendererGridLayerSettings())
+        else:
+            assert set(panel) <= keys_of(fl.PlotConfig()) | known
+            assert all(set(path) <= keys_of(fl.PlotSeries()) for path in panel["paths"])
+    for script in {**layout["userNodes"], **scored_layout["userNodes"]}.values():
+        assert set(script) == keys_of(fl.UserScript(name="", source_code=""))
+
+
+def test_command_writes_the_layout_and_keeps_the_log(recorded: Path, tmp_path: Path, ipsys: Ipsys) -> None:
+    before = recorded.read_bytes()
+    done = ipsys("view", recorded, "--foxglove-layout", tmp_path / "layout.json")
+    assert (done.code, done.out) == (0, "")
+    assert done.err.endswith("in Foxglove: Layouts, Import from file\n")
+    assert set(json.loads((tmp_path / "layout.json").read_text())["configById"]) > {"3D!floor"}
+    assert recorded.read_bytes() == before
+    wrong = ipsys("view", recorded, "--foxglove-layout", tmp_path / "layout.txt")
+    assert (wrong.code, "use layout.json" in wrong.err) == (1, True)
+    unknown = ipsys("view", recorded, "--run", "nothing", "--foxglove-layout", tmp_path / "x.json")
+    assert (unknown.code, "has no run 'nothing'" in unknown.err) == (1, True)
+    assert not (tmp_path / "x.json").exists()

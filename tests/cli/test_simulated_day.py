@@ -203,6 +203,9 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("plan", "session.mcap", "--places", 2)
     day("report", "session.mcap")
     day("export", "a.mcap", "-o", "a.csv")
+    day("export", "a.mcap", "-o", "bag.mcap", "--format", "ros2")
+    day("export", "a.mcap", "-o", "a.mp4", "--size", "320x180", "--frame-rate", 5)
+    day("export", "a.mcap", "-o", "coco", "--format", "coco")
     for stage in ("detect", "camera-frame", "fit", "locate", "fuse", "smooth"):
         day(stage, "session.mcap")
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)

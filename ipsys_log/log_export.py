@@ -75,9 +75,9 @@ def _write_bag(
 
     robots = () if options.robot is None else (options.robot,)
     counts = write_bag(session, str(runs[0]), path, robots, options.with_images, progress)
-    text = f"messages: {counts.images} images, {counts.poses} poses"
+    text = f"messages; images: {counts.images}, poses: {counts.poses}"
     if counts.left_out:
-        text += f" ({counts.left_out} left out: outside the calibrated volume, predicted or without heading)"
+        text += f", left out: {counts.left_out} (outside the calibrated volume, predicted or without heading)"
     return counts.messages, text
 
 
@@ -98,7 +98,7 @@ def _write_data_set(
     from ipsys_log.exchange.coco import write_coco
 
     counts = write_coco(session, str(runs[0]), path, progress)
-    return counts.pictures, f"pictures with {counts.markers} marker{'' if counts.markers == 1 else 's'}"
+    return counts.pictures, f"pictures; markers: {counts.markers}"
 
 
 Write = Callable[[Session, Runs, Path, ExportOptions, Progress], tuple[int, str]]

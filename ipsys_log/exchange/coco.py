@@ -180,6 +180,8 @@ class _DataSet:
         }
         self._write(self._file, self.pictures, row)
         for marker in markers.markers:
+            if not np.isfinite(marker.corners_px).all():
+                continue  # a log of another program may hold such corners, and JSON has no NaN
             self.markers += 1
             self._write(self._rows, self.markers, _annotation(marker, self.markers, self.pictures))
 

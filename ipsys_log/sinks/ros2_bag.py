@@ -122,7 +122,7 @@ class _Bag:
             if height_m is not None and (not self._robots or robot in self._robots)
         }
         cameras = _cameras(session, run)
-        if known_m or cameras:
+        if (known_m or cameras) and is_stampable(session.start_ns):
             data = ros2.encode_static(known_m, session.start_ns, cameras)
             self._put("/tf_static", ros2.TF, session.start_ns, session.start_ns, data, is_latched=True)
 

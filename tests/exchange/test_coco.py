@@ -112,7 +112,7 @@ def test_markers_of_one_log_find_pictures_of_another(tmp_path: Path) -> None:
     for number, logs in enumerate(((images, derived), (derived, images))):
         with ipsys.open(*logs) as opened:
             exported = opened.export(tmp_path / f"coco{number}", format="coco", run=RUN)
-        assert (exported.rows, exported.content) == (1, "pictures with 1 marker")
+        assert (exported.rows, exported.content) == (1, "pictures; markers: 1")
 
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError])

@@ -234,7 +234,7 @@ def test_poses_that_a_robot_must_not_use_are_left_out(tmp_path: Path) -> None:
     assert (floor.child_frame_id, floor.header.frame_id, height_m) == ("ada/floor", "ada", -0.1)
     with ipsys.open(log) as opened:
         exported = opened.export(tmp_path / "one.mcap", run=RUN, robot="bob")
-    assert "1 poses" in exported.content
+    assert "poses: 1" in exported.content
     assert "/ada/pose" not in read(tmp_path / "one.mcap")
 
 
@@ -254,7 +254,7 @@ def test_bag_without_images_has_the_rest(replayed_log: Path, tmp_path: Path, ips
     assert not [topic for topic in messages if "image" in topic]
     assert len(messages["/red/camera_info"]) == 1
     assert len(messages["/robot_0/pose"]) > 10
-    assert f"{sum(map(len, messages.values()))} messages: 0 images" in done.out
+    assert f"{sum(map(len, messages.values()))} messages; images: 0" in done.out
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:

@@ -202,6 +202,20 @@ def test_interrupted_video_leaves_the_old_file(fault: type[BaseException], tmp_p
     assert (tmp_path / "lab.mp4").read_bytes() == b"old"
 
 
+def test_wild_numbers_of_other_programs_are_drawn_or_left_out(tmp_path: Path) -> None:
+    wild = [
+        track(1e12, -1e12),
+        track(float("nan"), 1.0),
+        track(1.0, 1.0, heading_rad=float("nan")),
+        replace(track(1.0, 1.0), covariance_m2=np.diag([1e300, -1.0, 0.0])),
+        replace(track(1.0, 1.0), covariance_m2=np.full((3, 3), np.nan)),
+    ]
+    rows = {n: (row,) for n, row in enumerate([*wild, track(1.0, 0.75)])}
+    log = PicturedLab({n: image(n) for n in rows}, rows, frozenset(rows)).write(tmp_path / "lab.mcap")
+    last = export(log, tmp_path / "lab.mp4").pictures[-1]
+    assert place_on_floor(last, robot_colour(0)) == pytest.approx((0.25, 0.25), abs=0.02)
+
+
 def test_same_log_gives_the_same_bytes(tmp_path: Path) -> None:
     log = moving(5, 8).write(tmp_path / "lab.mcap")
     for name in ("one", "two"):

@@ -110,6 +110,8 @@ class CameraPanel:
         for marker in markers.markers:
             # Points of a log count from the centre of the first pixel, scales from its corner.
             outline = (np.asarray(marker.corners_px) + 0.5) * scale - 0.5 + corner
+            if not np.isfinite(outline).all():
+                continue
             canvas.line(outline, MARKER_COLOUR, max(self._font_px // 7, 1), is_closed=True)
             label, size = str(marker.id), self._font_px - 1
             width = text_size(label, size)[0]

@@ -22,6 +22,7 @@ Point = Sequence[float] | NDArray[np.float64]
 _SHIFT = 4
 _PARTS = 1 << _SHIFT
 _LONGEST = 100
+_FAR_PX = 30_000
 
 
 @cache
@@ -44,6 +45,11 @@ def text_size(text: str, size_px: int) -> tuple[int, int]:
     return width, height
 
 
+def _in_parts(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Return points in parts of pixels. Points far away move nearer: their integers would be too large."""
+    return np.round(np.clip(points, -_FAR_PX, _FAR_PX) * _PARTS).astype(np.int32)
+
+
 class Canvas:
     """A picture (height, width, 3) in the order BGR. Points count from the centre of the first pixel."""
 
@@ -53,7 +59,7 @@ class Canvas:
     def text(self, at: Point, text: str, size_px: int, colour: RGB, halo: RGB | None = None) -> None:
         """Draw a line of text; its base line begins at a point. A halo separates it from the ground."""
         mask, above = _text_mask(text, size_px)
-        left, top = round(at[0]), round(at[1]) - above
+        left, top = round(float(at[0])), round(float(at[1])) - above
         if halo is not None:
             rim = max(size_px // 6, 1)
             wide = cv2.copyMakeBorder(mask, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=0)
@@ -63,19 +69,17 @@ class Canvas:
 
     def line(self, points: NDArray[np.float64], colour: RGB, width: int = 1, is_closed: bool = False) -> None:
         """Draw a line through points (n, 2)."""
-        parts = np.round(points * _PARTS).astype(np.int32)
-        cv2.polylines(self.picture, [parts], is_closed, colour[::-1], width, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(self.picture, [_in_parts(points)], is_closed, colour[::-1], width, cv2.LINE_AA, _SHIFT)
 
     def fill(self, points: NDArray[np.float64], colour: RGB) -> None:
         """Fill a polygon (n, 2)."""
-        parts = np.round(points * _PARTS).astype(np.int32)
-        cv2.fillPoly(self.picture, [parts], colour[::-1], cv2.LINE_AA, _SHIFT)
+        cv2.fillPoly(self.picture, [_in_parts(points)], colour[::-1], cv2.LINE_AA, _SHIFT)
 
     def disc(self, at: Point, radius_px: float, colour: RGB, width: int = -1) -> None:
         """Draw a disc; with a width, only its edge."""
-        centre = round(at[0] * _PARTS), round(at[1] * _PARTS)
+        x, y = _in_parts(np.asarray(at, dtype=np.float64)).tolist()
         radius = max(round(radius_px * _PARTS), 1)
-        cv2.circle(self.picture, centre, radius, colour[::-1], width, cv2.LINE_AA, _SHIFT)
+        cv2.circle(self.picture, (x, y), radius, colour[::-1], width, cv2.LINE_AA, _SHIFT)
 
     def box(self, left: int, top: int, right: int, bottom: int, colour: RGB) -> None:
         """Fill a rectangle; right and bottom are not included."""

@@ -105,7 +105,8 @@ class FloorMap:
     def add(self, tracks: Tracks, time_ns: int) -> None:
         """Show poses of a log time from now on."""
         for track in tracks.tracks:
-            if track.robot not in self._look.colours or not np.isfinite([track.x_m, track.y_m]).all():
+            numbers = [track.x_m, track.y_m, track.heading_rad or 0.0]
+            if track.robot not in self._look.colours or not np.isfinite(numbers).all():
                 continue
             robot = self._robots.setdefault(track.robot, _Robot(track, time_ns))
             robot.track, robot.time_ns = track, time_ns

@@ -15,6 +15,8 @@ from pathlib import Path
 from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Rig
+from ipsys_log.messages.channels import RIG
 from ipsys_log.publish.blurred_images import blur_log, marker_corners
 from ipsys_log.publish.card import Card, read_card
 from ipsys_log.publish.kept_channels import cut_options, kept_channels
@@ -34,10 +36,9 @@ from ipsys_log.publish.members import (
 )
 from ipsys_log.publish.readme import readme_text
 from ipsys_log.publish.scores import SCORE_FIELDS, Score, compute_scores, scores_json
-from ipsys_log.rig.file import rig_toml
+from ipsys_log.rig.file import hide_passwords, rig_toml
 from ipsys_log.runs.cut import cut
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.select import rig_with_offsets
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["PackResult", "pack"]
@@ -171,7 +172,7 @@ def _write_texts(
 ) -> list[Member]:
     """Write all files beside the logs; return all files of the pack, with manifest and checksums."""
     with Session(logs) as session:
-        rig, from_images = rig_with_offsets(session), bool(session.images)
+        rig, from_images = _newest_rig(session), bool(session.images)
         day = datetime.fromtimestamp(session.end_ns // NS_PER_S, UTC).date().isoformat()
         facts = readme_text(card, session, rig, scores, blurred)
     log_names = [f"{LOGS}/{log.name}" for log in logs]
@@ -189,6 +190,13 @@ def _write_texts(
     members.append(describe_member(folder, CHECKSUMS))
     check_unique((member.name for member in members), str(folder))
     return members
+
+
+def _newest_rig(session: Session) -> Rig:
+    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    if not rigs:
+        raise IpsysError(f"{session}: has no rig, which a pack needs; import or record the log with a rig")
+    return hide_passwords(rigs[-1])
 
 
 def _write(folder: Path, texts: Mapping[str, str]) -> None:

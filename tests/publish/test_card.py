@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
@@ -30,6 +30,11 @@ def render(text: str) -> str:
 
 
 @given(_SIGNS)
+@example("[a]: /b")
+@example("![a](b) [a](b) <b>")
+@example("1. a")
+@example("---")
+@example("~~a~~ &amp; `b`")
 def test_escaped_text_is_shown_as_it_is(text: str) -> None:
     """A Markdown program shows the text, in a paragraph and in the cell of a table."""
     shown = html.escape(plain_text(" ".join(text.split()))).replace("&#x27;", "'")

@@ -146,7 +146,7 @@ def test_encrypted_archive_is_refused(packed: Path, tmp_path: Path, refuse: Refu
     data = bytearray((packed / "dataset.zip").read_bytes())
     data[data.index(b"PK\x01\x02") + 8] |= 1
     (tmp_path / "e.zip").write_bytes(data)
-    refuse(tmp_path / "e.zip", "is encrypted")
+    refuse(tmp_path / "e.zip", "is encrypted; give the pack without a password")
 
 
 @pytest.fixture

@@ -127,8 +127,9 @@ def test_cut_by_time_equals_filter_with_mcap(whole: Path, tmp_path: Path) -> Non
         (CutOptions(runs=("stock",)), lambda row: not row.topic.startswith("/runs/rigid/")),
         # The record of the run that it has read comes with it, and its camera points do not.
         (CutOptions(runs=("rigid",)), lambda row: not row.topic.startswith("/runs/stock/")),
+        (CutOptions(exclude_runs=("rigid",)), lambda row: not row.topic.startswith("/runs/rigid/")),
     ],
-    ids=["topics", "exclude", "cameras", "runs", "runs_with_inputs"],
+    ids=["topics", "exclude", "cameras", "runs", "runs_with_inputs", "exclude_runs"],
 )
 def test_cut_by_name_keeps_these_channels(
     whole: Path, tmp_path: Path, options: CutOptions, keep: Callable[[Row], bool]
@@ -136,7 +137,7 @@ def test_cut_by_name_keeps_these_channels(
     part = tmp_path / "part.mcap"
     cut([whole], part, options)
     rows = expected(stock_rows(whole), keep)
-    if options.runs == ("stock",):
+    if options.runs == ("stock",) or options.exclude_runs:
         rows = [row for row in rows if row.topic != "/runs/rigid/record"]
     assert stock_rows(part) == rows
 

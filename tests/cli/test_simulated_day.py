@@ -203,7 +203,6 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("plan", "session.mcap", "--places", 2)
     day("report", "session.mcap")
     day("export", "a.mcap", "-o", "a.csv")
-<<<<<<< HEAD
     day("pack", "--card-form", "card.toml")
     form = (day.folder / "card.toml").read_text()
     for key, value in (("title", '"Day"'), ("authors", '["Lab"]'), ("licence", '"CC0-1.0"')):
@@ -212,11 +211,9 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     pack = ("-o", "dataset.zip", "--card", "card.toml", "--model", "rigid", "--without-images")
     day("pack", "session.mcap", *pack)
     assert "come out as stated" in day("score", "dataset.zip")
-=======
     day("export", "a.mcap", "-o", "bag.mcap", "--format", "ros2")
     day("export", "a.mcap", "-o", "a.mp4", "--size", "320x180", "--frame-rate", 5)
     day("export", "a.mcap", "-o", "coco", "--format", "coco")
->>>>>>> exch
     for stage in ("detect", "camera-frame", "fit", "locate", "fuse", "smooth"):
         day(stage, "session.mcap")
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)

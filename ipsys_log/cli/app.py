@@ -19,6 +19,7 @@ from ipsys_log.cli import (
     cut,
     drift,
     drive,
+    exclude,
     export,
     imports,
     inspect,
@@ -42,7 +43,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure"),
         *("calibrate-lab", "replay", "live"),
     ),
-    "Accuracy, and the next points to measure": ("evaluate", "plan", "report", "drift"),
+    "Accuracy, and the next points to measure": ("evaluate", "exclude", "plan", "report", "drift"),
     "Inspect a log": (
         *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
         *("cut", "verify", "diff", "latency", "repair"),
@@ -115,6 +116,10 @@ ipsys live --model-from calibration.mcap -o monday.mcap --udp 9870
 ipsys evaluate calibration.mcap                    # all models
 ipsys evaluate calibration.mcap --details          # with details
 ipsys evaluate calibration.mcap --model poly --model best --plots figures
+""",
+    "exclude": """
+ipsys exclude calibration.mcap p007 p012 --reason "the tape sagged"
+ipsys exclude calibration.mcap p012 --readmit --reason "tape was straight"
 """,
     "plan": """
 ipsys plan calibration.mcap --places 5 --plot next.png
@@ -234,7 +239,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, drift, inspect, contents, export, stream, cut, compare, drive),
+    *(exclude, plan, drift, inspect, contents, export, stream, cut, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

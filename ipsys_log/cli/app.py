@@ -14,6 +14,7 @@ from ipsys_log.cli import (
     calibrate,
     calibrate_lab,
     cameras,
+    compact,
     compare,
     contents,
     cut,
@@ -46,7 +47,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
     "Accuracy, and the next points to measure": ("evaluate", "exclude", "plan", "report", "drift"),
     "Inspect a log": (
         *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
-        *("cut", "verify", "diff", "latency", "repair"),
+        *("cut", "compact", "verify", "diff", "latency", "repair"),
     ),
     _STAGES: (),
     "Without cameras": ("simulate", "drive", "import"),
@@ -165,6 +166,10 @@ ipsys cut monday.mcap -o part.mcap --start '2026-05-04 10:00' --camera red
 ipsys cut monday.mcap -o small.mcap --exclude-topics '/cameras/*/image'
 ipsys cut monday.mcap -o poly.mcap --run poly
 """,
+    "compact": """
+ipsys compact calibration.mcap --dry-run           # which runs, how much?
+ipsys compact calibration.mcap -o small.mcap
+""",
     "verify": """
 ipsys verify monday.mcap                           # all of its runs
 """,
@@ -239,7 +244,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(exclude, plan, drift, inspect, contents, export, stream, cut, compare, drive),
+    *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

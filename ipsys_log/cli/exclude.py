@@ -26,9 +26,7 @@ def exclude(
         list[str],
         typer.Argument(metavar="POINT", help="Names of calibration points, such as p007."),
     ],
-    reason: Annotated[
-        str, typer.Option(metavar="TEXT", help="The reason, which is written into the log.")
-    ],
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which is written into the log.")],
     readmit: Annotated[
         bool, typer.Option("--readmit", help="Use excluded points again, instead of excluding points.")
     ] = False,

@@ -5,6 +5,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -221,9 +222,24 @@ class LogReader:
         """Read every byte of the log, and compare records, CRCs, indexes, summary and stored hashes."""
         return check_file(self._view, self._contents, stored_hashes(self._view, self._contents), watch)
 
-    def sizes(self, progress: Callable[[int], None] = lambda done: None) -> list[ChannelSize]:
-        """Return the sizes of the channels, the largest first; `progress` gets the number of chunks done."""
-        return read_sizes(self._view, self._contents, progress)
+    def sizes(
+        self, progress: Callable[[int], None] = lambda done: None, topics: Collection[str] | None = None
+    ) -> list[ChannelSize]:
+        """Return the sizes of the channels, the largest first; `progress` gets the number of chunks done.
+
+        With `topics`, only the chunks of these topics are read, and only their sizes are returned.
+        """
+        contents = self._contents
+        if topics is None:
+            return read_sizes(self._view, contents, progress)
+        wanted = {key for key, channel in contents.channels.items() if channel.topic in topics}
+        chunks = [
+            chunk
+            for chunk in contents.chunks
+            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets)
+        ]
+        sizes = read_sizes(self._view, replace(contents, chunks=chunks), progress)
+        return [size for size in sizes if size.topic in topics]
 
     def _topics_by_id(self, topics: Collection[str] | None) -> dict[int, str]:
         wanted = self.channels.keys() if topics is None else set(topics)

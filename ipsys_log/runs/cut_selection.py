@@ -19,7 +19,7 @@ from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo
 from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, POSITIONS, RECORD, RIG
-from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.provenance import newest_run, with_inputs
 from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["CutOptions", "Selection", "select"]
@@ -256,12 +256,7 @@ def _with_inputs(session: Session, runs: Iterable[str]) -> set[str]:
     inputs: dict[str, set[str]] = {}
     for record in session.runs():
         inputs.setdefault(record.run, set()).update(record.input_runs)
-    waiting, reached = list(runs), set(runs)
-    while waiting:
-        new = inputs.get(waiting.pop(), set()) - reached
-        reached |= new
-        waiting += new
-    return reached
+    return with_inputs(runs, inputs)
 
 
 def _matches(topic: str, patterns: Iterable[str]) -> bool:

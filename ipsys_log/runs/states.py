@@ -13,9 +13,9 @@ from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
 from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
 from ipsys_log.runs.provenance import is_complete, recorded_version
 
-__all__ = ["Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
+__all__ = ["CURRENT", "Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
 
-_CURRENT = "current"
+CURRENT = "current"
 # The record of a model that was fitted to measurements of the same log has one of these parameters.
 _FITTED_HERE = frozenset(("train", "seed"))
 
@@ -37,7 +37,7 @@ class Recorded:
 
     run: Run
     method: str
-    state: str = _CURRENT
+    state: str = CURRENT
     out_of_date: bool = False
     is_newer: bool = False
     is_part: bool = False
@@ -125,7 +125,7 @@ def _judge(session: Session, one: Recorded) -> Recorded:
 def _judge_inputs(one: Recorded, stale: Collection[str]) -> Recorded:
     """Return a stage; mark a current stage as out of date if it read a ``stale`` topic."""
     names = [str(run_of_topic(read.topic)) for read in one.run.inputs if read.topic in stale]
-    if one.state != _CURRENT or not names:
+    if one.state != CURRENT or not names:
         return one
     return replace(one, state=f"out of date: input {names[0]} is", out_of_date=True)
 

@@ -26,6 +26,7 @@ from ipsys_log.cli import (
     inspect,
     markers,
     measure,
+    merge,
     plan,
     record,
     setup,
@@ -47,7 +48,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
     "Accuracy, and the next points to measure": ("evaluate", "exclude", "plan", "report", "drift"),
     "Inspect a log": (
         *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
-        *("cut", "compact", "verify", "diff", "latency", "repair"),
+        *("cut", "compact", "merge", "verify", "diff", "latency", "repair"),
     ),
     _STAGES: (),
     "Without cameras": ("simulate", "drive", "import"),
@@ -170,6 +171,10 @@ ipsys cut monday.mcap -o poly.mcap --run poly
 ipsys compact calibration.mcap --dry-run           # which runs, how much?
 ipsys compact calibration.mcap -o small.mcap
 """,
+    "merge": """
+ipsys merge monday_a.mcap monday_b.mcap -o monday.mcap
+ipsys merge a.mcap b.mcap c.mcap -o day.mcap --offset b=0.012 --offset c=-1
+""",
     "verify": """
 ipsys verify monday.mcap                           # all of its runs
 """,
@@ -244,7 +249,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, compare, drive),
+    *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, merge, compare, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

@@ -149,6 +149,7 @@ class LogReader:
         topics: Collection[str] | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
+        without: Collection[int] = (),
     ) -> Iterator[RawMessage]:
         """Return the messages in log order: by log time, then by offset in the file.
 
@@ -158,6 +159,8 @@ class LogReader:
             The topics to read; None means all topics. A topic that is not in the log has no messages.
         start_ns, end_ns
             Half-open range of log time in ns: start <= log time < end.
+        without
+            Offsets of chunks that are left out.
 
         Raises
         ------
@@ -174,6 +177,7 @@ class LogReader:
             for chunk in contents.chunks
             if chunk.start_ns <= span[1]
             and chunk.end_ns >= span[0]
+            and chunk.offset not in without
             and (not chunk.index_offsets or not wanted.keys().isdisjoint(chunk.index_offsets))
         ]
         if span[1] < span[0] or not wanted:

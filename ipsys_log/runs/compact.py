@@ -65,7 +65,7 @@ def compact(
     overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
 ) -> None:
-    """Write a copy of a log without its superseded runs; topic, times and data of all other messages stay the same.
+    """Write a copy of a log without its superseded runs; all other messages stay the same.
 
     The copy gets its name when it is complete. Each kept channel has the same messages, so the records of the
     kept runs are true for the copy, too.

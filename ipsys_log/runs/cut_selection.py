@@ -18,7 +18,7 @@ from ipsys_log.images.video import is_keyframe
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo
-from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, POSITIONS, RECORD, RIG
+from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, MERGES, POSITIONS, RECORD, RIG
 from ipsys_log.runs.provenance import newest_run, with_inputs
 from ipsys_log.units import NS_PER_S, format_time
 
@@ -173,7 +173,7 @@ class _TopicRule:
             is_read = run in self.read_too and topic in self.lasting
             if not is_read:
                 return True
-        if topic in (RECORD.topic_of(run), CUTS.topic):
+        if topic in (RECORD.topic_of(run), CUTS.topic, MERGES.topic):
             return False
         if camera is not None and options.cameras and camera not in options.cameras:
             return True

@@ -8,11 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ipsys_log.log.codec import encode
-from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, Run
 from ipsys_log.runs.graph import versioned_names
-from ipsys_log.runs.origins import is_cut, is_whole
+from ipsys_log.runs.origins import own_inputs
 from ipsys_log.runs.provenance import is_complete, recorded_version, with_inputs
 from ipsys_log.runs.states import CURRENT, Recorded, recorded_stages
 
@@ -75,7 +74,7 @@ def superseded_runs(session: Session) -> list[SupersededRun]:
 
 
 def _newer_stages(session: Session, stages: Sequence[Recorded]) -> dict[int, str]:
-    """Return the newest run that supersedes a stage, by the identity of the stage; other stages are missing."""
+    """Return the newest run that supersedes a stage, by the identity of the stage."""
     newest: dict[bytes, Recorded] = {}
     newer: dict[int, str] = {}
     for stage, branch in reversed([*zip(stages, _branches(session, stages), strict=True)]):
@@ -99,7 +98,7 @@ def _branches(session: Session, stages: Iterable[Recorded]) -> list[bytes]:
     writers: dict[str, bytes] = {}  # the branch by topic; a stage reads channels of earlier stages only
     branches = []
     for stage in stages:
-        own = _own_inputs(session, stage.run)
+        own = own_inputs(session, stage.run)
         inputs = {
             writers.get(read.topic, b"") if read.topic in own else read.topic.encode()
             for read in stage.run.inputs
@@ -121,19 +120,9 @@ def _branch(stage: Recorded, inputs: Iterable[bytes]) -> bytes:
     return state.digest()
 
 
-def _own_inputs(session: Session, run: Run) -> dict[str, str]:
-    """Return the topics of runs of this log that a stage has read, each with its run."""
-    reads = ((read, run_of_topic(read.topic)) for read in run.inputs)
-    return {
-        read.topic: name
-        for read, name in reads
-        if name is not None and (is_whole(session, read) or is_cut(session, read))
-    }
-
-
 def _read_runs(session: Session, runs: Iterable[Run]) -> dict[str, set[str]]:
     """Return by run the runs of this log that its stages have read."""
     reads: dict[str, set[str]] = {}
     for run in runs:
-        reads.setdefault(run.run, set()).update(_own_inputs(session, run).values())
+        reads.setdefault(run.run, set()).update(own_inputs(session, run).values())
     return reads

@@ -64,7 +64,7 @@ def superseded(log: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="session")
 def grown_log(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The simulated session with two rigid models, of which the first is superseded, and a run without end."""
+    """The simulated session with two rigid models, the first superseded, and an unfinished run."""
 
     def write(folder: Path) -> None:
         log = folder / "lab.mcap"
@@ -266,7 +266,7 @@ def _dropped(steps: list[Step], unfinished: frozenset[int]) -> set[str]:
         branch[run] = (run[0], stage, frozenset(branch[name] for name in reads))
     finished = [run for n, (run, _, _) in enumerate(steps) if n not in unfinished]
     newest = {branch[run]: run for run in finished}
-    kept = waiting = {run for run in newest.values()}
+    kept = waiting = set(newest.values())
     reads_of = {run: set(reads) for run, _, reads in steps}
     while waiting:
         waiting = set().union(*(reads_of[run] for run in waiting)) - kept

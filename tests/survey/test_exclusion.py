@@ -159,8 +159,8 @@ def test_last_message_about_a_point_decides(steps: list[tuple[str, str]]) -> Non
             continue
         if row is not None:
             row[2] = kind == "readmit"
-        names = {"withdraws": name} if kind == "exclude" else {"readmits": name}
-        message = Measurement(number, f"{kind}_{number}", reason="why", **names)
+        withdraws, readmits = (name, None) if kind == "exclude" else (None, name)
+        message = Measurement(number, f"{kind}_{number}", withdraws, readmits=readmits, reason="why")
         # The reason and the name survive the log.
         history.append(decode(schema_name(Measurement), encode(message)))
     assert [(m.id, m.timestamp) for m in active_measurements(history)] == [

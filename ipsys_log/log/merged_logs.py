@@ -61,7 +61,7 @@ class MergeSource:
         wanted = [topic for topic, name in self.topics.items() if topics is None or name in topics]
         schemas = {topic: self.reader.channels[topic].schema for topic in wanted}
         names = {topic: schema.name if schema else "" for topic, schema in schemas.items()}
-        for raw in self.reader.messages(wanted, without=without):
+        for raw in self.reader.messages(wanted, without=without, is_checked=True):
             data = bytes(raw.data)
             try:
                 if raw.topic in self.changes:

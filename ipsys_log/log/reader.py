@@ -150,6 +150,7 @@ class LogReader:
         start_ns: int | None = None,
         end_ns: int | None = None,
         without: Collection[int] = (),
+        is_checked: bool = False,
     ) -> Iterator[RawMessage]:
         """Return the messages in log order: by log time, then by offset in the file.
 
@@ -161,6 +162,8 @@ class LogReader:
             Half-open range of log time in ns: start <= log time < end.
         without
             Offsets of chunks that are left out.
+        is_checked
+            Read each chunk as a whole, and check its CRC.
 
         Raises
         ------
@@ -172,7 +175,9 @@ class LogReader:
         span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
         pending = [
             PendingChunk(
-                chunk.start_ns, chunk.offset, partial(open_chunk, view, self._cache, chunk, wanted, span)
+                chunk.start_ns,
+                chunk.offset,
+                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
             )
             for chunk in contents.chunks
             if chunk.start_ns <= span[1]

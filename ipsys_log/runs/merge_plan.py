@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import NamedTuple
 
@@ -15,11 +15,11 @@ from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import MergeSource
 from ipsys_log.log.shifted_times import check_shift
-from ipsys_log.messages import FrameTransforms, Rig, Run
-from ipsys_log.messages.channels import MEASUREMENTS, POSES, RECORD, RIG
+from ipsys_log.messages import Cut, FrameTransforms, Merge, Rig, Run
+from ipsys_log.messages.channels import CUTS, MEASUREMENTS, MERGES, POSES, RECORD, RIG
 from ipsys_log.rig.combination import combine_rigs
 from ipsys_log.runs.origins import own_inputs
-from ipsys_log.runs.renaming import rename_frames, rename_record, rename_topic
+from ipsys_log.runs.renaming import rename_channels, rename_frames, rename_record, rename_topic
 
 __all__ = ["LogOffset", "MergePlan", "check_logs_differ", "plan_merge"]
 
@@ -218,7 +218,20 @@ def _name_changes(session: Session, names: Mapping[str, str]) -> dict[str, Calla
     def change_frames(data: bytes) -> bytes:
         return encode(rename_frames(decode(schema_name(FrameTransforms), data), names))
 
+    def change_cut(data: bytes) -> bytes:
+        return encode(rename_channels(decode(schema_name(Cut), data), names))
+
+    def change_merge(data: bytes) -> bytes:
+        record: Merge = decode(schema_name(Merge), data)
+        logs = tuple(rename_channels(log, names) for log in record.logs)
+        return encode(replace(record, logs=logs))
+
     runs = sorted(session.run_names())
     records = [topic for run in runs for topic in session.topics(RECORD, run)]
     poses = [topic for run in names for topic in session.topics(POSES, run)]
-    return {**dict.fromkeys(records, change_record), **dict.fromkeys(poses, change_frames)}
+    return {
+        **dict.fromkeys(records, change_record),
+        **dict.fromkeys(poses, change_frames),
+        CUTS.topic: change_cut,
+        MERGES.topic: change_merge,
+    }

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from ipsys_log.log.contents import run_of_topic
-from ipsys_log.messages import FrameTransforms, Run
+from ipsys_log.messages import Cut, FrameTransforms, MergedLog, Run
 
-__all__ = ["rename_frames", "rename_record", "rename_topic"]
+__all__ = ["rename_channels", "rename_frames", "rename_record", "rename_topic"]
+
+
+Origins = TypeVar("Origins", Cut, MergedLog)
 
 
 def rename_topic(topic: str, names: Mapping[str, str]) -> str:
@@ -41,6 +44,12 @@ def rename_frames(payload: Any, names: Mapping[str, str]) -> Any:
 def _rename_frame(frame_id: str, names: Mapping[str, str]) -> str:
     run, slash, robot = frame_id.partition("/")
     return f"{names.get(run, run)}{slash}{robot}"
+
+
+def rename_channels(record: Origins, names: Mapping[str, str]) -> Origins:
+    """Return the record of a cut, or of a log in a merge, with the new names of runs in its channels."""
+    channels = tuple(replace(one, topic=rename_topic(one.topic, names)) for one in record.channels)
+    return replace(record, channels=channels)
 
 
 def rename_record(run: Run, names: Mapping[str, str], own: Collection[str]) -> Run:

@@ -298,6 +298,6 @@ def test_damaged_log_leaves_no_merged_log(tmp_path: Path) -> None:
     data = bytearray(b.read_bytes())
     data[data.index(bytes([2]) * 40_000) + 20_000] ^= 1
     b.write_bytes(data)
-    with pytest.raises(IpsysError):
+    with pytest.raises(IpsysError, match="CRC of the chunk is wrong"):
         merge([a, b], tmp_path / "all.mcap", [LogOffset(), LogOffset(5)])
     assert sorted(tmp_path.iterdir()) == [a, b]

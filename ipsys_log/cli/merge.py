@@ -51,7 +51,7 @@ def merge(
 
     check_copy(logs, output, overwrite)
     with progress_bar() as progress:
-        offsets = choose_offsets(logs, offset or ())
+        offsets = choose_offsets(logs, offset or (), progress)
         result = merge_logs(logs, output, offsets, overwrite, progress)
     if as_json:
         print(json.dumps(_as_json(output, result), indent=2))  # noqa: T201

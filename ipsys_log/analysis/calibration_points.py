@@ -10,6 +10,7 @@ from ipsys_log.analysis.pairs import (
     gather_sightings,
     split,
     valid_measurements,
+    withdrawals,
 )
 from ipsys_log.messages import Measurement, Pair, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
@@ -45,8 +46,8 @@ def find_pairs(view: StageView, points: list[RiggedMeasurement]) -> dict[str, li
 def has_measurements(view: StageView) -> bool:
     """Return whether a measurement was entered and not withdrawn."""
     entered: list[Measurement] = view.payloads(MEASUREMENTS)
-    withdrawn = {measurement.withdraws for measurement in entered}
-    return any(m.withdraws is None and m.id not in withdrawn for m in entered)
+    withdrawn = withdrawals(entered)
+    return any(m.is_point and m.id not in withdrawn for m in entered)
 
 
 def split_ids(measurements: Iterable[Measurement], options: Mapping[str, str]) -> tuple[set[str], set[str]]:

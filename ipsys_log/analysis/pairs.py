@@ -26,6 +26,7 @@ __all__ = [
     "split",
     "still_interval",
     "valid_measurements",
+    "withdrawals",
 ]
 
 # A marker is stationary if it stays within these distances from its position at the measurement. They are
@@ -99,29 +100,57 @@ def valid_measurements(messages: Iterable[Message], override: Rig | None) -> lis
     if numbered and not rigs:
         raise IpsysError("the log has no rig (reference points, markers): give one with --rig lab.toml")
     # If an id was withdrawn and measured again, the last measurement counts.
-    last = {m.id: RiggedMeasurement(m, rigs[number]) for m, number in numbered if m.withdraws is None}
+    last = {m.id: RiggedMeasurement(m, rigs[number]) for m, number in numbered if m.is_point}
     return [place for name, place in last.items() if name in active]
 
 
 def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement]:
     """Return the measurements that are not withdrawn, in their order.
 
+    A re-admitted measurement has its former place in the order.
+
     Raises
     ------
     IpsysError
         Two measurements have the same id, or a measurement has no marker.
     """
-    active: dict[str, Measurement] = {}
+    points: dict[str, Measurement] = {}
+    withdrawn: dict[str, Measurement] = {}
     for measurement in measurements:
-        if measurement.withdraws is not None:
-            active.pop(measurement.withdraws, None)
-            continue
-        if measurement.id in active:
-            raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
-        if measurement.marker_id is None:
-            raise IpsysError(f"measurement {measurement.id} has no marker; withdraw it and measure again")
-        active[measurement.id] = measurement
-    return list(active.values())
+        if measurement.is_point:
+            if measurement.id in points and measurement.id not in withdrawn:
+                raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
+            if measurement.marker_id is None:
+                raise IpsysError(f"measurement {measurement.id} has no marker; withdraw it and measure again")
+            points.pop(measurement.id, None)
+            points[measurement.id] = measurement
+        _follow(withdrawn, measurement)
+    return [measurement for name, measurement in points.items() if name not in withdrawn]
+
+
+def withdrawals(measurements: Iterable[Measurement]) -> dict[str, Measurement]:
+    """Return the withdrawals in force by the id of their measurement.
+
+    Examples
+    --------
+    >>> gone = Measurement(0, "w", withdraws="p001", reason="the tape sagged")
+    >>> withdrawals([Measurement(0, "p001"), gone])["p001"].reason
+    'the tape sagged'
+    >>> withdrawals([Measurement(0, "p001"), gone, Measurement(0, "r", readmits="p001")])
+    {}
+    """
+    withdrawn: dict[str, Measurement] = {}
+    for measurement in measurements:
+        _follow(withdrawn, measurement)
+    return withdrawn
+
+
+def _follow(withdrawn: dict[str, Measurement], message: Measurement) -> None:
+    """Update the withdrawals in force by the next message; a new measurement ends that of its id."""
+    if message.withdraws is not None:
+        withdrawn[message.withdraws] = message
+    else:
+        withdrawn.pop(message.readmits or message.id, None)
 
 
 def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:

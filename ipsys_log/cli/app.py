@@ -14,16 +14,19 @@ from ipsys_log.cli import (
     calibrate,
     calibrate_lab,
     cameras,
+    compact,
     compare,
     contents,
     cut,
     drift,
     drive,
+    exclude,
     export,
     imports,
     inspect,
     markers,
     measure,
+    merge,
     plan,
     publish,
     record,
@@ -43,10 +46,10 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure"),
         *("calibrate-lab", "replay", "live"),
     ),
-    "Accuracy, and the next points to measure": ("evaluate", "plan", "report", "drift"),
+    "Accuracy, and the next points to measure": ("evaluate", "exclude", "plan", "report", "drift"),
     "Inspect a log": (
         *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
-        *("cut", "verify", "diff", "latency", "repair"),
+        *("cut", "compact", "merge", "verify", "diff", "latency", "repair"),
     ),
     "Publish a dataset": ("pack", "score"),
     _STAGES: (),
@@ -119,6 +122,10 @@ ipsys evaluate calibration.mcap                    # all models
 ipsys evaluate calibration.mcap --details          # with details
 ipsys evaluate calibration.mcap --model poly --model best --plots figures
 """,
+    "exclude": """
+ipsys exclude calibration.mcap p007 p012 --reason "the tape sagged"
+ipsys exclude calibration.mcap p012 --readmit --reason "tape was straight"
+""",
     "plan": """
 ipsys plan calibration.mcap --places 5 --plot next.png
 """,
@@ -165,6 +172,14 @@ ipsys cut monday.mcap -o part.mcap --start 60 --end 90
 ipsys cut monday.mcap -o part.mcap --start '2026-05-04 10:00' --camera red
 ipsys cut monday.mcap -o small.mcap --exclude-topics '/cameras/*/image'
 ipsys cut monday.mcap -o poly.mcap --run poly
+""",
+    "compact": """
+ipsys compact calibration.mcap --dry-run           # which runs, how much?
+ipsys compact calibration.mcap -o small.mcap
+""",
+    "merge": """
+ipsys merge monday_a.mcap monday_b.mcap -o monday.mcap
+ipsys merge a.mcap b.mcap c.mcap -o day.mcap --offset b=0.012 --offset c=-1
 """,
     "verify": """
 ipsys verify monday.mcap                           # all of its runs
@@ -249,7 +264,7 @@ app = typer.Typer(
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(plan, drift, inspect, contents, export, stream, cut, compare, publish, drive),
+    *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, merge, compare, publish, drive),
 )
 for module in _MODULES:
     module.add_commands(app)

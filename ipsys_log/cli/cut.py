@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import NewLog, ReadLogs
+from ipsys_log.cli.options import NewLog, Overwrite, ReadLogs
 
 __all__ = ["add_commands"]
 
@@ -68,9 +68,7 @@ def cut(
         int,
         typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera, with its results."),
     ] = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", "--force", help="Replace an existing log of this name.")
-    ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a part of a log to a new log: a time range, some topics, cameras, runs, robots or frames.
 

@@ -208,7 +208,7 @@ def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
     withdrawn = sum(measurement.withdraws is not None for measurement in added)
-    count = len(added) - withdrawn
+    count = sum(measurement.is_point for measurement in added)
     if as_json:
         print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
         return

@@ -26,6 +26,7 @@ __all__ = [
     "ModelOfOther",
     "NewLog",
     "Only",
+    "Overwrite",
     "Port",
     "ReadLogs",
     "RigFile",
@@ -113,6 +114,9 @@ Only = Annotated[
     typer.Option("--camera", metavar="NAME", help="Use only this camera of the rig; repeat it for several."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing log of this name.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", "--force", help="Replace an existing log of this name.")
+]
 Host = Annotated[
     str | None,
     typer.Option(

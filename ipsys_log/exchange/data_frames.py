@@ -292,6 +292,8 @@ def _measurement(message: Message) -> dict[str, Any]:
         "distances_m": {distance.reference: distance.distance_m for distance in measurement.distances},
         "splits": measurement.splits,
         "withdraws": measurement.withdraws,
+        "readmits": measurement.readmits,
+        "reason": measurement.reason,
     }
 
 
@@ -327,6 +329,7 @@ _COLUMNS = {
     "measurements": [
         *("time", "log_time_ns", "id", "marker_id", "side", "height_m", "x_m", "y_m", "z_m"),
         *("still_start", "still_end", "distances_m", "splits", "withdraws"),
+        *("readmits", "reason"),
     ],
     "events": ["time", "log_time_ns", "kind", "camera", "marker_id", "text"],
     "latency": ["time", "log_time_ns", "camera", "received", "detected", "located", "fused", "published"],

@@ -241,18 +241,26 @@ class _Records:
 
 
 def open_chunk(
-    view: LogBytes, cache: RangeCache, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
+    view: LogBytes,
+    cache: RangeCache,
+    chunk: ChunkRef,
+    topics: Mapping[int, str],
+    span: tuple[int, int],
+    is_checked: bool = False,
 ) -> Cursor:
-    """Return a cursor over the messages of the channels in `topics` with start <= log time <= end."""
+    """Return a cursor over the messages of the channels in `topics` with start <= log time <= end.
+
+    With `is_checked`, the chunk is read as a whole, and its CRC is checked.
+    """
     offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
     packed = chunk.compressed_size
     check_compression(view, name)
     entries = chunk_entries(view, chunk, cache.searched)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
-    if name and packed > _SMALL and packed > len(rows) * _SPARSE:
+    if not is_checked and name and packed > _SMALL and packed > len(rows) * _SPARSE:
         records.raw = find_blocks(view, name, offset + CHUNK_HEAD_SIZE + len(name), packed, size)
-    if name and records.raw is None:
+    if is_checked or (name and records.raw is None):
         ranges, fetch = [(0, size)] * len(rows), records.unpacked
     else:
         ranges, fetch = runs(entries, rows, size), partial(cache.fetch, offset, records.read)

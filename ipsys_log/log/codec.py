@@ -50,6 +50,7 @@ PAYLOADS: dict[str, type] = {
             messages.Latency,
             messages.Markers,
             messages.Measurement,
+            messages.Merge,
             messages.Model,
             messages.Positions,
             messages.Rig,

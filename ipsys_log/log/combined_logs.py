@@ -96,10 +96,14 @@ def find_new_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
 
 
 def rename_ids(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
-    """Return a measurement, or a withdrawal, with the new ids of its log."""
-    withdrawn = measurement.withdraws
+    """Return a measurement, a withdrawal, or a re-admission, with the new ids of its log."""
+
+    def new_id(name: str | None) -> str | None:
+        return None if name is None else ids.get(name, name)
+
     return replace(
         measurement,
         id=ids.get(measurement.id, measurement.id),
-        withdraws=None if withdrawn is None else ids.get(withdrawn, withdrawn),
+        withdraws=new_id(measurement.withdraws),
+        readmits=new_id(measurement.readmits),
     )

@@ -10,6 +10,7 @@ import heapq
 import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -31,12 +32,13 @@ from ipsys_log.log.contents import (
     run_of_topic,
 )
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import Cut, Measurement, Message, Run
+from ipsys_log.messages import Cut, Measurement, Merge, MergedLog, Message, Run
 from ipsys_log.messages.channels import (
     CALIBRATIONS,
     CUTS,
     IMAGES,
     MEASUREMENTS_TOPIC,
+    MERGES,
     Channel,
     channel_of,
 )
@@ -292,14 +294,27 @@ class Session:
         return sorted(runs, key=lambda run: run.number)
 
     @cached_property
-    def cuts(self) -> dict[LogReader, list[Cut]]:
-        """The records of cuts of each log that is a part of another one, the oldest first."""
-        topics = self.topics(CUTS)
+    def cuts(self) -> dict[LogReader, list[Cut | MergedLog]]:
+        """The records of cuts and of merges of each log that was made from others, the oldest first.
+
+        A merge has one record for each of its logs.
+        """
+        topics = [*self.topics(CUTS), *self.topics(MERGES)]
         parts = {
-            reader: [message.payload for message in self._decoded(reader, items, topics, None, None)]
+            reader: [
+                record
+                for message in self._decoded(reader, items, topics, None, None)
+                for record in _origin_records(message.payload)
+            ]
             for reader, items in (self._items() if topics else ())
         }
         return {reader: cuts for reader, cuts in parts.items() if cuts}
+
+    def with_images(self, topics: Collection[str]) -> Session:
+        """Return a view of these logs with the images of these topics only; it ends with this session."""
+        view = copy(self)
+        view.images = {camera: topic for camera, topic in self.images.items() if topic in topics}
+        return view
 
     def _check_same_parameters(self) -> None:
         names = [{run_of_topic(topic) for topic in reader.channels} - {None} for reader in self.readers]
@@ -386,6 +401,10 @@ class Session:
                     items = PartCounter(reader.read_limits.max_items)
                     return str(_payload(reader, raw, items).frame_id)
         return ""
+
+
+def _origin_records(payload: Cut | Merge) -> tuple[Cut | MergedLog, ...]:
+    return payload.logs if isinstance(payload, Merge) else (payload,)
 
 
 def _payload(reader: LogReader, raw: RawMessage, items: PartCounter) -> Any:

@@ -18,7 +18,7 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
 from ipsys_log.log.writer import LogWriter
 
-__all__ = ["Choose", "copy_messages", "copy_records"]
+__all__ = ["Choose", "copy_chunk", "copy_messages", "copy_records"]
 
 # From a topic and log times in ns, (n,), to those that are kept, (n,).
 Choose = Callable[[str, NDArray[np.int64]], NDArray[np.bool_]]
@@ -46,22 +46,34 @@ def copy_messages(
     """
     view, contents = reader.view, reader.contents
     for chunk in sorted(contents.chunks, key=lambda chunk: chunk.offset):
-        entries = chunk_entries(view, chunk, {})
-        kept = _kept_rows(contents, entries, choose)
-        if kept:
-            ids = {key: _adopt(contents, writer, key) for key in kept}
-            is_whole = all(len(kept.get(key, ())) == len(rows) for key, rows in entries.items())
-            if chunk.index_length and is_whole and all(key == own for key, own in ids.items()):
-                _copy_chunk(view, contents, chunk, entries, writer)
-            else:
-                data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
-                _copy_rows(view, contents, kept, writer, _Bytes(data).read)
+        copy_chunk(reader, writer, chunk, choose)
         advance(chunk.end)
     unchunked = _kept_rows(contents, to_rows(contents.unchunked), choose)
     if unchunked:
         for key in unchunked:
             _adopt(contents, writer, key)
         _copy_rows(view, contents, unchunked, writer, lambda low, high: view.read(low, high - low))
+
+
+def copy_chunk(
+    reader: LogReader, writer: LogWriter, chunk: ChunkRef, choose: Choose, is_distinct: bool = False
+) -> None:
+    """Copy the chosen messages of a chunk; errors are those of `copy_messages`.
+
+    With ``is_distinct``, a channel with other metadata is another channel.
+    """
+    view, contents = reader.view, reader.contents
+    entries = chunk_entries(view, chunk, {})
+    kept = _kept_rows(contents, entries, choose)
+    if not kept:
+        return
+    ids = {key: _adopt(contents, writer, key, is_distinct) for key in kept}
+    is_whole = all(len(kept.get(key, ())) == len(rows) for key, rows in entries.items())
+    if chunk.index_length and is_whole and all(key == own for key, own in ids.items()):
+        _copy_chunk(view, contents, chunk, entries, writer)
+    else:
+        data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
+        _copy_rows(view, contents, kept, writer, _Bytes(data).read, is_distinct)
 
 
 def copy_records(reader: LogReader, writer: LogWriter) -> None:
@@ -113,9 +125,9 @@ class _Bytes:
         return self._data[low:high]
 
 
-def _adopt(contents: Contents, writer: LogWriter, key: int) -> int:
+def _adopt(contents: Contents, writer: LogWriter, key: int, is_distinct: bool = False) -> int:
     channel = contents.channels[key]
-    return writer.adopt_channel(channel, contents.schemas.get(channel.schema_id))
+    return writer.adopt_channel(channel, contents.schemas.get(channel.schema_id), is_distinct)
 
 
 def _by_offset(entries: Mapping[int, Rows]) -> list[list[int]]:
@@ -131,6 +143,7 @@ def _copy_rows(
     kept: Mapping[int, Rows],
     writer: LogWriter,
     read: Callable[[int, int], bytes],
+    is_distinct: bool = False,
 ) -> None:
     """Write messages one by one; ``read`` returns the bytes between two offsets."""
     topics = [contents.channels[key].topic for key in kept]
@@ -144,7 +157,7 @@ def _copy_rows(
             raise view.fault(offset, "a message reaches beyond the end of its chunk")
         topic = contents.channels[key].topic
         if topics.count(topic) > 1:  # its channels differ in the version of their schema
-            _adopt(contents, writer, key)
+            _adopt(contents, writer, key, is_distinct)
         writer.write(topic, log_ns, publish_ns, data)
 
 

@@ -5,6 +5,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -148,6 +149,8 @@ class LogReader:
         topics: Collection[str] | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
+        without: Collection[int] = (),
+        is_checked: bool = False,
     ) -> Iterator[RawMessage]:
         """Return the messages in log order: by log time, then by offset in the file.
 
@@ -157,6 +160,10 @@ class LogReader:
             The topics to read; None means all topics. A topic that is not in the log has no messages.
         start_ns, end_ns
             Half-open range of log time in ns: start <= log time < end.
+        without
+            Offsets of chunks that are left out.
+        is_checked
+            Read each chunk as a whole, and check its CRC.
 
         Raises
         ------
@@ -168,11 +175,14 @@ class LogReader:
         span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
         pending = [
             PendingChunk(
-                chunk.start_ns, chunk.offset, partial(open_chunk, view, self._cache, chunk, wanted, span)
+                chunk.start_ns,
+                chunk.offset,
+                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
             )
             for chunk in contents.chunks
             if chunk.start_ns <= span[1]
             and chunk.end_ns >= span[0]
+            and chunk.offset not in without
             and (not chunk.index_offsets or not wanted.keys().isdisjoint(chunk.index_offsets))
         ]
         if span[1] < span[0] or not wanted:
@@ -221,9 +231,24 @@ class LogReader:
         """Read every byte of the log, and compare records, CRCs, indexes, summary and stored hashes."""
         return check_file(self._view, self._contents, stored_hashes(self._view, self._contents), watch)
 
-    def sizes(self, progress: Callable[[int], None] = lambda done: None) -> list[ChannelSize]:
-        """Return the sizes of the channels, the largest first; `progress` gets the number of chunks done."""
-        return read_sizes(self._view, self._contents, progress)
+    def sizes(
+        self, progress: Callable[[int], None] = lambda done: None, topics: Collection[str] | None = None
+    ) -> list[ChannelSize]:
+        """Return the sizes of the channels, the largest first; `progress` gets the number of chunks done.
+
+        With `topics`, only the chunks of these topics are read, and only their sizes are returned.
+        """
+        contents = self._contents
+        if topics is None:
+            return read_sizes(self._view, contents, progress)
+        wanted = {key for key, channel in contents.channels.items() if channel.topic in topics}
+        chunks = [
+            chunk
+            for chunk in contents.chunks
+            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets)
+        ]
+        sizes = read_sizes(self._view, replace(contents, chunks=chunks), progress)
+        return [size for size in sizes if size.topic in topics]
 
     def _topics_by_id(self, topics: Collection[str] | None) -> dict[int, str]:
         wanted = self.channels.keys() if topics is None else set(topics)

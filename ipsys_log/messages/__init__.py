@@ -40,6 +40,7 @@ from ipsys_log.messages.images import (
 )
 from ipsys_log.messages.markers import CameraPoint, CameraPoints, Marker, MarkerPose, Markers
 from ipsys_log.messages.measurements import Distance, Interval, Measurement, WorldPoint
+from ipsys_log.messages.merges import Merge, MergedLog
 from ipsys_log.messages.message import Corners, Floats, Mat33, Mat34, Mat88, Message, TimeNs, Vec3
 from ipsys_log.messages.models import (
     CameraEvaluation,
@@ -125,6 +126,8 @@ __all__ = [
     "Mat34",
     "Mat88",
     "Measurement",
+    "Merge",
+    "MergedLog",
     "Message",
     "Model",
     "Noise",

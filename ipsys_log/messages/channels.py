@@ -17,6 +17,7 @@ from ipsys_log.messages.images import (
 )
 from ipsys_log.messages.markers import CameraPoints, Markers
 from ipsys_log.messages.measurements import Measurement
+from ipsys_log.messages.merges import Merge
 from ipsys_log.messages.models import Evaluation, Model
 from ipsys_log.messages.rig import CameraCalibration, Rig
 from ipsys_log.messages.runs import Run
@@ -39,6 +40,7 @@ __all__ = [
     "MARKERS",
     "MEASUREMENTS",
     "MEASUREMENTS_TOPIC",
+    "MERGES",
     "MODEL",
     "PATHS",
     "PATHS_TOPIC",
@@ -116,6 +118,7 @@ TRUTH = Channel(name="truth", topic="/truth/tracks", payloads=(Tracks,), by_sche
 PATHS = Channel(name="paths", topic="/robots/paths", payloads=(RobotPath,), by_schema=True, lasting=True)
 COMMANDS = Channel(name="commands", topic="/robots/commands", payloads=(WheelCommand,), by_schema=True)
 CUTS = Channel(name="cuts", topic="/cuts", payloads=(Cut,), lasting=True)
+MERGES = Channel(name="merges", topic="/merges", payloads=(Merge,), lasting=True)
 
 RECORD = Channel(name="record", topic="/runs/{run}/record", payloads=(Run,), lasting=True)
 MARKERS = Channel(name="markers", topic="/runs/{run}/cameras/{camera}/markers", payloads=(Markers,))
@@ -135,7 +138,7 @@ POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransfor
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
 
 CHANNELS: tuple[Channel, ...] = (
-    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS),
+    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS, MERGES),
     *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
     *(SMOOTHED_TRACKS, RUN_EVENTS),
 )

@@ -13,7 +13,8 @@ __all__ = ["ChannelCut", "Cut"]
 class ChannelCut:
     """A channel before a cut (``messages``, ``hash``) and after it (``kept``, ``kept_hash``).
 
-    ``left_out`` says that the options exclude the whole channel.
+    ``left_out`` says that the options exclude the whole channel. In a merged log, ``shared`` says that the
+    channel also has messages of other logs, or was changed.
     """
 
     topic: str
@@ -22,6 +23,7 @@ class ChannelCut:
     kept: int
     kept_hash: str | None = None
     left_out: bool = False
+    shared: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

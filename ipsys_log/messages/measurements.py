@@ -31,7 +31,11 @@ class WorldPoint:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A tape measurement of one marker at one calibration point; or, with ``withdraws``, a withdrawal."""
+    """A tape measurement of one marker at one calibration point; or a withdrawal, or a re-admission.
+
+    A message with ``withdraws`` or ``readmits`` has the id of a measurement there, and perhaps a reason. The
+    last message about a measurement counts.
+    """
 
     timestamp: TimeNs
     id: str
@@ -45,3 +49,15 @@ class Measurement:
     point: WorldPoint | None = None
     splits: tuple[str, ...] = ()
     calibration_point: str | None = None
+    readmits: str | None = None
+    reason: str | None = None
+
+    @property
+    def is_point(self) -> bool:
+        """Return whether the message is a measurement, and no withdrawal or re-admission."""
+        return self.refers_to is None
+
+    @property
+    def refers_to(self) -> str | None:
+        """The id of the measurement that this message withdraws or re-admits; None for a measurement."""
+        return self.withdraws if self.withdraws is not None else self.readmits

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.interrupts import undivided
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.known_contents import one_reading
@@ -21,7 +19,7 @@ from ipsys_log.messages import ChannelCut, Cut, Message
 from ipsys_log.messages.channels import CUTS
 from ipsys_log.runs.cut_selection import CutOptions, Selection, select
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.output import write_message
+from ipsys_log.runs.output import check_copy, create_copy, write_message
 
 __all__ = ["CutResult", "cut"]
 
@@ -60,13 +58,11 @@ def cut(
         The output exists or is one of the logs, an option names nothing in the logs, or no message is
         selected.
     """
-    _check_output(paths, output, overwrite)
+    check_copy(paths, output, overwrite)
     with Session(paths) as session:
         _check_ids(session)
         selection = select(session, options)
-        with ExitStack() as stack:
-            with undivided():
-                writer = stack.enter_context(LogWriter.create(output, atomic=True, overwrite=overwrite))
+        with create_copy(output, overwrite) as writer:
             _copy(session, writer, selection, progress)
             channels = _channel_cuts(session, writer, selection)
             if not any(one.kept for one in channels if selection.is_ranged(one.topic)):
@@ -80,15 +76,6 @@ def cut(
             write_message(writer, Message(CUTS.topic, last_ns, last_ns, record), {})
         counts = [(one.kept, one.messages, one.kept > 0) for one in channels]
     return CutResult(*(sum(column) for column in zip(*counts, strict=True)))
-
-
-def _check_output(paths: Sequence[Path], output: Path, overwrite: bool) -> None:
-    if not output.exists():
-        return
-    if any(path.exists() and path.samefile(output) for path in paths):
-        raise IpsysError(f"-o {output}: this is the log itself; choose another name")
-    if not overwrite:
-        raise IpsysError(f"-o {output}: exists already; choose another name, or give --overwrite")
 
 
 def _check_ids(session: Session) -> None:

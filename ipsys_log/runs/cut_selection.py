@@ -18,8 +18,8 @@ from ipsys_log.images.video import is_keyframe
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo
-from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, POSITIONS, RECORD, RIG
-from ipsys_log.runs.provenance import newest_run
+from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, MERGES, POSITIONS, RECORD, RIG
+from ipsys_log.runs.provenance import newest_run, with_inputs
 from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["CutOptions", "Selection", "select"]
@@ -178,7 +178,7 @@ class _TopicRule:
             is_read = run in self.read_too and topic in self.lasting
             if not is_read:
                 return True
-        if topic in (RECORD.topic_of(run), CUTS.topic):
+        if topic in (RECORD.topic_of(run), CUTS.topic, MERGES.topic):
             return False
         if camera is not None and options.cameras and camera not in options.cameras:
             return True
@@ -261,12 +261,7 @@ def _with_inputs(session: Session, runs: Iterable[str]) -> set[str]:
     inputs: dict[str, set[str]] = {}
     for record in session.runs():
         inputs.setdefault(record.run, set()).update(record.input_runs)
-    waiting, reached = list(runs), set(runs)
-    while waiting:
-        new = inputs.get(waiting.pop(), set()) - reached
-        reached |= new
-        waiting += new
-    return reached
+    return with_inputs(runs, inputs)
 
 
 def _matches(topic: str, patterns: Iterable[str]) -> bool:

@@ -1,39 +1,48 @@
-"""Origins of the channels of a part of a log: the identity of each channel before every cut."""
+"""Origins of the channels of a part of a log, or of a merged log: their identity before each cut or merge."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from ipsys_log.log.contents import camera_of_topic
+from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import ChannelCut, ChannelRead, Run
+from ipsys_log.messages import ChannelCut, ChannelRead, MergedLog, Run
 from ipsys_log.messages.channels import Channel
 
 __all__ = [
+    "Origin",
     "cut_topics",
     "has_result",
     "is_cut",
     "is_whole",
     "left_out",
-    "logs_before_cut",
+    "origin_of_run",
+    "own_inputs",
     "present_inputs",
     "was_complete",
 ]
 
 
-class _Origin(NamedTuple):
-    """A channel before a cut: the number of its messages, their hash, and the logs that were cut."""
+class Origin(NamedTuple):
+    """A channel before a cut, or before a merge: the number of its messages, their hash, and its logs."""
 
     messages: int
     hash: str
     logs: tuple[str, ...]
+    is_merged: bool
+
+    def text(self, run: str) -> str:
+        """Return the state of a run with such a channel."""
+        if self.is_merged:
+            return f"run {run} merged from {', '.join(self.logs)}"
+        return f"part of run {run}, cut from {', '.join(self.logs)}"
 
 
-def _origins(session: Session, topic: str) -> list[_Origin]:
-    """Return a channel before each cut, the last cut first.
+def _origins(session: Session, topic: str) -> list[Origin]:
+    """Return a channel before each cut and each merge, the last one first.
 
-    A record of a cut counts only if the channel is now, or was before the next cut, as the cut has left it.
+    A record counts only if the channel is now, or was before a later record, as the cut or merge has left it.
     """
     readers = [reader for reader in session.readers if topic in reader.channels]
     if len(readers) > 1:  # the channel goes on in a second log, which the record does not know
@@ -41,12 +50,13 @@ def _origins(session: Session, topic: str) -> list[_Origin]:
     cuts = session.cuts.get(readers[0], []) if readers else [cut for c in session.cuts.values() for cut in c]
     if not cuts:
         return []
-    state, origins = (session.count(topic), session.hash(topic)), []
+    states, origins = {(session.count(topic), session.hash(topic))}, []
     for cut in reversed(cuts):
-        before = next((one for one in cut.channels if one.topic == topic), None)
-        if before is not None and (before.kept, before.kept_hash or "") == state:
-            state = before.messages, before.hash
-            origins.append(_Origin(*state, cut.logs))
+        before = next((one for one in cut.channels if one.topic == topic and not one.shared), None)
+        if before is not None and (before.kept, before.kept_hash or "") in states:
+            states.add((before.messages, before.hash))
+            is_merged = isinstance(cut, MergedLog)
+            origins.append(Origin(before.messages, before.hash, cut.logs, is_merged))
     return origins
 
 
@@ -55,7 +65,7 @@ def is_whole(session: Session, read: ChannelRead) -> bool:
     return session.count(read.topic) == read.messages and session.hash(read.topic) == read.hash
 
 
-def _origin_of(session: Session, read: ChannelRead) -> _Origin | None:
+def _origin_of(session: Session, read: ChannelRead) -> Origin | None:
     wanted = read.messages, read.hash
     return next((one for one in _origins(session, read.topic) if one[:2] == wanted), None)
 
@@ -65,28 +75,39 @@ def is_cut(session: Session, read: ChannelRead) -> bool:
     return _origin_of(session, read) is not None
 
 
-def logs_before_cut(session: Session, run: Run) -> tuple[str, ...]:
-    """Return the names of the logs that a run was cut from.
+def origin_of_run(session: Session, run: Run) -> Origin | None:
+    """Return the origin of a run that was cut or merged, by one of its channels.
 
     Returns
     -------
-    Nothing if the run is whole, or if one of its inputs changed in another way than by a cut.
+    None if the run is whole, or if one of its inputs changed in another way than by a cut or a merge. A run
+    that was both merged and cut is a part.
     """
-    logs: tuple[str, ...] = ()
+    origins: list[Origin] = []
     for read in run.inputs:
         if not is_whole(session, read):
             origin = _origin_of(session, read)
             if origin is None:
-                return ()
-            logs = origin.logs
+                return None
+            origins.append(origin)
     for output in run.outputs:
         if session.count(output.topic) < output.messages:
             enough = (one for one in _origins(session, output.topic) if one.messages >= output.messages)
             origin = next(enough, None)
             if origin is None:
-                return ()
-            logs = logs or origin.logs
-    return logs
+                return None
+            origins.append(origin)
+    return min(origins, key=lambda one: one.is_merged, default=None)
+
+
+def own_inputs(session: Session, run: Run) -> dict[str, str]:
+    """Return the topics of runs of this log that a stage has read, each with its run."""
+    reads = ((read, run_of_topic(read.topic)) for read in run.inputs)
+    return {
+        read.topic: name
+        for read, name in reads
+        if name is not None and (is_whole(session, read) or is_cut(session, read))
+    }
 
 
 def was_complete(session: Session, topic: str, messages: int) -> bool:

@@ -25,6 +25,8 @@ from ipsys_log.rig.file import hide_passwords
 __all__ = [
     "append_messages",
     "append_run",
+    "check_copy",
+    "create_copy",
     "open_target",
     "record_message",
     "write_log",
@@ -63,6 +65,31 @@ def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
         with undivided():
             writer = stack.enter_context(LogWriter.create(path, atomic=True))
         return write_messages(writer, messages)
+
+
+def check_copy(paths: Sequence[Path], output: Path, overwrite: bool) -> None:
+    """Refuse an output that is one of the logs, or that exists, except with ``overwrite``.
+
+    Raises
+    ------
+    IpsysError
+        The output is refused.
+    """
+    if not output.exists():
+        return
+    if any(path.exists() and path.samefile(output) for path in paths):
+        raise IpsysError(f"-o {output}: this is the log itself; choose another name")
+    if not overwrite:
+        raise IpsysError(f"-o {output}: exists already; choose another name, or give --overwrite")
+
+
+@contextmanager
+def create_copy(output: Path, overwrite: bool) -> Iterator[LogWriter]:
+    """Yield the writer of a log that is made from other logs; it gets its name when it is complete."""
+    with ExitStack() as stack:
+        with undivided():
+            writer = stack.enter_context(LogWriter.create(output, atomic=True, overwrite=overwrite))
+        yield writer
 
 
 def append_run(

@@ -12,7 +12,7 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import ChannelCut, Run
 from ipsys_log.runs.graph import input_runs, stage_named
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.origins import cut_topics, is_whole, left_out
+from ipsys_log.runs.origins import cut_topics, left_out
 from ipsys_log.runs.view import LogView
 
 __all__ = ["compare_with_cut", "repeatable_topics"]
@@ -23,8 +23,8 @@ _STEP = "channels"
 def repeatable_topics(session: Session, run: Run, say: Callable[[str], None]) -> set[str]:
     """Return the channels of a stage, in a part of a log, that follow from the inputs in the part.
 
-    If all inputs are whole, these are the channels that are whole, too. Otherwise they are the channels
-    without memory, of the cameras whose inputs are in the part.
+    If all inputs are whole, also with the shifted times of a merge, these are the channels that are whole,
+    too. Otherwise they are the channels without memory, of the cameras whose inputs are in the part.
 
     Parameters
     ----------
@@ -32,8 +32,12 @@ def repeatable_topics(session: Session, run: Run, say: Callable[[str], None]) ->
     """
     entries = {topic: one for part in cut_topics(session).values() for topic, one in part.items()}
     outputs = {output.topic for output in run.outputs if output.topic in entries} - left_out(session)
-    if all(is_whole(session, read) for read in run.inputs):
-        topics = {topic for topic in outputs if entries[topic].kept == entries[topic].messages}
+    if all(session.count(read.topic) == read.messages for read in run.inputs):
+        topics = {
+            topic
+            for topic in outputs
+            if entries[topic].kept == entries[topic].messages and not entries[topic].shared
+        }
         reason = "the part does not have its whole results"
     else:
         topics, reason = _stateless_topics(session, run, outputs)

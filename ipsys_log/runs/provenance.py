@@ -7,7 +7,7 @@ versions, except version 1. Versions of packages make no run out of date: they a
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
@@ -33,6 +33,7 @@ __all__ = [
     "read_channels",
     "recorded_version",
     "replaced_lenses",
+    "with_inputs",
 ]
 
 _MOST_DIGITS = 6
@@ -120,6 +121,26 @@ def find_run(session: Session, wanted: Run, purpose: Channel, name: str | None =
             if _identity(here) == essence and has_result(session, run, purpose):
                 return run.run
     return None
+
+
+def with_inputs(names: Iterable[str], reads: Mapping[str, Collection[str]]) -> set[str]:
+    """Return runs and all runs that they have read, directly or through others.
+
+    Parameters
+    ----------
+    reads : by run, the runs that its stages have read.
+
+    Examples
+    --------
+    >>> sorted(with_inputs(["poly"], {"poly": ["edges"], "edges": ["edges"], "rigid": ["stock"]}))
+    ['edges', 'poly']
+    """
+    waiting, reached = list(names), set(names)
+    while waiting:
+        new = set(reads.get(waiting.pop(), ())) - reached
+        reached |= new
+        waiting += new
+    return reached
 
 
 def free_name(session: Session, record: Run, base: str, writes: Sequence[Channel]) -> str:

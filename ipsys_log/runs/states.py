@@ -10,12 +10,12 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
 from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
-from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
+from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run
 from ipsys_log.runs.provenance import is_complete, recorded_version
 
-__all__ = ["Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
+__all__ = ["CURRENT", "Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
 
-_CURRENT = "current"
+CURRENT = "current"
 # The record of a model that was fitted to measurements of the same log has one of these parameters.
 _FITTED_HERE = frozenset(("train", "seed"))
 
@@ -29,15 +29,15 @@ class Recorded:
     run : the record of the stage.
     method : its corner method, camera-point method or model; "" if the stage has none.
     state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, ``part of run <run>,
-        cut from <log>``, or what to do if newer software made it.
+        cut from <log>``, ``run <run> merged from <log>``, or what to do if newer software made it.
     out_of_date : the software, the log or an input run has changed since, and the stage can be repeated.
     is_newer : newer software made it.
-    is_part : the log is a part of the log with the whole run.
+    is_part : the log is a part of the log with the whole run, or was merged from it.
     """
 
     run: Run
     method: str
-    state: str = _CURRENT
+    state: str = CURRENT
     out_of_date: bool = False
     is_newer: bool = False
     is_part: bool = False
@@ -106,8 +106,8 @@ def _judge(session: Session, one: Recorded) -> Recorded:
         return replace(one, state=newer, is_newer=True)
     names = versioned_names(run.stage, one.method)
     is_copied = writes(run, MODEL) and not is_fitted_here(run)
-    logs = logs_before_cut(session, run) if session.cuts and not is_copied else ()
-    missing = any(read.messages and not session.count(read.topic) for read in run.inputs) and not logs
+    origin = origin_of_run(session, run) if session.cuts and not is_copied else None
+    missing = any(read.messages and not session.count(read.topic) for read in run.inputs) and origin is None
     if is_copied or missing:
         return replace(one, state="not repeatable")
     reasons = [
@@ -115,8 +115,8 @@ def _judge(session: Session, one: Recorded) -> Recorded:
         for name in names
         if recorded_version(run, name) < VERSIONS[name]
     ]
-    if logs and not reasons:
-        return replace(one, state=f"part of run {run.run}, cut from {', '.join(logs)}", is_part=True)
+    if origin is not None and not reasons:
+        return replace(one, state=origin.text(run.run), is_part=True)
     changed = (read for read in run.inputs if not is_whole(session, read))
     reasons += [_change(read) for read in changed if not is_cut(session, read)]
     return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one
@@ -125,7 +125,7 @@ def _judge(session: Session, one: Recorded) -> Recorded:
 def _judge_inputs(one: Recorded, stale: Collection[str]) -> Recorded:
     """Return a stage; mark a current stage as out of date if it read a ``stale`` topic."""
     names = [str(run_of_topic(read.topic)) for read in one.run.inputs if read.topic in stale]
-    if one.state != _CURRENT or not names:
+    if one.state != CURRENT or not names:
         return one
     return replace(one, state=f"out of date: input {names[0]} is", out_of_date=True)
 

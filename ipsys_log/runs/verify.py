@@ -22,15 +22,16 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
-from ipsys_log.messages import IMPORTED, FrameTransforms, Message, Run
+from ipsys_log.messages import IMPORTED, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.origins import is_cut, is_whole, logs_before_cut
+from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run
 from ipsys_log.runs.part_check import compare_with_cut, repeatable_topics
 from ipsys_log.runs.provenance import replaced_lenses
+from ipsys_log.runs.renaming import rename_frames, rename_topic
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 
 __all__ = ["diff", "explain_diff", "verify"]
@@ -87,7 +88,7 @@ def verify(
             for stage in recorded
             if stage.run in records
             and not _is_of_other_version(stage, say)
-            and (logs_before_cut(session, stage.run) or _is_up_to_date(session, stage.run, checked, say))
+            and (origin_of_run(session, stage.run) or _is_up_to_date(session, stage.run, checked, say))
         ]
         topics_of = {id(record): _topics(session, record, say) for record in repeated}
         if not repeated and not session.cuts:
@@ -113,7 +114,7 @@ def verify(
 
 def _topics(session: Session, run: Run, say: Callable[[str], None]) -> set[str]:
     """Return the channels of a stage that are repeated: all of them, except in a part of a log."""
-    if logs_before_cut(session, run):
+    if origin_of_run(session, run) is not None:
         return repeatable_topics(session, run, say)
     return {output.topic for output in run.outputs}
 
@@ -237,15 +238,9 @@ def _called(message: Message, run: str | None) -> Message:
     """Return a message as a message of another run: the run's name is in its topic and in robot frame ids."""
     if run is None:
         return message
-    name, payload = run_of_topic(message.topic), message.payload
-    if isinstance(payload, FrameTransforms):
-        payload = FrameTransforms(
-            tuple(
-                replace(transform, child_frame_id=transform.child_frame_id.replace(f"{name}/", f"{run}/", 1))
-                for transform in payload.transforms
-            )
-        )
-    return replace(message, topic=message.topic.replace(f"/runs/{name}/", f"/runs/{run}/"), payload=payload)
+    names = {str(run_of_topic(message.topic)): run}
+    payload = rename_frames(message.payload, names)
+    return replace(message, topic=rename_topic(message.topic, names), payload=payload)
 
 
 def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Callable[[str], None]) -> bool:
@@ -273,6 +268,9 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
 
 def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stored]:
     stage = stage_named(run.stage)
+    images = {read.topic for read in run.inputs} & set(session.images.values())
+    if session.cuts and images:  # a merged log has cameras that the stage did not read
+        session = session.with_images(images)
     task = (
         plan_stage(stage, session, run.parameters, input_runs(run), run.rig, replaced_lenses(run))
         if stage

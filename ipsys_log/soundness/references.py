@@ -89,18 +89,16 @@ def check_measurements(session: Session) -> Iterator[LogFinding]:
     """Check that measurements name markers and reference points of the rig, and withdrawals measurements."""
     rigs: list[Rig] = session.payloads(session.topics(RIG))[:1]
     active: set[str] = set()
+    withdrawn: set[str] = set()
     faults: dict[tuple[str, str], list[tuple[str, int]]] = {}
     for message in session.messages([*session.topics(RIG), *session.topics(MEASUREMENTS)]):
         payload = message.payload
         if isinstance(payload, Rig):
             rigs[:] = [payload]
         elif isinstance(payload, Measurement):
-            for fault in _faults(payload, active, rigs[0] if rigs else None):
+            for fault in _faults(payload, active, withdrawn, rigs[0] if rigs else None):
                 faults.setdefault(fault, []).append((payload.id, message.log_time_ns))
-            if payload.withdraws is None:
-                active.add(payload.id)
-            else:
-                active.discard(payload.withdraws)
+            _follow(payload, active, withdrawn)
     for (text, advice), places in faults.items():
         ids = _names([name for name, _ in places])
         title = "measurement" if len(places) == 1 else "measurements"
@@ -108,14 +106,32 @@ def check_measurements(session: Session) -> Iterator[LogFinding]:
         yield LogFinding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
 
 
-def _faults(measurement: Measurement, active: set[str], rig: Rig | None) -> Iterator[tuple[str, str]]:
+def _follow(measurement: Measurement, active: set[str], withdrawn: set[str]) -> None:
+    """Move the id of a message about a measurement to the valid or to the withdrawn ids."""
+    if measurement.is_point:
+        active.add(measurement.id)
+    elif measurement.withdraws is not None and measurement.withdraws in active:
+        active.remove(measurement.withdraws)
+        withdrawn.add(measurement.withdraws)
+    elif measurement.readmits in withdrawn:
+        withdrawn.remove(measurement.readmits)
+        active.add(measurement.readmits)
+
+
+def _faults(
+    measurement: Measurement, active: set[str], withdrawn: set[str], rig: Rig | None
+) -> Iterator[tuple[str, str]]:
     """Yield the wrong references of a measurement, each with the advice."""
     again = "withdraw it and measure again: ipsys measure"
     complete = "add it to lab.toml, and give --rig lab.toml"
+    no_effect = "it has no effect: check the id"
     if measurement.withdraws is not None:
         if measurement.withdraws not in active:
-            text = f"withdraws {measurement.withdraws}, which is not in the log"
-            yield text, "it has no effect: check the id"
+            yield f"withdraws {measurement.withdraws}, which is not in the log", no_effect
+        return
+    if measurement.readmits is not None:
+        if measurement.readmits not in withdrawn:
+            yield f"re-admits {measurement.readmits}, which is not withdrawn", no_effect
         return
     if measurement.id in active:
         yield "an earlier measurement has the same id", "withdraw one of them"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from ipsys_log.survey.entry import Entry, Fault
 from ipsys_log.survey.scene import MarkerObservations, Prediction, predict
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["EntryCheck", "check_entry", "next_id", "withdrawal_of"]
+__all__ = ["EntryCheck", "check_entry", "free_id", "next_id", "withdrawal_of"]
 
 Array = NDArray[np.float64]
 
@@ -74,8 +75,21 @@ def next_id(history: Iterable[Measurement]) -> str:
     return f"p{max(numbers, default=0) + 1:03d}"
 
 
-def withdrawal_of(history: Sequence[Measurement], name: str) -> Measurement:
-    """Return the message that withdraws a measurement; the log keeps the measurement.
+def free_id(history: Iterable[Measurement], name: str) -> str:
+    """Return the id for a new withdrawal or re-admission: ``name``, or ``name_2``, ``name_3`` ...
+
+    Examples
+    --------
+    >>> free_id([Measurement(0, "p001_withdrawn", withdraws="p001")], "p001_withdrawn")
+    'p001_withdrawn_2'
+    """
+    taken = {measurement.id for measurement in history}
+    numbered = (f"{name}_{number}" for number in count(2))
+    return next(candidate for candidate in chain([name], numbered) if candidate not in taken)
+
+
+def withdrawal_of(history: Sequence[Measurement], name: str, reason: str | None = None) -> Measurement:
+    """Return the message that withdraws a measurement, perhaps with the reason; the log keeps it.
 
     Raises
     ------
@@ -84,7 +98,8 @@ def withdrawal_of(history: Sequence[Measurement], name: str) -> Measurement:
     """
     for measurement in active_measurements(history):
         if measurement.id == name:
-            return Measurement(measurement.timestamp, f"{name}_withdrawn", withdraws=name)
+            message_id = free_id(history, f"{name}_withdrawn")
+            return Measurement(measurement.timestamp, message_id, withdraws=name, reason=reason)
     raise IpsysError(f"measurement {name} cannot be withdrawn: it is withdrawn already, or does not exist")
 
 
@@ -192,7 +207,7 @@ def _identity_faults(
     entry: Entry, observations: MarkerObservations | None, history: Sequence[Measurement]
 ) -> list[Fault]:
     faults = []
-    if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
+    if entry.id is not None and any(entry.id in (m.id, m.refers_to) for m in history):
         faults.append(Fault("id", f"id {entry.id} is already used; leave it out to get the next free id"))
     if observations is not None and observations.still is None:
         faults.append(Fault("marker", observations.text))

@@ -18,7 +18,6 @@ from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
-    MEASUREMENTS_TOPIC,
     CompressedImage,
     CompressedVideo,
     Measurement,
@@ -34,6 +33,7 @@ from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import out_of_date_lines
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import check_references
+from ipsys_log.survey.exclusion import place_in_log
 from ipsys_log.survey.scene import CameraView, StationaryInterval
 from ipsys_log.units import NS_PER_S
 
@@ -142,19 +142,19 @@ class FinishedLog:
                 )
             added: list[Message] = []
             for measurement in measurements:
-                added.append(_message(measurement, [*self._history, *added]))
+                added.append(place_in_log(measurement, [*self._history, *added]))
             write_messages(writer, added)
         self._history += added
 
     def _of_others(self) -> list[Message]:
         """Return the measurements that other processes have added since the last read of the log."""
-        known_ids = {(message.payload.id, message.payload.withdraws) for message in self._history}
+        known_ids = {(message.payload.id, message.payload.refers_to) for message in self._history}
         with Session([self.path]) as session:
             messages = session.messages(session.topics(MEASUREMENTS))
             return [
                 message
                 for message in messages
-                if (message.payload.id, message.payload.withdraws) not in known_ids
+                if (message.payload.id, message.payload.refers_to) not in known_ids
             ]
 
     def _view(self, camera: str, interval: StationaryInterval) -> CameraView:
@@ -209,17 +209,6 @@ def rigs_of(session: Session, request: Request) -> list[Rig]:
 def _newest(session: Session, channel: Channel) -> list[str]:
     run = newest_run(session, channel)
     return session.topics(channel, run) if run else []
-
-
-def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
-    """Return the message of a measurement, at the end of its stationary interval.
-
-    Messages with the same id keep their order.
-    """
-    end_ns = measurement.timestamp if measurement.still is None else measurement.still.end
-    names = {measurement.id, measurement.withdraws}
-    same = [m.log_time_ns + 1 for m in earlier if {m.payload.id, m.payload.withdraws} & (names - {None})]
-    return Message(MEASUREMENTS_TOPIC, max([end_ns, *same]), measurement.timestamp, measurement)
 
 
 def _find_intervals(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[StationaryInterval]:

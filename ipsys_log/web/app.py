@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from ipsys_log.analysis.pairs import active_measurements, locate_measurements
+from ipsys_log.analysis.pairs import active_measurements, locate_measurements, withdrawals
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import are_collinear
 from ipsys_log.messages import Measurement
@@ -52,6 +52,7 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
     """Return all measurements so far, newest first, also withdrawn ones; and the measured intervals."""
     history = scene.history()
     active = active_measurements(history)
+    withdrawn = withdrawals(history)
     points = {place.id: place.point_m for place in locate_measurements(active, scene.rig)[0]}
     rows = [
         {
@@ -61,10 +62,11 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
             "point_m": points[measurement.id].tolist()
             if measurement in active and measurement.id in points
             else None,
+            "reason": withdrawn[measurement.id].reason if measurement.id in withdrawn else None,
             "tapes": _tapes(measurement),
         }
         for measurement in reversed(history)
-        if measurement.withdraws is None
+        if measurement.is_point
     ]
     return {"next": next_id(history), "places": rows, "measured": _measured(scene.intervals, active)}
 

@@ -235,7 +235,7 @@ function nextOpen() {
 
 function list() {
   const rows = history.places.map((place) => {
-    const where = place.point_m ? `at x ${cm(place.point_m[0] * 100)}, y ${cm(place.point_m[1] * 100)} cm` : place.counts ? "" : "withdrawn";
+    const where = place.point_m ? `at x ${cm(place.point_m[0] * 100)}, y ${cm(place.point_m[1] * 100)} cm` : place.counts ? "" : place.reason ? `withdrawn: ${place.reason}` : "withdrawn";
     const text = make("div", {}, make("b", {}, place.id), make("span", {}, ` marker ${place.marker}`), " ", make("em", {}, where), make("small", {}, place.tapes));
     if (!place.counts) return make("li", { className: "gone" }, text);
     const undo = make("button", { type: "button" }, "Undo");

@@ -93,7 +93,7 @@ def _merge(logs: Sequence[Path], merged: Path) -> None:
     from ipsys_log.runs.merge import merge
     from ipsys_log.runs.merge_plan import LogOffset
 
-    merge(logs, merged, [LogOffset(0, 0.0, True) for _ in logs])
+    merge(logs, merged, [LogOffset() for _ in logs])
 
 
 def _check(logs: Sequence[Path], _copy: Path) -> None:

@@ -115,9 +115,9 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
     candidates_s = [equal_s + step * _REFINED_S for step in range(-_NEAR_STEPS, _NEAR_STEPS + 1)]
     candidates_s += _search(pairs)
     fits = [fit for near_s in candidates_s if (fit := _refine(pairs, near_s)) is not None]
-    best = _unique(pairs, sorted(fits, key=lambda fit: fit.misfit))
+    offset_s, sigma_s = _unique(pairs, sorted(fits, key=lambda fit: fit.misfit))
     markers = tuple(sorted({pair.marker_id for pair in pairs}))
-    return ClockOffset(equal_s - best.offset_s, best.sigma_s, markers)
+    return ClockOffset(equal_s - offset_s, sigma_s, markers)
 
 
 def _search(pairs: Sequence[_Pair]) -> list[float]:
@@ -133,13 +133,12 @@ def _search(pairs: Sequence[_Pair]) -> list[float]:
     ]
 
 
-class _Estimate(NamedTuple):
-    offset_s: float
-    sigma_s: float
+def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> tuple[float, float]:
+    """Return the offset of the only fit that is sharp and good, and its standard deviation, in s.
 
-
-def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> _Estimate:
-    """Return the offset of the only fit that is sharp and good; the fits are in the order of their misfits.
+    Parameters
+    ----------
+    fits : in the order of their misfits.
 
     Raises
     ------
@@ -161,7 +160,7 @@ def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> _Estimate:
         best = fit, sigma_s
     if best is None:
         raise FitError("the paths of their common markers agree at no offset")
-    return _Estimate(best[0].offset_s, best[1])
+    return best[0].offset_s, best[1]
 
 
 def _since_start(paths: Iterable[MarkerPath]) -> tuple[list[MarkerPath], float]:

@@ -36,7 +36,8 @@ def verify(
     """Compute every run of a log again from its inputs, and compare each channel byte for byte.
 
     Frames that live processing skipped are excluded. In a part of a log (ipsys cut), results that depend on
-    messages outside of the part are compared with the record of the cut. The exit code is 1 if there is a
+    messages outside of the part are compared with the record of the cut. In a merged log (ipsys merge), the
+    runs of each log are repeated with its own images. The exit code is 1 if there is a
     difference."""
     from ipsys_log import api
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
@@ -148,7 +149,7 @@ def _agreement(found: Sequence[Comparison]) -> str:
     if count == len(found):
         return "the replay is identical to the log"
     return (
-        f"{len(found) - count} channels have the messages of the cut; the replay of "
+        f"{len(found) - count} channels have the messages of the cut or the merge; the replay of "
         f"{count or 'no'} channels is identical to the log"
     )
 

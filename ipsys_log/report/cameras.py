@@ -223,7 +223,7 @@ def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Tab
 def _same_text(comparison: Comparison) -> str:
     if not comparison.equal:
         return str(comparison.same)
-    return "all" if comparison.repeated else "as cut"
+    return "all" if comparison.repeated else "as written"
 
 
 def first_difference(found: Sequence[Comparison]) -> str | None:

@@ -137,5 +137,5 @@ def _parse_seconds(text: str, value: str) -> int:
     except InvalidOperation:
         seconds = Decimal("nan")
     if not seconds.is_finite() or abs(seconds) > _LARGEST_S:
-        raise IpsysError(f"--offset {text}: is not a number of seconds; write it as NAME=0.012")
+        raise IpsysError(f"--offset {text}: has no valid number of seconds; write it as NAME=0.012")
     return round(seconds * NS_PER_S)

@@ -76,7 +76,7 @@ def _stateless_topics(session: Session, run: Run, outputs: Collection[str]) -> t
 def compare_with_cut(
     session: Session, names: Collection[str], repeated: Collection[str], progress: Progress
 ) -> Iterator[Comparison]:
-    """Yield for each channel of a part whether its messages are those that the cut wrote; all bytes are read.
+    """Yield whether the messages of each channel are those that the cut or the merge wrote; all bytes are read.
 
     Parameters
     ----------
@@ -101,5 +101,5 @@ def _compare(reader: LogReader, one: ChannelCut) -> Comparison:
         state.add(message.log_time_ns, message.publish_time_ns, message.data)
     is_same = (state.count, state.digest.hex()) == (one.kept, one.kept_hash)
     count = state.count if is_same else 0
-    first = None if is_same else "its messages are not those that the cut wrote"
+    first = None if is_same else "its messages are not those that the cut or the merge wrote"
     return Comparison(one.topic, state.count, one.kept, count, count, first, repeated=False)

@@ -190,6 +190,14 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     assert "the replay is identical to the log" in day("verify", "a.mcap")
     day("cut", "a.mcap", "-o", "part.mcap", "--start", 2)
     assert "channels have the messages of the cut" in day("verify", "part.mcap")
+    day("cut", "a.mcap", "-o", "red.mcap", "--camera", "red")
+    day("cut", "a.mcap", "-o", "rest.mcap", "--camera", "white", "--camera", "black")
+    merged = json.loads(day("merge", "red.mcap", "rest.mcap", "-o", "both.mcap", "--json"))
+    # One program recorded both, so their clocks are equal.
+    assert abs(merged["logs"][1]["offset_ns"]) < 30_000_000
+    day("exclude", "session.mcap", "p001", "--reason", "the tape sagged")
+    day("exclude", "session.mcap", "p001", "--readmit", "--reason", "the tape was straight")
+    day("compact", "session.mcap", "--dry-run")
     day("latency", "a.mcap", "--plot", "latency.png")
     day("diff", "a.mcap", "a.mcap")
     day("repair", "a.mcap")

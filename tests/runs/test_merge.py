@@ -271,9 +271,9 @@ def test_rigs_with_different_cameras_become_one_rig(tmp_path: Path) -> None:
     [
         (("a.mcap", "b.mcap", "--offset", "c=1"), "--offset c=1: does not name one log"),
         (("a.mcap", "b.mcap", "--offset", "a=1"), "the clock of the first log counts"),
-        (("a.mcap", "b.mcap", "--offset", "b=soon"), "is not a number of seconds"),
+        (("a.mcap", "b.mcap", "--offset", "b=soon"), "has no valid number of seconds"),
         (("a.mcap", "b.mcap", "--offset", "b=1", "--offset", "b.mcap=1"), "has two offsets"),
-        (("a.mcap", "b.mcap", "--offset", "b=-1800000000"), "is not a number of seconds"),
+        (("a.mcap", "b.mcap", "--offset", "b=-1800000000"), "has no valid number of seconds"),
         (("a.mcap", "--offset", "b=1"), "does not name one log"),
         (("a.mcap",), "a merge needs two logs or more"),
         (("a.mcap", "a.mcap", "--offset", "a=1"), "does not name one log"),

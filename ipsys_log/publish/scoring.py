@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,22 +92,16 @@ def score(
     IpsysError
         The pack is damaged or refused, does not state a score of a model, or a model has a fault.
     """
-    own = [
-        model if isinstance(model, OwnModel) else load_own_model(model)
-        for model in models
-        if isinstance(model, OwnModel) or ":" in model
-    ]
-    names = [model for model in models if isinstance(model, str) and ":" not in model]
-    for name in names:
-        check_name(name)
+    names, own = _names_and_own(models)
     with tempfile.TemporaryDirectory(prefix="ipsys_score_") as temporary:
         folder, results = Path(temporary) / "pack", Path(temporary) / "results.mcap"
         folder.mkdir()
         opened = copy_pack(fetch_pack(str(source), Path(temporary)), folder)
-        _check_recorded(opened, source)
-        repeated = _repeated_models(opened.stated, names, own, source)
-        computed = compute_scores(opened.logs, results, repeated, progress, say)
-        own_scores = [found for model in own for found in _score_own(model, opened.logs, results)]
+        with _named_as(folder, source):
+            _check_recorded(opened)
+            repeated = _repeated_models(opened.stated, names, own, source)
+            computed = compute_scores(opened.logs, results, repeated, progress, say)
+            own_scores = [found for model in own for found in _score_own(model, opened.logs, results)]
     if own and not names:
         repeated = ()
     by_key = {found.key: found for found in computed}
@@ -119,7 +115,31 @@ def score(
     )
 
 
-def _check_recorded(opened: OpenedPack, source: object) -> None:
+def _names_and_own(models: Sequence[str | OwnModel]) -> tuple[list[str], list[OwnModel]]:
+    """Return the names of models of the table, and the models of the user, which are loaded."""
+    names: list[str] = []
+    own: list[OwnModel] = []
+    for model in models:
+        if isinstance(model, OwnModel):
+            own.append(model)
+        elif ":" in model:
+            own.append(load_own_model(model))
+        else:
+            check_name(model)
+            names.append(model)
+    return names, own
+
+
+@contextmanager
+def _named_as(folder: Path, source: object) -> Iterator[None]:
+    """Name the pack in errors of its logs: the temporary copy does not exist any more."""
+    try:
+        yield
+    except IpsysError as error:
+        raise IpsysError(str(error).replace(f"{folder}{os.sep}", f"{source}: ")) from error
+
+
+def _check_recorded(opened: OpenedPack) -> None:
     """Check that the logs have no results that the pipeline would take over instead of computing them."""
     with Session(opened.logs) as session:
         kept = kept_channels(session, without_images=False)
@@ -127,8 +147,8 @@ def _check_recorded(opened: OpenedPack, source: object) -> None:
             run = run_of_topic(topic)
             if run is not None and topic != RECORD.topic_of(run) and session.count(topic):
                 raise IpsysError(
-                    f"{source}: its logs have the result {topic}, which would not be computed again; pack "
-                    "the logs again with ipsys pack"
+                    f"{session}: has the result {topic}, which would not be computed again; pack the logs "
+                    "again with ipsys pack"
                 )
 
 
@@ -148,7 +168,7 @@ def _repeated_models(
 
 
 def _score_own(model: OwnModel, logs: Sequence[Path], results: Path) -> list[Score]:
-    with Session([*logs, results]) as session:
+    with Session([*logs, *([results] if results.exists() else [])]) as session:
         for run in sorted(session.run_names()):
             evaluations = session.payloads(session.topics(EVALUATION, run))
             models = session.payloads(session.topics(MODEL, run))

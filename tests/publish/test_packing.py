@@ -263,7 +263,7 @@ def test_result_in_a_pack_is_refused(packed: Path, dataset: Path, tmp_path: Path
     replay([dataset / "logs/lab.mcap"], Request(models=("rigid",)), "fit")
     sign(dataset)
     with pytest.raises(
-        IpsysError, match="its logs have the result /runs/rigid/model, which would not be comp"
+        IpsysError, match=r"logs/lab\.mcap: has the result /runs/rigid/model, which would not be"
     ):
         score(dataset)
 

@@ -19,9 +19,11 @@ from ipsys_log.log.journal import Disk
 from ipsys_log.log.repair import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
+    EVENTS_TOPIC,
     FRAME_SKIPPED,
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
+    STAMP_UNRELIABLE,
     CompressedImage,
     Event,
     Measurement,
@@ -30,6 +32,7 @@ from ipsys_log.messages import (
     Rig,
     image_topic,
 )
+from tests.playing import WAIT_LIMIT_S
 
 
 def frame(number: int, camera: str = "red") -> Message:
@@ -81,9 +84,11 @@ def backlog(source: Generator[Message | None, None, None], log: Recording) -> Ba
 
 
 def test_frame_is_logged_before_its_processing(log: Noted) -> None:
+    processed = threading.Semaphore(1)
+
     def source() -> Generator[Message | None, None, None]:
         for number in range(3):
-            time.sleep(0.05)
+            assert processed.acquire(timeout=WAIT_LIMIT_S)
             yield frame(number)
             yield None
 
@@ -92,7 +97,37 @@ def test_frame_is_logged_before_its_processing(log: Noted) -> None:
         for message in frames:
             assert message is TICK or message in log.noted
             seen.append(message)
+            if message is TICK:
+                processed.release()
     assert [message is TICK for message in seen] == [False, True] * 3
+
+
+def test_events_pass_beside_the_frames_after_their_write(log: Noted) -> None:
+    lost = Message(EVENTS_TOPIC, 5, 5, Event(5, "camera_lost", "camera red is lost", "red"))
+    late = Message(EVENTS_TOPIC, 6, 6, Event(6, STAMP_UNRELIABLE, "late", "red", start=1))
+    shown, processed = list[Message](), threading.Event()
+
+    def source() -> Generator[Message | None, None, None]:
+        yield lost
+        assert processed.wait(WAIT_LIMIT_S)  # an event alone wakes the consumer
+        yield late
+        yield from (frame(number) for number in range(4))
+
+    seen = []
+    with backlog(source(), log) as frames:
+        for message in frames:
+            seen.append(message)
+            shown += frames.take_events()
+            assert all(event in log.noted for event in shown)
+            if lost in shown:
+                processed.set()
+        shown += frames.take_events()
+    # A stage reads the second event: it passes the stages, and a skipped frame is an event beside them.
+    assert lost not in seen
+    assert late in seen
+    assert shown[0] is lost
+    assert {event.payload.kind for event in shown[1:]} <= {FRAME_SKIPPED}
+    assert len(shown) - 1 + sum(isinstance(m.payload, CompressedImage) for m in seen) == 4
 
 
 def test_oldest_frames_are_skipped_with_an_event(log: Noted) -> None:

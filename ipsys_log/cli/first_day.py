@@ -16,9 +16,7 @@ __all__ = ["add_commands"]
 
 Folder = Annotated[
     Path,
-    typer.Argument(
-        metavar="FOLDER", help="The folder of the lab: it gets lab.toml, intrinsics and logs."
-    ),
+    typer.Argument(metavar="FOLDER", help="The folder of the lab: it gets lab.toml, intrinsics and logs."),
 ]
 
 

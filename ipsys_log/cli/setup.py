@@ -41,6 +41,7 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
     "tape_sigma_m": (0.003, "Standard deviation of the tape readings, in m."),
 }
 
+
 def add_commands(app: typer.Typer) -> None:
     app.command()(init)
     app.command("simulate", help=simulate.__doc__)(_simulate_command())

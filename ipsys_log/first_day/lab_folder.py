@@ -95,6 +95,15 @@ class LabFolder:
         self._writing = path
         return path
 
+    def new_board_folder(self, camera: str) -> Path:
+        """Make and return a folder for pictures of a board: ``boards/red``, ``boards/red_2`` and so on."""
+        number, path = 1, self.path / "boards" / camera
+        while path.exists():
+            number += 1
+            path = self.path / "boards" / f"{camera}_{number}"
+        path.mkdir(parents=True)
+        return path
+
     def finish_log(self) -> None:
         """Note that no log is being written."""
         self._writing = None

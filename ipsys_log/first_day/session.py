@@ -7,11 +7,13 @@ from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+from ipsys_log.calibration.board import parse_board
 from ipsys_log.capture.usb_bus import UsbCamera
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.first_day import work
 from ipsys_log.first_day.alignment import AlignmentResult, read_result
+from ipsys_log.first_day.board_search import BoardSearch
 from ipsys_log.first_day.camera_choice import (
     list_attached,
     list_options,
@@ -35,6 +37,10 @@ DICTIONARIES = (
     *("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250"),
     *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
 )
+
+# The board as the options of ``ipsys calibrate`` describe it without other values.
+_SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
+_CALIBRATION = "the calibration"
 
 
 class Pages(NamedTuple):
@@ -73,6 +79,7 @@ class SetupSession:
         self._attached: Sequence[UsbCamera] | None = None
         self._pictures: dict[str, _Picture] = {}
         self._number = 0
+        self._search: BoardSearch | None = None
         self._alignment: tuple[LogFacts, AlignmentResult | str] | None = None
         self._actions: dict[str, tuple[str, str, Callable[[Job], None]]] = {
             "pictures": ("the pictures of the cameras", "cameras", self._take_pictures),
@@ -96,6 +103,7 @@ class SetupSession:
             "rig": self._describe_rig(progress),
             "cameras": self._describe_cameras(progress),
             "intrinsics": [asdict(one) for one in progress.intrinsics],
+            "board": self._describe_board(),
             "alignment": self._describe_alignment(progress),
             "points": {
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
@@ -153,6 +161,30 @@ class SetupSession:
             raise IpsysError(f"the folder has no new intrinsics of camera {camera!r}; calibrate it first")
         set_calibration(self._folder.rig_file, camera, file)
 
+    def calibrate(self, camera: str, board: str) -> list[Fault]:
+        """Start the calibration of a camera with a board; return the fault of the board instead.
+
+        Raises
+        ------
+        IpsysError
+            The rig has no such camera, or a job works.
+        """
+        self._check_idle()
+        step = read_progress(self._folder)
+        if camera not in [one.camera for one in step.intrinsics]:
+            raise IpsysError(f"lab.toml has no camera {camera!r} with a source; reload this page")
+        try:
+            wanted = parse_board(board, _SQUARE_M, _MARKER_SCALE, _DICTIONARY, False)
+        except IpsysError as error:
+            return [Fault("board", str(error))]
+        pictures = self._folder.new_board_folder(camera)
+        search = self._search = BoardSearch(camera, wanted, pictures)
+        self.jobs.start(
+            f"{_CALIBRATION} of {camera}",
+            lambda job: work.calibrate(self._folder, search, pictures, board, job),
+        )
+        return []
+
     def start(self, action: str) -> None:
         """Start the job of an action.
 
@@ -170,7 +202,9 @@ class SetupSession:
         self.jobs.start(title, job)
 
     def picture(self, kind: str, name: str) -> bytes | None:
-        """Return a picture of a camera: ``camera`` by number, or ``alignment`` by the camera's name."""
+        """Return a picture: ``board`` of the calibration, ``camera`` by number, ``alignment`` by camera."""
+        if kind == "board":
+            return None if self._search is None else self._search.picture()
         if kind == "camera":
             found = (one.data for one in self._pictures.values() if str(one.number) == name)
             return next(found, None)
@@ -193,7 +227,14 @@ class SetupSession:
         return self._attached
 
     def _action_of(self, job: Job) -> str:
-        return next(key for key, (title, *_) in self._actions.items() if title == job.name)
+        return next((key for key, (title, *_) in self._actions.items() if title == job.name), "calibrate")
+
+    def _describe_board(self) -> dict[str, Any] | None:
+        """Return the pictures of a board that a camera takes now; None without a calibration."""
+        job = self.jobs.present
+        if self._search is None or job is None or job.ended or self._action_of(job) != "calibrate":
+            return None
+        return self._search.describe() or None
 
     def _describe_rig(self, progress: Progress) -> dict[str, Any]:
         return {

@@ -153,7 +153,11 @@ def _rig_step(rig: Rig | None, fault: str) -> StepState:
 
 def _cameras_step(rig: Rig | None, cameras: tuple[RigCamera, ...], fault: str) -> StepState:
     status = Status.WAITS if rig is None else Status.READY if fault else Status.DONE
-    text = "first describe the lab" if rig is None else fault or ", ".join(one.name for one in cameras)
+    text = (
+        "first describe the lab"
+        if rig is None
+        else fault or f"used: {', '.join(one.name for one in cameras)}"
+    )
     return StepState("cameras", "Cameras", "ipsys cameras --rig lab.toml", status, text)
 
 
@@ -171,9 +175,7 @@ def _intrinsics_step(intrinsics: tuple[CameraIntrinsics, ...], camera_fault: str
 def _alignment_step(alignment: LogFacts | None, missing: str) -> StepState:
     status = Status.DONE if alignment else Status.WAITS if missing else Status.READY
     text = f"measured in {alignment.path.name}" if alignment else missing
-    return StepState(
-        "alignment", "Alignment", "ipsys align --rig lab.toml -o alignment.mcap", status, text
-    )
+    return StepState("alignment", "Alignment", "ipsys align --rig lab.toml -o alignment.mcap", status, text)
 
 
 def _points_step(rig: Rig | None, logs: tuple[LogFacts, ...], missing: str) -> StepState:

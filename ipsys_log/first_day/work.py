@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from ipsys_log import api, pipeline
+from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.capture.devices import check_devices, check_sources, open_source
 from ipsys_log.capture.disk import expected_bytes_per_s, free_room
 from ipsys_log.capture.frames import Clock
@@ -15,11 +18,25 @@ from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.capture.live_plan import check_start
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages, fitting_lenses
+from ipsys_log.capture.simulated import show_board
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, load_lenses
+from ipsys_log.first_day.board_search import BoardSearch
+from ipsys_log.first_day.camera_choice import set_calibration
 from ipsys_log.first_day.jobs import Job
 from ipsys_log.first_day.lab_folder import LabFolder
-from ipsys_log.messages import CameraCalibration, Message, Model, Rig
+from ipsys_log.messages import (
+    CameraCalibration,
+    CompressedImage,
+    CompressedVideo,
+    Message,
+    Model,
+    Rig,
+)
 from ipsys_log.messages.channels import TRACKS
+from ipsys_log.report.calibration import calibration_lines
+from ipsys_log.report.files import write_files
 from ipsys_log.runs.graph import copy_model
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
@@ -32,7 +49,16 @@ from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.survey.live import LiveScene
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["LiveView", "OpenedLab", "align", "fit_and_evaluate", "measure", "measure_sheet", "track"]
+__all__ = [
+    "LiveView",
+    "OpenedLab",
+    "align",
+    "calibrate",
+    "fit_and_evaluate",
+    "measure",
+    "measure_sheet",
+    "track",
+]
 
 _LAST_STAGE = "camera-frame"
 # Durations of recordings, by the time stamps of the frames, and the least number of frames of each camera.
@@ -75,6 +101,41 @@ def align(folder: LabFolder, job: Job) -> None:
             api.replay(log, until=_LAST_STAGE, method="pose", progress=job.progress, say=job.say)
 
 
+def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, board: str, job: Job) -> None:
+    """Take pictures of a board until they are enough or the job is stopped, and calibrate the camera.
+
+    This is ``ipsys calibrate --rig lab.toml --board BOARD --camera NAME``; it also writes the file into the
+    rig. Simulated cameras show the board.
+
+    Raises
+    ------
+    IpsysError
+        The camera has a fault, or the pictures do not determine its intrinsics.
+    """
+    _, cameras = load_cameras(folder.rig_file, [search.camera])
+    check_sources(cameras)
+    shown = [show_board(camera, board) for camera in cameras]
+    job.say(f"opening {search.camera}")
+    with LiveCameras(shown, open_source, Clock(), job.say) as attached:
+        job.on_stop(attached.stop)
+        newest = _NewestImage(search.look)
+        with newest:
+            for message in attached:
+                if message is not None and isinstance(message.payload, (CompressedImage, CompressedVideo)):
+                    newest.put(message.payload)
+                if search.is_enough:
+                    attached.stop()
+    job.say(f"{search.count} pictures are in {pictures.parent.name}/{pictures.name}")
+    (outcome,) = api.calibrate(pictures, board=board, cameras=[search.camera], progress=job.progress)
+    if not isinstance(outcome, CalibrationResult):
+        raise IpsysError(outcome.reason)
+    file = f"{search.camera}.yaml"
+    write_files(folder.path, {file: calibration_text(outcome).encode()})
+    set_calibration(folder.rig_file, search.camera, file)
+    for line in (*calibration_lines(outcome), *outcome.notes):
+        job.say(line)
+
+
 def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
     """Record stationary markers, and append the tape measurements of a sheet.
 
@@ -95,9 +156,7 @@ def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
                 job.say(remark)
 
 
-def measure(
-    folder: LabFolder, show: Callable[[LiveScene], AbstractContextManager[object]], job: Job
-) -> None:
+def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManager[object]], job: Job) -> None:
     """Measure points with live cameras until the job is stopped (``ipsys measure``).
 
     Parameters
@@ -128,9 +187,7 @@ def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
     api.replay(*folder.calibration_logs(), progress=job.progress, say=job.say)
 
 
-def track(
-    folder: LabFolder, show: Callable[[LiveView], AbstractContextManager[Sink]], job: Job
-) -> None:
+def track(folder: LabFolder, show: Callable[[LiveView], AbstractContextManager[Sink]], job: Job) -> None:
     """Track robots with live cameras until the job is stopped (``ipsys live``).
 
     Parameters
@@ -193,6 +250,50 @@ def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
         job.say(f"recording into {log.name} for {seconds:g} s")
         enough = _Enough(lab.cameras, seconds, job)
         pipeline.record(lab.cameras, lab.settings, log, [enough])
+
+
+class _NewestImage:
+    """A thread that handles the newest image; images that arrive meanwhile are left out. A context manager."""
+
+    def __init__(self, handle: Callable[[CompressedImage | CompressedVideo], None]) -> None:
+        self._handle = handle
+        self._image: CompressedImage | CompressedVideo | None = None
+        self._changed = threading.Condition()
+        self._is_ended = False
+        self._pool = ThreadPoolExecutor(1, "board")
+        self._working: Future[None] | None = None
+
+    def __enter__(self) -> None:
+        self._working = self._pool.submit(self._work)
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._is_ended = True
+            self._changed.notify_all()
+        self._pool.shutdown()
+        self._raise()
+
+    def put(self, image: CompressedImage | CompressedVideo) -> None:
+        """Replace the waiting image; raise the error of the thread."""
+        if self._working is not None and self._working.done():
+            self._raise()
+        with self._changed:
+            self._image = image
+            self._changed.notify_all()
+
+    def _raise(self) -> None:
+        if self._working is not None:
+            self._working.result()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._image is not None or self._is_ended)
+                image, self._image = self._image, None
+                if self._is_ended:
+                    return
+            assert image is not None
+            self._handle(image)
 
 
 class _Enough:

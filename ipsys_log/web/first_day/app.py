@@ -80,6 +80,7 @@ class SetupApp:
                 Route("/api/simulate", self._simulate, methods=["POST"]),
                 Route("/api/cameras", self._cameras, methods=["POST"]),
                 Route("/api/intrinsics", self._intrinsics, methods=["POST"]),
+                Route("/api/calibrate", self._calibrate, methods=["POST"]),
                 Route("/api/start", self._start, methods=["POST"]),
                 Route("/api/stop", self._stop, methods=["POST"]),
                 Mount("/measure", self._measuring),
@@ -141,6 +142,11 @@ class SetupApp:
         camera = str((await read_json(request)).get("camera", ""))
         await asyncio.to_thread(self.session.use_intrinsics, camera)
         return JSONResponse({})
+
+    async def _calibrate(self, request: Request) -> Response:
+        body = await read_json(request)
+        camera, board = str(body.get("camera", "")), str(body.get("board", ""))
+        return _answer(await asyncio.to_thread(self.session.calibrate, camera, board))
 
     async def _start(self, request: Request) -> Response:
         action = str((await read_json(request)).get("action", ""))

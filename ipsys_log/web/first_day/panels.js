@@ -5,10 +5,16 @@ import { alignedImage, cameraImage } from "./pictures.js";
 
 const cameraId = (key) => `camera-${key.replace(/[^\w]/g, "_")}`;
 
+// The lines of a calibration that has ended.
+function report(state) {
+  const { job } = state;
+  return job?.ended && job.action === "calibrate" && !job.error ? job.lines.slice(1) : [];
+}
+
 // The part of the state that a panel shows: the panel is drawn again only if it changes.
 export function shownPart(name, state) {
   const parts = {
-    rig: state.rig, cameras: state.cameras, intrinsics: state.intrinsics, alignment: state.alignment,
+    rig: state.rig, cameras: state.cameras, intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
     points: state.points, accuracy: state.answer, live: null,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
@@ -21,7 +27,7 @@ export function panel(name, state, act) {
   const content = { rig, cameras, intrinsics, alignment, points, accuracy, live }[name](state, act, step);
   const following = state.steps[number];
   const onward = step.status === "done" && following
-    ? [make("div", { className: "actions" }, button(`Next: ${following.title}`, () => { location.hash = following.name; }, "onward"))] : [];
+    ? [make("div", { className: "actions" }, button(`Next: ${following.title}`, () => { location.hash = following.name; }, "onward", { className: "main" }))] : [];
   return [
     make("h2", { textContent: `${number}. ${step.title}` }),
     ...(step.text ? [make("p", { className: "text", textContent: sentence(step.text) })] : []),
@@ -32,7 +38,7 @@ export function panel(name, state, act) {
   ];
 }
 
-const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`.replace(/\.\.$/, ".");
+const sentence = (text) => `${text}.`.replace(/\.\.$/, ".");
 
 function button(text, work, id, more = {}) {
   const made = make("button", { type: "button", textContent: text, ...(id ? { id } : {}), ...more });
@@ -51,24 +57,28 @@ function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
 }
 
-function submit(form, state, act, work) {
-  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: "main", textContent: "Save", disabled: !state.may_operate })));
+function submit(form, state, act, isMain, work) {
+  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: isMain ? "main" : "", textContent: "Save", disabled: !state.may_operate })));
   form.noValidate = true;
   form.addEventListener("submit", (event) => { event.preventDefault(); act(work); });
   return form;
 }
 
-function rig(state, act) {
+function rig(state, act, step) {
   const { values, labels, dictionaries, exists } = state.rig;
   const form = make("form", { className: "grid" });
+  let pair = form;
   for (const [key, label] of Object.entries(labels)) {
     const made = field(key, label, values[key], key.endsWith("_m") ? { inputMode: "decimal" } : {});
-    form.append(made);
+    // The two coordinates of a point are side by side.
+    if (/(width|x)_m$/.test(key)) form.append((pair = make("div", { className: "pair" }, made)));
+    else if (/(depth|y)_m$/.test(key)) pair.append(made);
+    else form.append(made);
     if (key !== "dictionary") continue;
     made.querySelector("input").setAttribute("list", "dictionaries");
     made.append(make("datalist", { id: "dictionaries" }, ...dictionaries.map((name) => make("option", { value: name }))));
   }
-  submit(form, state, act, async () => {
+  submit(form, state, act, step.status !== "done", async () => {
     const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
     showFaults(form, await post("rig", { values: typed }), (key) => key);
   });
@@ -83,7 +93,7 @@ function rig(state, act) {
   ];
 }
 
-function cameras(state, act) {
+function cameras(state, act, step) {
   const form = make("form", {});
   const cards = state.cameras.map((one) => make("div", { className: "card" },
     cameraImage(one.picture, one.name || one.key),
@@ -91,7 +101,7 @@ function cameras(state, act) {
       ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
       field(cameraId(one.key), "Name; empty: not used", one.name, { maxLength: 40 }))));
   form.append(make("div", { className: "cards" }, ...cards));
-  submit(form, state, act, async () => {
+  submit(form, state, act, step.status !== "done", async () => {
     const names = Object.fromEntries(state.cameras.map((one) => [one.key, document.getElementById(cameraId(one.key)).value]));
     showFaults(form, await post("cameras", { names }), cameraId);
   });
@@ -103,14 +113,27 @@ function cameras(state, act) {
 }
 
 function intrinsics(state, act) {
+  const works = state.job && !state.job.ended;
+  const board = field("board", "Inner corners of the chessboard, such as 6x4", "6x4", { maxLength: 40 });
+  const form = make("form", { className: "grid" }, board);
+  form.addEventListener("submit", (event) => event.preventDefault());
+  const calibrate = (camera) => act(async () => {
+    showFaults(form, await post("calibrate", { camera, board: document.getElementById("board").value }), (key) => key);
+  });
   const cards = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
     make("b", { textContent: one.camera }),
     make("p", { className: one.known ? "text" : "fault", textContent: one.text }),
-    ...(one.file ? [make("div", { className: "actions" }, button(`Use ${one.file}`,
-      () => act(() => post("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_operate }))] : []))));
-  const isKnown = state.intrinsics.every((one) => one.known);
-  const how = isKnown ? [] : [make("p", { textContent: "Print a chessboard (ipsys markers --board 6x4 -o board.pdf), and run the command below in a terminal. Move the board through the whole image of each camera. This page sees the file as soon as it is written." })];
-  return [...how, make("div", { className: "cards" }, ...cards)];
+    make("div", { className: "actions" },
+      ...(one.file ? [button(`Use ${one.file}`, () => act(() => post("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_operate })] : []),
+      button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
+        { className: one.known || one.file ? "" : "main", disabled: works || !state.may_operate })))));
+  return [
+    make("p", { textContent: "Print a chessboard on a flat plate (ipsys markers --board 6x4 -o board.pdf). Move it through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far." }),
+    form,
+    ...(state.board ? [make("div", { id: "board-image" })] : []),
+    make("div", { className: "cards" }, ...cards),
+    ...lines(report(state).map((text) => ["", text])),
+  ];
 }
 
 function alignment(state, act) {

@@ -35,3 +35,13 @@ function arrow(one, width, height) {
   for (const kind of ["shadow", "shaft"]) for (const d of paths) group.append(element("path", { class: kind, d }));
   return group;
 }
+
+// The present image of a camera with the board, and the boards of all kept pictures.
+export function boardImage(board) {
+  const [width, height] = board.size_px;
+  const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${board.count} pictures of the board` });
+  svg.append(element("image", { href: `picture/board/${board.number}`, width, height }));
+  for (const outline of board.kept_px) svg.append(element("polygon", { class: "kept", points: outline.join(" ") }));
+  if (board.board_px) svg.append(element("polygon", { class: "present", points: board.board_px.join(" ") }));
+  return [make("div", { className: "image" }, svg), make("p", { className: "text", textContent: `${board.count} pictures; ${board.advice.join("; ")}.` })];
+}

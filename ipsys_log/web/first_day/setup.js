@@ -2,6 +2,7 @@
 import { post } from "./fields.js";
 import { make } from "./make.js";
 import { panel, shownPart } from "./panels.js";
+import { boardImage } from "./pictures.js";
 
 const $ = (id) => document.getElementById(id);
 const EVERY_MS = 1000;
@@ -86,10 +87,11 @@ async function read() {
     if (!answer.ok) throw new Error(await answer.text());
     state = await answer.json();
     const count = state.steps.filter((step) => step.status === "done").length;
-    chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} steps done`);
+    chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} done`);
     $("folder").textContent = state.rig.name ?? state.folder;
     choose();
     drawPanel();
+    if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
     drawJob();
   } catch (error) {
     chip("bad", error instanceof TypeError ? "ipsys does not answer" : error.message.slice(0, 60));

@@ -8,8 +8,8 @@ from pathlib import Path
 from ipsys_log.capture.simulated import intrinsics_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
-from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 from ipsys_log.log.lock import describe_broken_link
+from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 from ipsys_log.rig.file import load_rig, rig_toml
 from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
 from ipsys_log.stages.detect import marker_detector
@@ -89,7 +89,7 @@ def tape_sheet_path(path: Path) -> Path:
 
 
 def simulated_lab_texts(path: Path) -> dict[Path, str]:
-    """Return the files of the simulated lab: its rig file ``path``, and the sheet of its tape measurements."""
+    """Return the files of the simulated lab: its rig file ``path``, and the sheet of its tape readings."""
     stationary = plan_live_lab(LIVE_SETTINGS).stationary
     return {
         path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)),

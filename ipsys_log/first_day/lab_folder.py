@@ -153,8 +153,9 @@ def _read_facts(path: Path) -> LogFacts:
     try:
         with Session([path]) as session:
             points = len(active_measurements(session.payloads(session.topics(MEASUREMENTS))))
-            is_live = bool(session.count(LATENCY_TOPIC))
-            tracked = sum(session.count(topic) for topic in session.topics(TRACKS)) if is_live else 0
+            # Only a live recording has latencies; the run of a replay does not count.
+            run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
+            tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
             aligned_run = None if points or tracked else newest_run(session, CAMERA_POINTS)
             return LogFacts(path, session.start_ns, points, tracked, aligned_run)
     except (IpsysError, OSError) as error:

@@ -15,7 +15,7 @@ from ipsys_log.models.table import min_pairs
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import check_references
 
-__all__ = ["CameraIntrinsics", "Progress", "StepState", "Status", "read_progress"]
+__all__ = ["CameraIntrinsics", "Progress", "Status", "StepState", "read_progress"]
 
 # The model that a replay fits, and the number of calibration points that gives good results.
 _MODEL, _GOOD = "poly", 40

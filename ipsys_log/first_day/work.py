@@ -253,7 +253,7 @@ def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
 
 
 class _NewestImage:
-    """A thread that handles the newest image; images that arrive meanwhile are left out. A context manager."""
+    """A context manager with a thread that handles the newest image, and leaves out those before it."""
 
     def __init__(self, handle: Callable[[CompressedImage | CompressedVideo], None]) -> None:
         self._handle = handle

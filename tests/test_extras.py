@@ -115,6 +115,7 @@ REFUSED = {
     "'ipsys_log[foxglove]'",
     "live --web --model-from model.mcap -o x.mcap": "--web needs Starlette and Uvicorn: pip install "
     "'ipsys_log[web]'",
+    "setup new_lab": "setup needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",

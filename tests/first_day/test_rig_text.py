@@ -49,7 +49,7 @@ def test_unknown_layout_is_refused_and_unchanged(tmp_path: Path) -> None:
     )
     path.write_text(text)
     expected = replace(load_rig(path), cameras=CAMERAS)
-    with pytest.raises(IpsysError, match="cannot change its layout|lab\\.toml"):
+    with pytest.raises(IpsysError, match=r"lab\.toml"):
         write_rig(path, replace_tables(text, "[[cameras]]", CAMERAS), expected)
     assert path.read_text() == text
 

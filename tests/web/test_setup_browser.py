@@ -1,4 +1,4 @@
-"""The first day in a browser: from an empty folder to tracked robots, on any screen, with the keyboard only."""
+"""The first day in a browser: from an empty folder to tracked robots, on any screen, by keyboard."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, tmp_path
         visitor.tap("#simulate")
         visitor.tap("#onward")
         visitor.run_job("#pictures")
-        visitor.wait("document.querySelectorAll('.image img').length === 3")
+        visitor.wait(f"document.querySelectorAll('.image img').length === 3 && {JOB_ENDED}")
         visitor.tap("#onward")
         says(browser, "#panel", "from the simulated lab")
         visitor.tap("#onward")

@@ -118,6 +118,7 @@ REFUSED = {
     "export lab.mcap -o x.mcap": "a ROS 2 bag needs rosbags: pip install 'ipsys_log[ros2]'",
     "export lab.mcap -o x.mp4": "a video needs Matplotlib: pip install 'ipsys_log[report]'",
     "import ros lab.bag -o x.mcap": "import ros needs rosbags: pip install 'ipsys_log[ros2]'",
+    "setup new_lab": "setup needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",

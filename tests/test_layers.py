@@ -38,6 +38,7 @@ LAYERS = (
     ("opened_log",),
     ("api",),
     ("report",),
+    ("first_day",),
     ("web",),
     ("cli",),
     ("__main__", "__init__"),

@@ -22,6 +22,7 @@ from ipsys_log.cli import (
     drive,
     exclude,
     export,
+    first_day,
     imports,
     inspect,
     markers,
@@ -43,7 +44,7 @@ _STAGES = "Single stages of replay"
 # The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
 _PLACED: dict[str, tuple[str, ...]] = {
     "First day, in this order": (
-        *("init", "markers", "cameras", "calibrate", "align", "record", "measure"),
+        *("setup", "init", "markers", "cameras", "calibrate", "align", "record", "measure"),
         *("calibrate-lab", "replay", "live"),
     ),
     "Accuracy, and the next points to measure": ("evaluate", "exclude", "plan", "report", "drift"),
@@ -65,6 +66,10 @@ def panels() -> dict[str, tuple[str, ...]]:
 
 # Each line is a command and its purpose; at most 76 columns.
 EXAMPLES: dict[str, str] = {
+    "setup": """
+ipsys setup lab                          # all steps of the first day
+ipsys setup lab --host 0.0.0.0           # also on a tablet
+""",
     "init": """
 ipsys init lab.toml                      # an example with comments
 ipsys init lab.toml --from monday.mcap   # the rig of a log
@@ -262,7 +267,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _MODULES = (
-    *(setup, markers, cameras, calibrate, align, imports, record, measure),
+    *(first_day, setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
     *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, merge, compare, publish, drive),
 )

@@ -265,15 +265,10 @@ def _check_free(path: Path, force: bool) -> None:
 
 def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
     """Write the files of a camera, one for each format."""
-    from ipsys_log.exchange.calibration_files import FORMATS
+    from ipsys_log.exchange.calibration_files import calibration_text
     from ipsys_log.report.files import write_files
 
-    comment = (
-        f"ipsys calibrate: RMS {one.rms_px:.3f} px, median {one.median_px:.3f} px over {len(one.pixels)} "
-        f"corners of {len(one.used)} pictures"
-    )
-    sigmas = dict(zip(one.names, one.sigmas.tolist(), strict=True))
-    contents = {path: FORMATS[name][0](one.lens, sigmas, comment).encode() for name, path in paths.items()}
+    contents = {path: calibration_text(one, name).encode() for name, path in paths.items()}
     for folder in dict.fromkeys(path.parent for path in contents):
         write_files(folder, {path.name: data for path, data in contents.items() if path.parent == folder})
         note_kept(", ".join(str(path) for path in contents if path.parent == folder))

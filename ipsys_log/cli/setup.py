@@ -41,12 +41,6 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
     "tape_sigma_m": (0.003, "Standard deviation of the tape readings, in m."),
 }
 
-# The beginning of the rig file of the simulated lab.
-_SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
-# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers do not move.
-
-"""
-
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(init)
@@ -70,6 +64,7 @@ def init(
 ) -> None:
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
+    from ipsys_log.exchange.lab_files import write_new
     from ipsys_log.rig.file import HIDDEN, example_toml
 
     if simulated:
@@ -78,7 +73,7 @@ def init(
         _init_simulated(path)
         return
     text = example_toml() if log is None else _rig_of(log)
-    _write_new({path: text})
+    write_new({path: text})
     console.print(f"{path} written: edit it to describe your lab")
     if HIDDEN in text:
         console.print(
@@ -87,44 +82,17 @@ def init(
 
 
 def _init_simulated(path: Path) -> None:
-    from ipsys_log.rig.file import rig_toml
-    from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
+    from ipsys_log.exchange.lab_files import simulated_lab_texts, tape_sheet_path, write_new
 
-    tape = path.with_name(f"{path.stem}_tape.csv")
-    lying = plan_live_lab(LIVE_SETTINGS).stationary
-    _write_new({path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)), tape: tape_sheet(lying)})
+    texts = simulated_lab_texts(path)
+    write_new(texts)
+    tape = tape_sheet_path(path)
+    lines = texts[tape].splitlines()
     console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
     console.print(
-        f"{tape} written: the tape measurements of its {len(lying)} stationary markers", markup=False
+        f"{tape} written: the tape measurements of its {len(lines) - 1} stationary markers", markup=False
     )
     console.print(f"next: ipsys align --rig {path}", markup=False)
-
-
-def _write_new(texts: dict[Path, str]) -> None:
-    """Write files that do not exist yet: all of them, or none.
-
-    Raises
-    ------
-    IpsysError
-        A file exists.
-    """
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.log.lock import describe_broken_link
-
-    made: list[Path] = []
-    try:
-        for path, text in texts.items():
-            with path.open("x", encoding="utf-8") as file:
-                made.append(path)
-                file.write(text)
-    except OSError as error:
-        for path in made:
-            path.unlink()
-        if isinstance(error, FileExistsError):
-            taken = Path(error.filename)
-            text = describe_broken_link(taken) or f"{taken}: exists already; edit it, or give another name"
-            raise IpsysError(text) from error
-        raise
 
 
 def _rig_of(log: Path) -> str:

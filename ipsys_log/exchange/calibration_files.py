@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.kalibr_files import find_cameras, read_camchain
 from ipsys_log.geometry.lenses import check_calibration
@@ -19,6 +20,7 @@ from ipsys_log.messages import CameraCalibration
 
 __all__ = [
     "FORMATS",
+    "calibration_text",
     "check_format",
     "kalibr_yaml",
     "opencv_yaml",
@@ -237,3 +239,13 @@ def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
             raise IpsysError(f"{path}: has no calibration of camera {camera}, only of {names}")
         lens: CameraCalibration = log.payloads([topics[name]])[-1]
     return replace(lens, frame_id=camera)
+
+
+def calibration_text(result: CalibrationResult, name: str = "opencv") -> str:
+    """Return the file of a result of an intrinsic calibration, in a format of ``FORMATS``."""
+    comment = (
+        f"ipsys calibrate: RMS {result.rms_px:.3f} px, median {result.median_px:.3f} px over "
+        f"{len(result.pixels)} corners of {len(result.used)} pictures"
+    )
+    sigmas = dict(zip(result.names, result.sigmas.tolist(), strict=True))
+    return FORMATS[name][0](result.lens, sigmas, comment)

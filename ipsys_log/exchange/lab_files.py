@@ -1,4 +1,4 @@
-"""The cameras of a lab: the cameras of the rig file, with their intrinsics."""
+"""The files of a lab: cameras of the rig file with their intrinsics, and the new files of a simulated lab."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ from pathlib import Path
 from ipsys_log.capture.simulated import intrinsics_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
+from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
-from ipsys_log.rig.file import load_rig
+from ipsys_log.rig.file import load_rig, rig_toml
+from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
 from ipsys_log.stages.detect import marker_detector
 
-__all__ = ["load_cameras", "load_lenses"]
+__all__ = ["load_cameras", "load_lenses", "simulated_lab_texts", "tape_sheet_path", "write_new"]
+
+# The beginning of the rig file of the simulated lab.
+_SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
+# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers do not move.
+
+"""
 
 
 def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigCamera]]:
@@ -73,3 +81,41 @@ def load_lenses(
             f"--calibration {unknown[0]}: this camera is not recorded; the cameras are {', '.join(names)}"
         )
     return lenses
+
+
+def tape_sheet_path(path: Path) -> Path:
+    """Return the path of the sheet of tape measurements beside the rig file of a simulated lab."""
+    return path.with_name(f"{path.stem}_tape.csv")
+
+
+def simulated_lab_texts(path: Path) -> dict[Path, str]:
+    """Return the files of the simulated lab: its rig file ``path``, and the sheet of its tape readings."""
+    stationary = plan_live_lab(LIVE_SETTINGS).stationary
+    return {
+        path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)),
+        tape_sheet_path(path): tape_sheet(stationary),
+    }
+
+
+def write_new(texts: Mapping[Path, str]) -> None:
+    """Write files that do not exist yet: all of them, or none.
+
+    Raises
+    ------
+    IpsysError
+        A file exists.
+    """
+    made: list[Path] = []
+    try:
+        for path, text in texts.items():
+            with path.open("x", encoding="utf-8") as file:
+                made.append(path)
+                file.write(text)
+    except OSError as error:
+        for path in made:
+            path.unlink()
+        if isinstance(error, FileExistsError):
+            taken = Path(error.filename)
+            text = describe_broken_link(taken) or f"{taken}: exists already; edit it, or give another name"
+            raise IpsysError(text) from error
+        raise

@@ -37,6 +37,7 @@ __all__ = [
     "hide_passwords",
     "load_rig",
     "rig_toml",
+    "toml_rows",
 ]
 
 Item = TypeVar("Item")
@@ -140,14 +141,14 @@ def rig_toml(rig: Rig) -> str:
     robot = "ada"
     <BLANKLINE>
     """
-    lines = _toml_rows(rig)
+    lines = toml_rows(rig)
     if rig.floor is not None:
-        lines += ["", "[floor]", *_toml_rows(rig.floor)]
+        lines += ["", "[floor]", *toml_rows(rig.floor)]
     if rig.stream is not None:
-        lines += ["", "[stream]", *_toml_rows(rig.stream)]
+        lines += ["", "[stream]", *toml_rows(rig.stream)]
     for key in _ITEMS:
         for item in getattr(rig, key):
-            lines += ["", f"[[{key}]]", *_toml_rows(item)]
+            lines += ["", f"[[{key}]]", *toml_rows(item)]
     return "\n".join(lines) + "\n"
 
 
@@ -174,7 +175,8 @@ def hide_passwords(rig: Rig) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
-def _toml_rows(item: Any) -> list[str]:
+def toml_rows(item: Any) -> list[str]:
+    """Return the lines of an item of a rig, without the header of its table; missing values have no line."""
     values = [(f.name, getattr(item, f.name)) for f in fields(item)]
     # A JSON string is a TOML string, and a JSON number is a TOML number; so is a list of strings.
     return [

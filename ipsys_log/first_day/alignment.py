@@ -1,0 +1,99 @@
+"""The alignment of a folder as data of a page: an arrow on the image of each camera, and advice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ipsys_log.analysis.alignment import Alignment
+from ipsys_log.geometry.lenses import project
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CameraCalibration, CompressedImage
+from ipsys_log.messages.channels import RIG
+from ipsys_log.report.alignment import read_alignment
+from ipsys_log.report.alignment_text import advise, coverage_lines
+
+__all__ = ["AlignedCamera", "AlignmentResult", "read_result"]
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedCamera:
+    """The alignment of a camera.
+
+    Attributes
+    ----------
+    level : whether the camera looks straight down; None if the markers do not tell it.
+    size_px : width and height of its image.
+    centre_px, plumb_px : principal point, and the pixel straight below the camera; the camera is turned from
+        the first to the second. ``plumb_px`` is None if the direction is unknown.
+    markers_px : positions of the markers on the floor.
+    picture : an image as JPEG; None if the log has none.
+    """
+
+    camera: str
+    level: bool | None
+    advice: str
+    size_px: tuple[int, int]
+    centre_px: tuple[float, float]
+    plumb_px: tuple[float, float] | None
+    markers_px: tuple[tuple[float, float], ...]
+    picture: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentResult:
+    """The alignment of all cameras; each line on the coverage of the floor says whether it is good."""
+
+    cameras: tuple[AlignedCamera, ...]
+    coverage: tuple[tuple[str, bool], ...]
+    notes: tuple[str, ...]
+
+
+def read_result(log: Path, run: str) -> AlignmentResult:
+    """Read the alignment from a log of ``ipsys align``.
+
+    Parameters
+    ----------
+    run : the run of its camera points.
+
+    Raises
+    ------
+    IpsysError
+        The log cannot be read.
+    """
+    with Session([log]) as session:
+        rig = session.payloads(session.topics(RIG))[-1]
+        lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+        lab = read_alignment(session, run, rig, lenses)
+        cameras = tuple(
+            _camera(one, lenses[one.camera], _picture(session, one.camera))
+            for one in lab.alignments
+            if one.camera in lenses
+        )
+    return AlignmentResult(cameras, tuple(coverage_lines(lab)), lab.notes)
+
+
+def _camera(one: Alignment, lens: CameraCalibration, picture: bytes | None) -> AlignedCamera:
+    plumb_px = None if one.down is None else _pixel(one.down, lens)
+    markers_px = tuple(_pixel(marker.point_m, lens) for marker in one.floor_markers)
+    centre_px = float(lens.K[0, 2]), float(lens.K[1, 2])
+    size_px = lens.width, lens.height
+    return AlignedCamera(
+        one.camera, one.level, advise(one), size_px, centre_px, plumb_px, markers_px, picture
+    )
+
+
+def _pixel(point_m: np.ndarray, lens: CameraCalibration) -> tuple[float, float]:
+    x_px, y_px = project(np.asarray(point_m, dtype=np.float64)[None], lens)[0].tolist()
+    return round(x_px, 1), round(y_px, 1)
+
+
+def _picture(session: Session, camera: str) -> bytes | None:
+    topic = session.images.get(camera)
+    if topic is None:
+        return None
+    payload = next(iter(session.messages([topic]))).payload
+    is_jpeg = isinstance(payload, CompressedImage) and payload.format == "jpeg"
+    return payload.data if is_jpeg else None

@@ -1,0 +1,117 @@
+"""Pictures of a board from a live camera: a picture is kept when it shows the board in a new pose."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting, view_board
+from ipsys_log.calibration.image_selection import NEAR, advise, measure_coverage
+from ipsys_log.errors import FrameError
+from ipsys_log.images.video import decode_keyframe, is_keyframe
+from ipsys_log.messages import CompressedImage, CompressedVideo
+from ipsys_log.stages.detect import decode_grey
+
+__all__ = ["BoardSearch"]
+
+Grey = NDArray[np.uint8]
+
+# So many pictures, without advice on further ones, are enough.
+_ENOUGH = 20
+# The picture on the page is smaller than that of the camera.
+_SHOWN_WIDTH_PX = 640
+_QUALITY = 70
+
+
+class BoardSearch:
+    """The search for a board in the images of one camera, and the pictures that it keeps.
+
+    One thread calls :meth:`look`, and another one reads the state.
+
+    Parameters
+    ----------
+    camera, board : name of the camera, and the board to search for; ``camera`` is also an attribute.
+    folder : an existing folder for the pictures.
+
+    Attributes
+    ----------
+    count : number of kept pictures.
+    is_enough : the kept pictures cover the image and enough poses.
+    """
+
+    def __init__(self, camera: str, board: Board, folder: Path) -> None:
+        self.count, self.is_enough = 0, False
+        self.camera, self._board, self._folder = camera, board, folder
+        self._kept: list[BoardSighting] = []
+        self._lock = threading.Lock()
+        self._number = 0
+        self._shown: bytes | None = None
+        self._state: dict[str, Any] = {}
+
+    def look(self, image: CompressedImage | CompressedVideo) -> None:
+        """Search for the board in an image, and keep the image if it shows a new pose."""
+        if isinstance(image, CompressedVideo) and not is_keyframe(image):
+            return
+        try:
+            grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
+        except FrameError:
+            return
+        sighting = view_board(f"{self.count}", grey, self._board, thorough=False).sighting
+        if sighting is not None and len(sighting.ids) >= LEAST_CORNERS and self._is_new(sighting, grey):
+            self._keep(sighting, grey)
+        self._show(sighting, grey)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the state as plain data; the outlines and the present board are in px of the image."""
+        with self._lock:
+            return dict(self._state)
+
+    def picture(self) -> bytes | None:
+        """Return the last image, smaller, as JPEG."""
+        with self._lock:
+            return self._shown
+
+    def _is_new(self, sighting: BoardSighting, grey: Grey) -> bool:
+        """Return whether a board differs from all kept ones by 3 % of the image diagonal."""
+        near_px = NEAR * float(np.hypot(*grey.shape))
+        moved_px = (np.linalg.norm(sighting.outline - other.outline, axis=1).mean() for other in self._kept)
+        return all(distance_px >= near_px for distance_px in moved_px)
+
+    def _keep(self, sighting: BoardSighting, grey: Grey) -> None:
+        self._kept.append(sighting)
+        self.count = len(self._kept)
+        # PNG: a second compression would move the corners.
+        (self._folder / f"{self.count:03d}.png").write_bytes(bytes(cv2.imencode(".png", grey)[1]))
+
+    def _show(self, sighting: BoardSighting | None, grey: Grey) -> None:
+        height, width = grey.shape
+        scale = min(1.0, _SHOWN_WIDTH_PX / width)
+        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        shown = simplejpeg.encode_jpeg(
+            np.ascontiguousarray(small)[..., None], quality=_QUALITY, colorspace="GRAY"
+        )
+        advice = ["hold the board into the image"]
+        if self._kept:
+            pixels = np.concatenate([one.pixels for one in self._kept])
+            outlines = np.stack([one.outline for one in self._kept])
+            advice = advise(measure_coverage(pixels, (width, height), outlines))
+            self.is_enough = not advice and self.count >= _ENOUGH
+        with self._lock:
+            self._number += 1
+            self._shown = shown
+            self._state = {
+                "camera": self.camera,
+                "number": self._number,
+                "count": self.count,
+                "size_px": [width, height],
+                "kept_px": [one.outline.round().tolist() for one in self._kept],
+                "board_px": None if sighting is None else sighting.outline.round().tolist(),
+                "advice": advice or ["tilt the board to all sides, near and far"],
+            }

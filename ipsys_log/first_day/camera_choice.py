@@ -1,0 +1,186 @@
+"""The cameras that a lab can use: those of the rig, attached ones and simulated ones, each with a picture."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+
+from ipsys_log.capture.devices import check_devices, check_sources, open_source
+from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.simulated import parse_source
+from ipsys_log.capture.usb_bus import UsbCamera, find_cameras
+from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.first_day.rig_text import replace_tables, write_rig
+from ipsys_log.images.video import decode_keyframe, is_keyframe
+from ipsys_log.messages import CompressedVideo, Rig, RigCamera
+from ipsys_log.rig.file import check_name, check_rig, hide_password, load_rig
+from ipsys_log.simulation.live_lab import LIVE_SETTINGS
+from ipsys_log.stages.detect import decode_grey
+from ipsys_log.survey.entry import Fault
+
+__all__ = [
+    "CameraOption",
+    "list_attached",
+    "list_options",
+    "save_cameras",
+    "set_calibration",
+    "take_picture",
+]
+
+# A source yields a frame, or None at least twice a second: the search for a picture ends after a minute.
+_MOST_WAITS = 120
+
+
+class CameraOption(NamedTuple):
+    """A camera that the lab can use.
+
+    ``key`` is its source without a password. ``text`` describes it, and ``name`` is its name in the rig,
+    empty if the lab does not use it.
+    """
+
+    key: str
+    text: str
+    camera: RigCamera
+
+    @property
+    def name(self) -> str:
+        return self.camera.name
+
+
+def list_attached() -> list[UsbCamera]:
+    """Return the attached cameras; only Linux lists them."""
+    return find_cameras() if sys.platform == "linux" else []
+
+
+def list_options(rig: Rig | None, attached: Sequence[UsbCamera]) -> list[CameraOption]:
+    """Return the cameras of the rig, then attached cameras and simulated ones that the rig does not use."""
+    used = [camera for camera in rig.cameras if camera.source] if rig else []
+    options = [CameraOption(hide_password(str(camera.source)), "in lab.toml", camera) for camera in used]
+    options += _unused(attached, used)
+    simulated = [RigCamera("", source=f"sim:{name}") for name in LIVE_SETTINGS.cameras]
+    present = {_simulated_number(camera) for camera in used if str(camera.source).startswith("sim:")}
+    return options + [
+        CameraOption(str(camera.source), "simulated lab, without hardware", camera)
+        for camera in simulated
+        if _simulated_number(camera) not in present
+    ]
+
+
+def save_cameras(path: Path, names: Mapping[str, str], attached: Sequence[UsbCamera]) -> list[Fault]:
+    """Write the named cameras into the rig file; return the faults of names instead.
+
+    Parameters
+    ----------
+    names : the name of each used camera, by the key of its option; cameras without a name are not used.
+    attached : the attached cameras that the user has seen.
+
+    Raises
+    ------
+    IpsysError
+        The rig file has a fault, or no camera has a name.
+    """
+    rig = load_rig(path)
+    options = {option.key: option for option in list_options(rig, attached)}
+    chosen: list[RigCamera] = []
+    faults: list[Fault] = []
+    for key, typed in names.items():
+        name = typed.strip()
+        if not name:
+            continue
+        if key not in options:
+            raise IpsysError("this camera is not attached any more; search for cameras again")
+        try:
+            check_name(name, "camera name")
+        except IpsysError as error:
+            faults.append(Fault(key, str(error)))
+        if any(camera.name == name for camera in chosen):
+            faults.append(Fault(key, f"two cameras have the name {name!r}; give each its own"))
+        chosen.append(_settings(options[key].camera, name, rig))
+    if faults:
+        return faults
+    if not chosen:
+        raise IpsysError("no camera has a name; type a name for each camera that the lab uses")
+    new = check_rig(replace(rig, cameras=tuple(chosen)), path.name)
+    check_devices(chosen)
+    check_sources(chosen)
+    write_rig(path, replace_tables(path.read_text(encoding="utf-8"), "[[cameras]]", chosen), new)
+    return []
+
+
+def set_calibration(path: Path, camera: str, file: str) -> None:
+    """Write the name of a file of intrinsics into the rig file.
+
+    Raises
+    ------
+    IpsysError
+        The rig file has a fault, or cannot be changed.
+    """
+    rig = load_rig(path)
+    cameras = tuple(replace(one, calibration=file) if one.name == camera else one for one in rig.cameras)
+    text = replace_tables(path.read_text(encoding="utf-8"), "[[cameras]]", cameras)
+    write_rig(path, text, replace(rig, cameras=cameras))
+
+
+def take_picture(camera: RigCamera, say: Say, is_stopped: Callable[[], bool]) -> bytes | None:
+    """Open a camera, and return its first image as JPEG or PNG; None if it sends none, or after a stop.
+
+    Raises
+    ------
+    IpsysError
+        The camera cannot be opened, or sends a damaged image.
+    """
+    with open_source(replace(camera, name=camera.name or "new"), Clock(), say) as frames:
+        for frame in islice(frames, _MOST_WAITS):
+            if is_stopped():
+                return None
+            if frame is not None and (picture := _picture(frame)) is not None:
+                return picture
+    return None
+
+
+def _picture(frame: Frame) -> bytes | None:
+    if frame.format in ("jpeg", "png"):
+        return frame.data
+    video = CompressedVideo(0, "", frame.data, frame.format)
+    if not is_keyframe(video):
+        return None
+    try:
+        return bytes(cv2.imencode(".jpg", decode_grey(decode_keyframe(video)))[1])
+    except FrameError:
+        return None
+
+
+def _unused(attached: Sequence[UsbCamera], used: Sequence[RigCamera]) -> Iterator[CameraOption]:
+    """Yield the attached cameras that the rig does not use, by their stable device path."""
+    taken = {
+        Path(str(camera.source).partition(":")[2]).resolve()
+        for camera in used
+        if str(camera.source).startswith("usb:/")
+    }
+    for found in attached:
+        if Path(found.device).resolve() not in taken:
+            source = f"usb:{found.stable or found.device}"
+            text = f"{found.name}; {found.fault}" if found.fault else found.name
+            yield CameraOption(source, text, RigCamera("", source=source))
+
+
+def _simulated_number(camera: RigCamera) -> int | None:
+    """Return the number of a camera in the simulated lab; None for a source with a fault."""
+    try:
+        return parse_source(camera).number
+    except IpsysError:
+        return None
+
+
+def _settings(camera: RigCamera, name: str, rig: Rig) -> RigCamera:
+    """Return a chosen camera; a new one gets the settings of the entry of its name without a source."""
+    planned = next((one for one in rig.cameras if one.name == name and not one.source), RigCamera(name))
+    if camera.name:
+        return replace(camera, name=name)
+    return replace(planned, source=camera.source)

@@ -1,0 +1,305 @@
+"""The setup of a lab as one session: its state as plain data, and the actions of its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+from ipsys_log.calibration.board import parse_board
+from ipsys_log.capture.usb_bus import UsbCamera
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
+from ipsys_log.first_day import work
+from ipsys_log.first_day.alignment import AlignmentResult, read_result
+from ipsys_log.first_day.board_search import BoardSearch
+from ipsys_log.first_day.camera_choice import (
+    list_attached,
+    list_options,
+    save_cameras,
+    set_calibration,
+    take_picture,
+)
+from ipsys_log.first_day.jobs import Job, Jobs
+from ipsys_log.first_day.lab_folder import LabFolder, LogFacts
+from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
+from ipsys_log.first_day.steps import Progress, Status, read_progress
+from ipsys_log.rig.file import load_rig
+from ipsys_log.sinks.sink import Sink
+from ipsys_log.survey.entry import Fault
+from ipsys_log.survey.live import LiveScene
+
+__all__ = ["DICTIONARIES", "Pages", "SetupSession"]
+
+# The dictionaries that the page offers first; the field takes any other name of OpenCV, too.
+DICTIONARIES = (
+    *("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250"),
+    *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
+)
+
+# The board as the options of ``ipsys calibrate`` describe it without other values.
+_SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
+_CALIBRATION = "the calibration"
+
+
+class Pages(NamedTuple):
+    """The functions that show a measuring page and a dashboard until the end of their block."""
+
+    measuring: Callable[[LiveScene], AbstractContextManager[object]]
+    dashboard: Callable[[work.LiveView], AbstractContextManager[Sink]]
+
+
+class _Picture(NamedTuple):
+    """The last picture of a camera, or the reason that there is none; ``number`` tells pictures apart."""
+
+    number: int
+    data: bytes | None
+    fault: str
+
+
+class SetupSession:
+    """The setup of the lab in a folder. Its state comes from the files of the folder.
+
+    Only pictures of cameras and the present job are in memory.
+
+    Parameters
+    ----------
+    folder : the folder.
+    pages : the pages of the steps with live cameras.
+
+    Attributes
+    ----------
+    jobs : the present job.
+    """
+
+    def __init__(self, folder: LabFolder, pages: Pages) -> None:
+        self.jobs = Jobs()
+        self._folder, self._pages = folder, pages
+        self._attached: Sequence[UsbCamera] | None = None
+        self._pictures: dict[str, _Picture] = {}
+        self._number = 0
+        self._search: BoardSearch | None = None
+        self._alignment: tuple[LogFacts, AlignmentResult | str] | None = None
+        self._actions: dict[str, tuple[str, str, Callable[[Job], None]]] = {
+            "pictures": ("the pictures of the cameras", "cameras", self._take_pictures),
+            "align": ("the alignment", "alignment", lambda job: work.align(folder, job)),
+            "sheet": ("the measuring by the sheet", "points", self._measure_sheet),
+            "measure": (
+                "the measuring", "points", lambda job: work.measure(folder, pages.measuring, job),
+            ),
+            "replay": ("the fit", "accuracy", lambda job: work.fit_and_evaluate(folder, job)),
+            "live": ("the live view", "live", lambda job: work.track(folder, pages.dashboard, job)),
+        }  # fmt: skip
+
+    def describe(self) -> dict[str, Any]:
+        """Return the whole state as plain data."""
+        progress = read_progress(self._folder)
+        job = self.jobs.present
+        return {
+            "folder": self._folder.path.absolute().name,
+            "next": progress.next,
+            "steps": [asdict(step) for step in progress.steps],
+            "rig": self._describe_rig(progress),
+            "cameras": self._describe_cameras(progress),
+            "intrinsics": [asdict(one) for one in progress.intrinsics],
+            "board": self._describe_board(),
+            "alignment": self._describe_alignment(progress),
+            "points": {
+                "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
+                "logs": [[log.path.name, log.points] for log in progress.logs if log.points],
+            },
+            "answer": list(progress.fit.answer) if progress.fit else [],
+            "faults": [log.fault for log in progress.logs if log.fault],
+            "job": None if job is None else {**job.describe(), "action": self._action_of(job)},
+        }
+
+    def save_rig(self, typed: Mapping[str, str]) -> list[Fault]:
+        """Write the typed rig; return the faults of its fields instead.
+
+        Raises
+        ------
+        IpsysError
+            The rig file cannot be changed, or a job works.
+        """
+        self._check_idle()
+        return save_rig_entry(self._folder.rig_file, typed)
+
+    def simulate(self) -> None:
+        """Write the rig of the simulated lab and its sheet (``ipsys init lab.toml --simulated``).
+
+        Raises
+        ------
+        IpsysError
+            There is a rig file already.
+        """
+        write_new(simulated_lab_texts(self._folder.rig_file))
+
+    def save_cameras(self, names: Mapping[str, str]) -> list[Fault]:
+        """Write the named cameras into the rig file; return the faults of names instead.
+
+        Raises
+        ------
+        IpsysError
+            The rig file has a fault, or a job works.
+        """
+        self._check_idle()
+        return save_cameras(self._folder.rig_file, names, self._found())
+
+    def use_intrinsics(self, camera: str) -> None:
+        """Write the file of intrinsics of a camera into the rig file.
+
+        Raises
+        ------
+        IpsysError
+            The folder has no such file.
+        """
+        self._check_idle()
+        files = {one.camera: one.file for one in read_progress(self._folder).intrinsics}
+        file = files.get(camera)
+        if file is None:
+            raise IpsysError(f"the folder has no new intrinsics of camera {camera!r}; calibrate it first")
+        set_calibration(self._folder.rig_file, camera, file)
+
+    def calibrate(self, camera: str, board: str) -> list[Fault]:
+        """Start the calibration of a camera with a board; return the fault of the board instead.
+
+        Raises
+        ------
+        IpsysError
+            The rig has no such camera, or a job works.
+        """
+        self._check_idle()
+        step = read_progress(self._folder)
+        if camera not in [one.camera for one in step.intrinsics]:
+            raise IpsysError(f"lab.toml has no camera {camera!r} with a source; reload this page")
+        try:
+            wanted = parse_board(board, _SQUARE_M, _MARKER_SCALE, _DICTIONARY, False)
+        except IpsysError as error:
+            return [Fault("board", str(error))]
+        pictures = self._folder.new_board_folder(camera)
+        search = self._search = BoardSearch(camera, wanted, pictures)
+        self.jobs.start(
+            f"{_CALIBRATION} of {camera}",
+            lambda job: work.calibrate(self._folder, search, pictures, board, job),
+        )
+        return []
+
+    def start(self, action: str) -> None:
+        """Start the job of an action.
+
+        Raises
+        ------
+        IpsysError
+            There is no such action, another job works, or the step lacks an earlier one.
+        """
+        if action not in self._actions:
+            raise IpsysError(f"the action {action!r} is not known; reload this page")
+        title, name, job = self._actions[action]
+        step = read_progress(self._folder).step(name)
+        if step.status is Status.WAITS:
+            raise IpsysError(f"{step.title}: {step.text}")
+        self.jobs.start(title, job)
+
+    def picture(self, kind: str, name: str) -> bytes | None:
+        """Return a picture: ``board`` of the calibration, ``camera`` by number, ``alignment`` by camera."""
+        if kind == "board":
+            return None if self._search is None else self._search.picture()
+        if kind == "camera":
+            found = (one.data for one in self._pictures.values() if str(one.number) == name)
+            return next(found, None)
+        result = None if self._alignment is None else self._alignment[1]
+        cameras = result.cameras if isinstance(result, AlignmentResult) else ()
+        return next((one.picture for one in cameras if one.camera == name), None)
+
+    def close(self) -> None:
+        """Stop the present job in order."""
+        self.jobs.close()
+
+    def _check_idle(self) -> None:
+        job = self.jobs.present
+        if job is not None and not job.ended:
+            raise IpsysError(f"{job.name} is not finished; wait for it, or stop it")
+
+    def _found(self) -> Sequence[UsbCamera]:
+        if self._attached is None:
+            self._attached = list_attached()
+        return self._attached
+
+    def _action_of(self, job: Job) -> str:
+        return next((key for key, (title, *_) in self._actions.items() if title == job.name), "calibrate")
+
+    def _describe_board(self) -> dict[str, Any] | None:
+        """Return the pictures of a board that a camera takes now; None without a calibration."""
+        job = self.jobs.present
+        if self._search is None or job is None or job.ended or self._action_of(job) != "calibrate":
+            return None
+        return self._search.describe() or None
+
+    def _describe_rig(self, progress: Progress) -> dict[str, Any]:
+        return {
+            "exists": self._folder.rig_file.exists(),
+            "name": progress.rig.name if progress.rig else None,
+            "values": rig_fields(progress.rig or example_rig()),
+            "labels": LABELS,
+            "dictionaries": DICTIONARIES,
+        }
+
+    def _describe_cameras(self, progress: Progress) -> list[dict[str, Any]]:
+        rows = []
+        for key, text, camera in list_options(progress.rig, self._found()):
+            taken = self._pictures.get(key)
+            picture = f"picture/camera/{taken.number}" if taken is not None and taken.data else None
+            fault = "" if taken is None else taken.fault
+            rows.append({"key": key, "text": text, "name": camera.name, "picture": picture, "fault": fault})
+        return rows
+
+    def _describe_alignment(self, progress: Progress) -> dict[str, Any] | None:
+        log = progress.alignment
+        if log is None or log.aligned_run is None:
+            return None
+        if self._alignment is None or self._alignment[0] != log:
+            try:
+                self._alignment = log, read_result(log.path, log.aligned_run)
+            except IpsysError as error:
+                self._alignment = log, str(error)
+        result = self._alignment[1]
+        if isinstance(result, str):
+            return {"fault": result, "cameras": [], "coverage": [], "notes": []}
+        cameras = [
+            {
+                "camera": one.camera,
+                "level": one.level,
+                "advice": one.advice,
+                "size_px": one.size_px,
+                "centre_px": one.centre_px,
+                "plumb_px": one.plumb_px,
+                "markers_px": one.markers_px,
+                "picture": f"picture/alignment/{one.camera}?{log.start_ns}" if one.picture else None,
+            }
+            for one in result.cameras
+        ]
+        return {"fault": "", "cameras": cameras, "coverage": result.coverage, "notes": result.notes}
+
+    def _take_pictures(self, job: Job) -> None:
+        """Search for cameras, and take a picture of each, one after the other."""
+        self._attached = list_attached()
+        rig = load_rig(self._folder.rig_file)
+        for option in list_options(rig, self._attached):
+            if job.is_stopped():
+                return
+            job.say(f"opening {option.key}")
+            data, fault = None, ""
+            try:
+                data = take_picture(option.camera, job.say, job.is_stopped)
+            except IpsysError as error:
+                fault = str(error)
+            self._number += 1
+            missing = "the camera sends no image; check its cable and its mode"
+            self._pictures[option.key] = _Picture(self._number, data, fault or ("" if data else missing))
+
+    def _measure_sheet(self, job: Job) -> None:
+        sheet = self._folder.sheet
+        if sheet is None:
+            raise IpsysError("the folder has no sheet lab_tape.csv; only the simulated lab has one")
+        work.measure_sheet(self._folder, sheet, job)

@@ -1,0 +1,325 @@
+"""The work of the steps with cameras and logs; each does what its command does, without a terminal."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ipsys_log import api, pipeline
+from ipsys_log.calibration.calibrate import CalibrationResult
+from ipsys_log.capture.devices import check_devices, check_sources, open_source
+from ipsys_log.capture.disk import expected_bytes_per_s, free_room
+from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.live_check import CameraMonitor
+from ipsys_log.capture.live_plan import check_start
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recorder import first_messages, fitting_lenses
+from ipsys_log.capture.simulated import show_board
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.calibration_files import calibration_text
+from ipsys_log.exchange.lab_files import load_cameras, load_lenses
+from ipsys_log.first_day.board_search import BoardSearch
+from ipsys_log.first_day.camera_choice import set_calibration
+from ipsys_log.first_day.jobs import Job
+from ipsys_log.first_day.lab_folder import LabFolder
+from ipsys_log.messages import (
+    CameraCalibration,
+    CompressedImage,
+    CompressedVideo,
+    Message,
+    Model,
+    Rig,
+)
+from ipsys_log.messages.channels import TRACKS
+from ipsys_log.report.calibration import calibration_lines
+from ipsys_log.report.files import write_files
+from ipsys_log.runs.graph import copy_model
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.select import wanted_models
+from ipsys_log.sinks.sink import Sink
+from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
+from ipsys_log.stages.fit import model_run
+from ipsys_log.survey.add_sheet import add_sheet, check_sheet
+from ipsys_log.survey.entry import check_references
+from ipsys_log.survey.from_log import open_finished_log
+from ipsys_log.survey.live import LiveScene
+from ipsys_log.units import NS_PER_S
+
+__all__ = [
+    "LiveView",
+    "OpenedLab",
+    "align",
+    "calibrate",
+    "fit_and_evaluate",
+    "measure",
+    "measure_sheet",
+    "track",
+]
+
+_LAST_STAGE = "camera-frame"
+# Durations of recordings, by the time stamps of the frames, and the least number of frames of each camera.
+_SHEET_S, _ALIGN_S, _LEAST_FRAMES = 5.0, 3.0, 20
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedLab:
+    """The opened cameras of a lab, with the first messages of a log."""
+
+    rig: Rig
+    lenses: Mapping[str, CameraCalibration]
+    cameras: LiveCameras
+    settings: list[Message]
+    monitor: CameraMonitor
+
+
+@dataclass(frozen=True, slots=True)
+class LiveView:
+    """A live recording that a page can show: its cameras, its log, and the run of the shown model."""
+
+    lab: OpenedLab
+    log: Path
+    model: Model
+    run: str
+    streams: tuple[Sink, ...]
+
+
+def align(folder: LabFolder, job: Job) -> None:
+    """Record the cameras for some seconds, and compute the camera points of the markers (``ipsys align``).
+
+    Raises
+    ------
+    IpsysError
+        The rig or a camera has a fault.
+    """
+    with _new_log(folder, "alignment") as log:
+        _record(folder, job, log, _ALIGN_S)
+        if not job.is_stopped():
+            api.replay(log, until=_LAST_STAGE, method="pose", progress=job.progress, say=job.say)
+
+
+def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, board: str, job: Job) -> None:
+    """Take pictures of a board until they are enough or the job is stopped, and calibrate the camera.
+
+    This is ``ipsys calibrate --rig lab.toml --board BOARD --camera NAME``; it also writes the file into the
+    rig. Simulated cameras show the board.
+
+    Raises
+    ------
+    IpsysError
+        The camera has a fault, or the pictures do not determine its intrinsics.
+    """
+    _, cameras = load_cameras(folder.rig_file, [search.camera])
+    check_sources(cameras)
+    shown = [show_board(camera, board) for camera in cameras]
+    job.say(f"opening {search.camera}")
+    with LiveCameras(shown, open_source, Clock(), job.say) as attached:
+        job.on_stop(attached.stop)
+        newest = _NewestImage(search.look)
+        with newest:
+            for message in attached:
+                if message is not None and isinstance(message.payload, (CompressedImage, CompressedVideo)):
+                    newest.put(message.payload)
+                if search.is_enough:
+                    attached.stop()
+    job.say(f"{search.count} pictures are in {pictures.parent.name}/{pictures.name}")
+    (outcome,) = api.calibrate(pictures, board=board, cameras=[search.camera], progress=job.progress)
+    if not isinstance(outcome, CalibrationResult):
+        raise IpsysError(outcome.reason)
+    file = f"{search.camera}.yaml"
+    write_files(folder.path, {file: calibration_text(outcome).encode()})
+    set_calibration(folder.rig_file, search.camera, file)
+    for line in (*calibration_lines(outcome), *outcome.notes):
+        job.say(line)
+
+
+def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
+    """Record stationary markers, and append the tape measurements of a sheet.
+
+    This is ``ipsys record``, and then ``ipsys measure LOG --csv SHEET``.
+
+    Raises
+    ------
+    IpsysError
+        The rig, a camera or a row of the sheet has a fault.
+    """
+    with _new_log(folder, "calibration") as log:
+        _record(folder, job, log, _SHEET_S)
+        if job.is_stopped():
+            return
+        check_sheet(sheet, log, Request())
+        with open_finished_log(log, Request(), job.progress, job.say) as scene:
+            for remark in add_sheet(scene, sheet):
+                job.say(remark)
+
+
+def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManager[object]], job: Job) -> None:
+    """Measure points with live cameras until the job is stopped (``ipsys measure``).
+
+    Parameters
+    ----------
+    show : shows the measuring page of a scene.
+
+    Raises
+    ------
+    IpsysError
+        The rig or a camera has a fault, or the rig has fewer than two reference points.
+    """
+    with _new_log(folder, "calibration") as log, _open_lab(folder, job) as lab:
+        check_references(lab.rig)
+        check_start(lab.rig, list(lab.cameras.states), lab.lenses, Request(), _LAST_STAGE)
+        scene = LiveScene(lab.rig, None, lab.cameras.states, lab.cameras.save)
+        with show(scene):
+            pipeline.measure(lab.cameras, lab.settings, log, Request(), [scene, lab.monitor])
+
+
+def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
+    """Fit the model to all calibration points of the folder, and evaluate it (``ipsys replay``).
+
+    Raises
+    ------
+    IpsysError
+        No log has calibration points, or the points do not determine the model.
+    """
+    api.replay(*folder.calibration_logs(), progress=job.progress, say=job.say)
+
+
+def track(folder: LabFolder, show: Callable[[LiveView], AbstractContextManager[Sink]], job: Job) -> None:
+    """Track robots with live cameras until the job is stopped (``ipsys live``).
+
+    Parameters
+    ----------
+    show : shows the dashboard of a recording; its value gets the recorded messages.
+
+    Raises
+    ------
+    IpsysError
+        The rig, a camera or the model has a fault.
+    """
+    request = Request(model_from=folder.calibration_logs()[-1])
+    with _new_log(folder, "live") as log, _open_lab(folder, job) as lab:
+        for line in check_start(lab.rig, list(lab.cameras.states), lab.lenses, request, None):
+            job.say(line)
+        name = wanted_models(request)[0]
+        run, cameras = model_run(name), lab.cameras
+        streamed = settings_of_rig(lab.rig.stream, folder.path)
+        for line in check_streams(streamed):
+            job.say(line)
+        heights_m = lab.rig.robot_heights_m()
+        with open_streams(
+            streamed, {TRACKS.topic_of(run)}, cameras.clock.now_ns, cameras.add_event, heights_m=heights_m
+        ) as streams:
+            view = LiveView(lab, log, copy_model(request, name)[1], run, tuple(streams))
+            with show(view) as sink:
+                sinks: list[Sink] = [sink, *streams]
+                pipeline.live(cameras, lab.settings, log, request, None, [lab.monitor], sinks=sinks)
+
+
+@contextmanager
+def _new_log(folder: LabFolder, name: str) -> Iterator[Path]:
+    """Yield the path of a new log; it counts from the end of the block on."""
+    try:
+        yield folder.new_log(name)
+    finally:
+        folder.finish_log()
+
+
+@contextmanager
+def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
+    """Open the cameras of the rig; a stop of the job ends them in order."""
+    rig, cameras = load_cameras(folder.rig_file)
+    lenses = load_lenses(folder.rig_file, cameras, {})
+    check_devices(cameras)
+    check_sources(cameras)
+    job.say(f"opening {', '.join(camera.name for camera in cameras)}")
+    with LiveCameras(cameras, open_source, Clock(), job.say) as attached, CameraMonitor(rig) as monitor:
+        job.on_stop(attached.stop)
+        sizes_px = {name: state.size_px for name, state in attached.states.items()}
+        fitting = fitting_lenses(lenses, sizes_px, job.say)
+        room = free_room(folder.rig_file, expected_bytes_per_s(cameras, attached.states))
+        job.say(room.describe(None))
+        yield OpenedLab(rig, fitting, attached, first_messages(rig, fitting, attached.now_ns), monitor)
+
+
+def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
+    """Record all cameras into a new log for some seconds."""
+    with _open_lab(folder, job) as lab:
+        job.say(f"recording into {log.name} for {seconds:g} s")
+        enough = _Enough(lab.cameras, seconds, job)
+        pipeline.record(lab.cameras, lab.settings, log, [enough])
+
+
+class _NewestImage:
+    """A context manager with a thread that handles the newest image, and leaves out those before it."""
+
+    def __init__(self, handle: Callable[[CompressedImage | CompressedVideo], None]) -> None:
+        self._handle = handle
+        self._image: CompressedImage | CompressedVideo | None = None
+        self._changed = threading.Condition()
+        self._is_ended = False
+        self._pool = ThreadPoolExecutor(1, "board")
+        self._working: Future[None] | None = None
+
+    def __enter__(self) -> None:
+        self._working = self._pool.submit(self._work)
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._is_ended = True
+            self._changed.notify_all()
+        self._pool.shutdown()
+        self._raise()
+
+    def put(self, image: CompressedImage | CompressedVideo) -> None:
+        """Replace the waiting image; raise the error of the thread."""
+        if self._working is not None and self._working.done():
+            self._raise()
+        with self._changed:
+            self._image = image
+            self._changed.notify_all()
+
+    def _raise(self) -> None:
+        if self._working is not None:
+            self._working.result()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._image is not None or self._is_ended)
+                image, self._image = self._image, None
+                if self._is_ended:
+                    return
+            assert image is not None
+            self._handle(image)
+
+
+class _Enough:
+    """A consumer that stops the cameras when each has sent frames for some seconds.
+
+    It counts the time by the frames, so that a slow machine records the same scene.
+    """
+
+    def __init__(self, cameras: LiveCameras, seconds: float, job: Job) -> None:
+        self._cameras, self._job = cameras, job
+        self._span_ns = round(seconds * NS_PER_S)
+        self._first_ns: dict[str, int] = {}
+        self._counts = dict.fromkeys(cameras.states, 0)
+        self._done: set[str] = set()
+
+    def __call__(self, message: Message | None) -> None:
+        """Count a frame."""
+        if message is None or message.camera not in self._counts:
+            return
+        camera = message.camera
+        self._counts[camera] += 1
+        begin_ns = self._first_ns.setdefault(camera, message.publish_time_ns)
+        span_ns = message.publish_time_ns - begin_ns
+        if span_ns >= self._span_ns and self._counts[camera] >= _LEAST_FRAMES:
+            self._done.add(camera)
+        shares = min(self._counts.values())
+        self._job.progress("frames of each camera", shares, None)
+        if len(self._done) == len(self._counts):
+            self._cameras.stop()

@@ -1,0 +1,1 @@
+"""The page of ``ipsys setup``: it serves the steps of the first day."""

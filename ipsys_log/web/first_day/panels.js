@@ -1,0 +1,183 @@
+// The content of each step. The server decides what can be done; the page only asks.
+import { field, post, showFaults } from "./fields.js";
+import { make } from "./make.js";
+import { alignedImage, cameraImage } from "./pictures.js";
+
+const cameraId = (key) => `camera-${key.replace(/[^\w]/g, "_")}`;
+
+// The lines of a calibration that has ended.
+function report(state) {
+  const { job } = state;
+  return job?.ended && job.action === "calibrate" && !job.error ? job.lines.slice(1) : [];
+}
+
+// The part of the state that a panel shows: the panel is drawn again only if it changes.
+export function shownPart(name, state) {
+  const parts = {
+    rig: state.rig, cameras: state.cameras, intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
+    points: state.points, accuracy: state.answer, live: null,
+  };
+  const busy = state.job && !state.job.ended ? state.job.action : null;
+  return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_operate, state.faults]);
+}
+
+export function panel(name, state, act) {
+  const step = state.steps.find((one) => one.name === name);
+  const number = state.steps.indexOf(step) + 1;
+  const content = { rig, cameras, intrinsics, alignment, points, accuracy, live }[name](state, act, step);
+  const following = state.steps[number];
+  const onward = step.status === "done" && following
+    ? [make("div", { className: "actions" }, button(`Next: ${following.title}`, () => { location.hash = following.name; }, "onward", { className: "main" }))] : [];
+  return [
+    make("h2", { textContent: `${number}. ${step.title}` }),
+    ...(step.text ? [make("p", { className: "text", textContent: sentence(step.text) })] : []),
+    ...lines(state.faults.map((fault) => ["bad", fault])),
+    ...(step.status === "waits" ? [] : content),
+    ...onward,
+    make("p", { className: "command" }, "The same in a terminal, in this folder: ", make("code", { textContent: step.command })),
+  ];
+}
+
+const sentence = (text) => `${text}.`.replace(/\.\.$/, ".");
+
+function button(text, work, id, more = {}) {
+  const made = make("button", { type: "button", textContent: text, ...(id ? { id } : {}), ...more });
+  made.addEventListener("click", work);
+  return made;
+}
+
+// A button that starts a job; no other job may work.
+function starter(text, action, state, act, isMain = true) {
+  const busy = state.job && !state.job.ended;
+  const properties = { disabled: busy || !state.may_operate, className: isMain ? "main" : "" };
+  return button(text, () => act(() => post("start", { action })), action, properties);
+}
+
+function lines(rows) {
+  return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
+}
+
+function submit(form, state, act, isMain, work) {
+  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: isMain ? "main" : "", textContent: "Save", disabled: !state.may_operate })));
+  form.noValidate = true;
+  form.addEventListener("submit", (event) => { event.preventDefault(); act(work); });
+  return form;
+}
+
+function rig(state, act, step) {
+  const { values, labels, dictionaries, exists } = state.rig;
+  const form = make("form", { className: "grid" });
+  let pair = form;
+  for (const [key, label] of Object.entries(labels)) {
+    const made = field(key, label, values[key], key.endsWith("_m") ? { inputMode: "decimal" } : {});
+    // The two coordinates of a point are side by side.
+    if (/(width|x)_m$/.test(key)) form.append((pair = make("div", { className: "pair" }, made)));
+    else if (/(depth|y)_m$/.test(key)) pair.append(made);
+    else form.append(made);
+    if (key !== "dictionary") continue;
+    made.querySelector("input").setAttribute("list", "dictionaries");
+    made.append(make("datalist", { id: "dictionaries" }, ...dictionaries.map((name) => make("option", { value: name }))));
+  }
+  submit(form, state, act, step.status !== "done", async () => {
+    const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
+    showFaults(form, await post("rig", { values: typed }), (key) => key);
+  });
+  if (exists) return [form];
+  const simulated = button("Use the simulated lab", () => act(() => post("simulate")), "simulate", { disabled: !state.may_operate });
+  return [
+    make("p", { textContent: "Measure the black square of a printed marker. If a printer scales it by 2 %, each height has an error of 4 cm." }),
+    form,
+    make("h3", { textContent: "Without cameras" }),
+    make("p", { textContent: "The simulated lab has three cameras and a sheet of tape measurements. Try all steps with it first." }),
+    make("div", { className: "actions" }, simulated),
+  ];
+}
+
+function cameras(state, act, step) {
+  const form = make("form", {});
+  const cards = state.cameras.map((one) => make("div", { className: "card" },
+    cameraImage(one.picture, one.name || one.key),
+    make("div", {}, make("b", { textContent: one.key }), make("p", { className: "text", textContent: one.text }),
+      ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
+      field(cameraId(one.key), "Name; empty: not used", one.name, { maxLength: 40 }))));
+  form.append(make("div", { className: "cards" }, ...cards));
+  submit(form, state, act, step.status !== "done", async () => {
+    const names = Object.fromEntries(state.cameras.map((one) => [one.key, document.getElementById(cameraId(one.key)).value]));
+    showFaults(form, await post("cameras", { names }), cameraId);
+  });
+  return [
+    make("p", { textContent: "Names have small letters, digits and _. A network camera is written into lab.toml with a text editor: source = \"rtsp://...\"." }),
+    make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, false)),
+    form,
+  ];
+}
+
+function intrinsics(state, act) {
+  const works = state.job && !state.job.ended;
+  const board = field("board", "Inner corners of the chessboard, such as 6x4", "6x4", { maxLength: 40 });
+  const form = make("form", { className: "grid" }, board);
+  form.addEventListener("submit", (event) => event.preventDefault());
+  const calibrate = (camera) => act(async () => {
+    showFaults(form, await post("calibrate", { camera, board: document.getElementById("board").value }), (key) => key);
+  });
+  const cards = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
+    make("b", { textContent: one.camera }),
+    make("p", { className: one.known ? "text" : "fault", textContent: one.text }),
+    make("div", { className: "actions" },
+      ...(one.file ? [button(`Use ${one.file}`, () => act(() => post("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_operate })] : []),
+      button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
+        { className: one.known || one.file ? "" : "main", disabled: works || !state.may_operate })))));
+  return [
+    make("p", { textContent: "Print a chessboard on a flat plate (ipsys markers --board 6x4 -o board.pdf). Move it through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far." }),
+    form,
+    ...(state.board ? [make("div", { id: "board-image" })] : []),
+    make("div", { className: "cards" }, ...cards),
+    ...lines(report(state).map((text) => ["", text])),
+  ];
+}
+
+function alignment(state, act) {
+  const found = state.alignment;
+  const parts = [
+    make("p", { textContent: "Put four or more markers on the floor, up to the edges of each image. The arrow shows the direction in which to turn a camera; it is 5 times longer than the turn." }),
+    make("div", { className: "actions" }, starter(found ? "Measure again" : "Measure the alignment", "align", state, act, !found)),
+  ];
+  if (!found) return parts;
+  const cards = found.cameras.map((one) => make("div", { className: "card" }, alignedImage(one),
+    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: sentence(one.advice) }))));
+  return [
+    ...parts, make("div", { className: "cards" }, ...cards), make("h3", { textContent: "Floor" }),
+    ...lines([...(found.fault ? [["bad", found.fault]] : []),
+      ...found.coverage.map(([text, good]) => [good ? "good" : "warn", text]), ...found.notes.map((text) => ["warn", text])]),
+  ];
+}
+
+function points(state, act) {
+  const { sheet, logs } = state.points;
+  const parts = [make("p", { textContent: "Put a marker on the floor, measure the distances from the two reference points with a tape, and enter them on the measuring page. Repeat this over the whole floor, also at other heights." })];
+  const actions = make("div", { className: "actions" });
+  if (state.pages.measure) actions.append(make("a", { id: "open-measure", className: "button main", href: "measure/", target: "_blank", textContent: "Open the measuring page" }));
+  else actions.append(starter("Start measuring", "measure", state, act, !sheet && logs.length === 0));
+  if (sheet) actions.append(starter(`Use the sheet ${sheet}`, "sheet", state, act, logs.length === 0));
+  parts.push(actions);
+  if (logs.length) {
+    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, count]) =>
+      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${count} points` }))))));
+  }
+  return parts;
+}
+
+function accuracy(state, act, step) {
+  return [
+    make("div", { className: "actions" }, starter(state.answer.length ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
+    ...lines(state.answer.map((text, n) => [n < 2 ? "strong" : "", text])),
+  ];
+}
+
+function live(state, act, step) {
+  const open = make("a", { id: "open-live", className: "button main", href: "live/", target: "_blank", textContent: "Open the dashboard" });
+  return [
+    make("p", { textContent: "The robots are tracked and recorded until you press Stop. Other devices can open the dashboard, too." }),
+    make("div", { className: "actions" }, state.pages.live ? open : starter("Start the live view", "live", state, act, step.status !== "done")),
+  ];
+}

@@ -1,0 +1,47 @@
+// The image of a camera, and the arrow of its alignment.
+import { element, make } from "./make.js";
+
+// Small angles are hard to see: the arrow is longer than the distance in the image.
+const GROWTH = 5;
+
+export function cameraImage(address, name) {
+  if (!address) return make("div", { className: "image", textContent: "no picture yet" });
+  return make("div", { className: "image" }, make("img", { src: address, alt: `Image of ${name}` }));
+}
+
+export function alignedImage(one) {
+  const [width, height] = one.size_px;
+  const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${one.camera}: ${one.advice}` });
+  if (one.picture) svg.append(element("image", { href: one.picture, width, height }));
+  for (const [x, y] of one.markers_px) svg.append(element("circle", { cx: x, cy: y, r: width / 60 }));
+  svg.append(arrow(one, width, height));
+  return make("div", { className: "image" }, svg);
+}
+
+function arrow(one, width, height) {
+  const [x, y] = one.centre_px;
+  const group = element("g", { class: one.level ? "level" : "tilted" });
+  const paths = [`M${x - width / 50} ${y}h${width / 25}M${x} ${y - width / 50}v${width / 25}`];
+  if (one.plumb_px) {
+    const [dx, dy] = [one.plumb_px[0] - x, one.plumb_px[1] - y].map((d) => d * GROWTH);
+    const length = Math.hypot(dx, dy), scale = Math.min(1, (height * 0.45) / Math.max(length, 1));
+    const [ex, ey] = [x + dx * scale, y + dy * scale];
+    if (length > width / 100) {
+      const head = Math.min(length * scale, width / 25), turn = Math.atan2(dy, dx);
+      const [a, b] = [turn + 2.6, turn - 2.6].map((angle) => `${ex + head * Math.cos(angle)} ${ey + head * Math.sin(angle)}`);
+      paths.push(`M${x} ${y}L${ex} ${ey}`, `M${a}L${ex} ${ey}L${b}`);
+    }
+  }
+  for (const kind of ["shadow", "shaft"]) for (const d of paths) group.append(element("path", { class: kind, d }));
+  return group;
+}
+
+// The present image of a camera with the board, and the boards of all kept pictures.
+export function boardImage(board) {
+  const [width, height] = board.size_px;
+  const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${board.count} pictures of the board` });
+  svg.append(element("image", { href: `picture/board/${board.number}`, width, height }));
+  for (const outline of board.kept_px) svg.append(element("polygon", { class: "kept", points: outline.join(" ") }));
+  if (board.board_px) svg.append(element("polygon", { class: "present", points: board.board_px.join(" ") }));
+  return [make("div", { className: "image" }, svg), make("p", { className: "text", textContent: `${board.count} pictures; ${board.advice.join("; ")}.` })];
+}

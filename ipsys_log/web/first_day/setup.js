@@ -1,0 +1,111 @@
+// The setup page. Every second it reads the state from the server, so that all devices show the same.
+import { post } from "./fields.js";
+import { make } from "./make.js";
+import { panel, shownPart } from "./panels.js";
+import { boardImage } from "./pictures.js";
+
+const $ = (id) => document.getElementById(id);
+const EVERY_MS = 1000;
+const SIGNS = { done: "✓", ready: "", waits: "" }, SAID = { done: "done", ready: "can be done now", waits: "waits" };
+let state = null, shown = "", selected = null, told = "", timer = 0;
+
+function chip(kind, text) {
+  if ($("state").textContent === text) return;
+  $("state").textContent = text;
+  $("state").className = `chip ${kind}`;
+}
+
+function tell(text) {
+  if (text && $("notice").textContent !== text) $("notice").textContent = text;
+  $("notice").hidden = !text;
+}
+
+// Do something on the server, and show the new state at once.
+async function act(work) {
+  tell("");
+  told = state.job?.error ?? "";
+  try { await work(); } catch (error) { tell(error.message); }
+  await read();
+}
+
+function choose() {
+  const wanted = location.hash.slice(1);
+  const names = state.steps.map((step) => step.name);
+  selected = names.includes(wanted) ? wanted : (selected ?? state.next ?? names.at(-1));
+}
+
+function drawSteps() {
+  const rows = state.steps.map((step, n) => {
+    const button = make("button", { type: "button", id: `step-${step.name}`, className: step.status },
+      make("b", { textContent: SIGNS[step.status] || String(n + 1) }),
+      make("span", { className: "title", textContent: step.title }), make("small", { textContent: step.text || SAID[step.status] }));
+    if (step.name === selected) button.setAttribute("aria-current", "step");
+    button.addEventListener("click", () => { location.hash = step.name; });
+    return make("li", {}, button);
+  });
+  const focused = document.activeElement?.id;
+  $("steps").replaceChildren(...rows);
+  if (focused?.startsWith("step-")) $(focused)?.focus();
+}
+
+function drawPanel() {
+  const part = shownPart(selected, state);
+  if (part === shown) return;
+  // Typed texts and the focus survive a change by another device.
+  const same = shown.startsWith(`["${selected}"`);
+  const typed = same ? [...$("panel").querySelectorAll("input")].filter((one) => one.value !== one.defaultValue).map((one) => [one.id, one.value]) : [];
+  const focused = same ? document.activeElement?.id : "";
+  shown = part;
+  $("panel").replaceChildren(...panel(selected, state, act));
+  for (const [id, value] of typed) if ($(id)) $(id).value = value;
+  if (focused && $("panel").contains($(focused))) $(focused).focus();
+  drawSteps();
+}
+
+function drawJob() {
+  const job = state.job, works = job && !job.ended;
+  $("job").hidden = !works;
+  $("stop").hidden = !state.may_operate;
+  if (job?.ended && job.error && job.error !== told) tell(job.error);
+  if (!works) return;
+  const text = `${job.stopping ? "Stopping" : "Working"}: ${job.name}`;
+  const line = job.lines.at(-1) ?? "";
+  const stage = job.stage ? `${job.stage}: ${job.done}${job.total ? ` of ${job.total}` : ""}` : "";
+  const said = [text, stage, line].join("\n");
+  if ($("job-text").dataset.said !== said) {
+    $("job-text").dataset.said = said;
+    $("job-text").replaceChildren(text, make("small", { textContent: stage || line }));
+  }
+  const bar = $("job-progress");
+  if (job.total) { bar.max = job.total; bar.value = job.done; } else bar.removeAttribute("value");
+}
+
+async function read() {
+  clearTimeout(timer);
+  try {
+    const answer = await fetch("api/state");
+    if (!answer.ok) throw new Error(await answer.text());
+    state = await answer.json();
+    const count = state.steps.filter((step) => step.status === "done").length;
+    chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} done`);
+    $("folder").textContent = state.rig.name ?? state.folder;
+    choose();
+    drawPanel();
+    if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
+    drawJob();
+  } catch (error) {
+    chip("bad", error instanceof TypeError ? "ipsys does not answer" : error.message.slice(0, 60));
+  }
+  clearTimeout(timer);
+  timer = setTimeout(read, EVERY_MS);
+}
+
+addEventListener("hashchange", () => {
+  if (!state) return;
+  choose();
+  drawPanel();
+  scrollTo(0, 0);
+  $("panel").focus();
+});
+$("stop").addEventListener("click", () => act(() => post("stop")));
+read();

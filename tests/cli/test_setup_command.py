@@ -1,0 +1,38 @@
+"""``ipsys setup``: its address, its end in order, and folders that cannot be used."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+from tests.conftest import Ipsys
+from tests.playing import WAIT_LIMIT_S
+
+
+def test_command_serves_a_new_folder_and_ends_in_order(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "ipsys_log", "setup", str(tmp_path / "lab"), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        line = program.stdout.readline()
+        assert line.startswith("open http://127.0.0.1:")
+        url = line.removeprefix("open ").strip()
+        with urllib.request.urlopen(f"{url}api/state", timeout=WAIT_LIMIT_S) as answer:
+            assert json.load(answer)["next"] == "rig"
+        program.send_signal(signal.SIGINT)
+        _, err = program.communicate(timeout=WAIT_LIMIT_S)
+    assert program.returncode == 0, err
+    assert "to continue: ipsys setup" in err
+    assert "Traceback" not in err
+    assert (tmp_path / "lab").is_dir()
+
+
+def test_file_instead_of_a_folder_is_one_line(ipsys: Ipsys, tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text("")
+    done = ipsys("setup", tmp_path / "lab.toml")
+    assert done.code == 1
+    assert "is a file; name a folder" in done.err
+    assert len(done.err.strip().splitlines()) == 1

@@ -1,0 +1,49 @@
+"""Jobs of the page: one at a time, with their errors, and a stop in order."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.first_day.jobs import Job, Jobs
+
+
+def test_second_job_is_refused_until_the_first_ends() -> None:
+    jobs, going = Jobs(), threading.Event()
+    jobs.start("the fit", lambda job: job.on_stop(going.set) or going.wait())  # type: ignore[func-returns-value]
+    with pytest.raises(IpsysError, match="the fit is not finished"):
+        jobs.start("the alignment", lambda job: None)
+    jobs.close()
+    assert jobs.present is not None
+    assert (jobs.present.ended, jobs.present.is_stopped(), jobs.present.error) == (True, True, "")
+    jobs.start("the alignment", lambda job: job.say("a\x1b[31mb"))
+    jobs.close()
+    (line,) = jobs.present.describe()["lines"]
+    assert "\x1b" not in line
+
+
+def test_error_of_a_job_is_one_line_and_a_bug_keeps_its_traceback() -> None:
+    def fails(_: Job) -> None:
+        raise IpsysError("red.yaml: cannot be read")
+
+    def breaks(_: Job) -> None:
+        raise ZeroDivisionError("by zero")
+
+    jobs = Jobs()
+    jobs.start("the fit", fails)
+    jobs.close()
+    assert jobs.present is not None
+    assert (jobs.present.error, jobs.present.bug) == ("red.yaml: cannot be read", "")
+    jobs.start("the fit", breaks)
+    jobs.close()
+    assert "internal error of ipsys: ZeroDivisionError" in jobs.present.error
+    assert "in breaks" in jobs.present.bug
+
+
+def test_stop_before_the_cameras_open_still_stops_them() -> None:
+    job, stopped = Job("the live view"), threading.Event()
+    job.stop()
+    job.on_stop(stopped.set)
+    assert stopped.is_set()

@@ -1,0 +1,191 @@
+"""The first day in a browser: from an empty folder to tracked robots, on any screen, by keyboard."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ipsys_log.first_day.lab_folder import LabFolder
+from ipsys_log.first_day.steps import Status, read_progress
+from ipsys_log.web.first_day.app import SetupApp
+from ipsys_log.web.server import serve_app
+from tests.cli.test_simulated_day import errors_m
+from tests.playing import WAIT_LIMIT_S
+from tests.web.contrast import low_contrasts
+from tests.web.phone import Phone, phone
+from tests.web.test_dashboard_browser import focus, press
+from tests.web.test_measuring_page import FETCHED, says
+
+# A browser for each test.
+pytestmark = pytest.mark.slow
+
+PHONE, DESKTOP, WALL = (390, 844), (1280, 900), (2560, 1440)
+STEPS = ("rig", "cameras", "intrinsics", "alignment", "points", "accuracy", "live")
+# A step lasts longer on a busy machine than a change of a page.
+JOB_ENDED = "document.querySelector('#job').hidden"
+
+
+class Visitor:
+    """A user of the page who counts the own inputs: taps and typed fields."""
+
+    def __init__(self, browser: Phone) -> None:
+        self.browser, self.inputs = browser, 0
+
+    def wait(self, script: str) -> None:
+        end = time.monotonic() + 2 * WAIT_LIMIT_S
+        while not self.browser.run(f"Boolean({script})"):
+            assert time.monotonic() < end, f"{script}: never, but {self.browser.state()}"
+            time.sleep(0.1)
+
+    def tap(self, selector: str) -> None:
+        """Tap a button; the page draws its panel before the button can be hit again."""
+        self.wait(f"document.querySelector({selector!r} + ':not(:disabled)')")
+        self.browser.tap(selector)
+        self.inputs += 1
+
+    def run_job(self, selector: str) -> None:
+        """Start a job, and wait until its step is done."""
+        self.tap(selector)
+        self.wait(f"document.querySelector('#onward') && {JOB_ENDED}")
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    setup = SetupApp(LabFolder(folder))
+    with serve_app(setup.app, None, 0) as server:
+        yield server.url
+        setup.session.close()
+        assert server.exceptions.count == 0, server.exceptions.first
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Phone]:
+    with phone(tmp_path) as one:
+        yield one
+
+
+def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, tmp_path: Path) -> None:
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    visitor = Visitor(browser)
+    with serving(folder) as url:
+        browser.open(url)
+        visitor.tap("#simulate")
+        visitor.tap("#onward")
+        visitor.run_job("#pictures")
+        visitor.wait(f"document.querySelectorAll('.image img').length === 3 && {JOB_ENDED}")
+        visitor.tap("#onward")
+        says(browser, "#panel", "from the simulated lab")
+        visitor.tap("#onward")
+        visitor.run_job("#align")
+        assert browser.run("document.querySelectorAll('.shaft').length") >= 3
+    # Restarted in the middle, another server continues with the same state.
+    with serving(folder) as url:
+        browser.open(url)
+        says(browser, "#state", "4 of 7")
+        says(browser, "h2", "5. Calibration points")
+        visitor.run_job("#sheet")
+        visitor.tap("#onward")
+        visitor.run_job("#replay")
+        says(browser, "#panel", "Mean position error")
+        visitor.tap("#onward")
+        visitor.tap("#live")
+        visitor.wait("document.querySelector('#open-live')")
+        dashboard = url + "live/"
+        browser.open(dashboard)
+        visitor.inputs += 1
+        visitor.wait("document.querySelectorAll('#floor .robot').length === 3")
+        browser.open(url + "#live")
+        visitor.tap("#stop")
+        visitor.wait(JOB_ENDED)
+        says(browser, "#state", "7 of 7")
+        assert browser.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
+        errors = browser.console
+    assert visitor.inputs == 12
+    assert errors == []
+    assert [step.status for step in read_progress(LabFolder(folder)).steps] == [Status.DONE] * 7
+    positions_m = errors_m(folder / "live.mcap")
+    assert len(positions_m) > 10
+    assert np.median(positions_m) < 0.01
+
+
+def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, tmp_path: Path) -> None:
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    visitor = Visitor(browser)
+    with serving(folder) as url:
+        browser.open(url)
+        visitor.tap("#simulate")
+        visitor.wait("document.querySelector('#onward')")
+        browser.run("location.hash = 'intrinsics'")
+        visitor.wait("document.querySelector('#board')")
+        browser.run("document.querySelector('#board').value = '6'")
+        visitor.tap("#calibrate-red")
+        says(browser, "#board-fault", "is not a board")
+        browser.run("document.querySelector('#board').value = '6x4'")
+        visitor.tap("#calibrate-red")
+        visitor.wait("document.querySelectorAll('.kept').length > 3")
+        visitor.wait(JOB_ENDED)
+        says(browser, "#panel", "from red.yaml")
+        browser.run("location.hash = 'points'")
+        visitor.tap("#measure")
+        visitor.wait("document.querySelector('#open-measure')")
+        browser.open(url + "measure/")
+        says(browser, "#sight", "are visible")
+        browser.open(url + "#points")
+        visitor.tap("#stop")
+        visitor.wait(JOB_ENDED)
+        # Without a point, the step is not done.
+        says(browser, "#panel", "0 points measured")
+        assert browser.console == []
+
+
+def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, tmp_path: Path) -> None:
+    folder = tmp_path / "a_long_name_of_a_folder_for_a_lab"
+    folder.mkdir()
+    with serving(folder) as url:
+        browser.open(url, DESKTOP)
+        browser.wait("document.querySelector('#marker_length_m')")
+        browser.run("document.querySelector('#marker_length_m').value = '20'")
+        browser.tap("#save")
+        says(browser, "#marker_length_m-fault", "0.2 if it is in cm")
+        assert browser.run("document.activeElement.id") == "marker_length_m"
+        # The typed value survives the polling of the state.
+        assert browser.run("document.querySelector('#marker_length_m').value") == "20"
+        assert browser.run("document.querySelector('#marker_length_m').ariaInvalid") == "true"
+        browser.tap("#simulate")
+        browser.wait("document.querySelector('#onward')")
+        for size in (PHONE, DESKTOP, WALL):
+            browser.open(url, size)
+            for name in STEPS:
+                browser.wait(f"document.querySelector('#step-{name}')")
+                browser.run(f"location.hash = '{name}'")
+                browser.wait(f"document.querySelector('#step-{name}[aria-current]')")
+                assert browser.run("document.scrollingElement.scrollWidth <= innerWidth"), (size, name)
+                for scheme in ("light", "dark"):
+                    browser.prefer(scheme)
+                    assert low_contrasts(browser) == [], (size, name, scheme)
+        assert browser.console == []
+
+
+def test_keyboard_alone_reaches_the_next_step(browser: Phone, tmp_path: Path) -> None:
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    with serving(folder) as url:
+        browser.open(url, DESKTOP)
+        browser.wait("document.querySelector('#simulate')")
+        focus(browser, "#simulate")
+        press(browser, "Enter", "\r")
+        browser.wait("document.querySelector('#onward')")
+        browser.wait("document.activeElement.id !== 'simulate'")
+        focus(browser, "#onward")
+        press(browser, "Enter", "\r")
+        says(browser, "h2", "2. Cameras")
+        focus(browser, "#step-points")
+        press(browser, "Enter", "\r")
+        says(browser, "h2", "5. Calibration points")

@@ -1,0 +1,181 @@
+"""The server of the setup page: faults at fields, refused requests, and one job for all devices."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from ipsys_log.first_day.lab_folder import LabFolder
+from ipsys_log.rig.file import load_rig
+from ipsys_log.web.first_day.app import SetupApp
+from ipsys_log.web.server import serve_app
+from tests.playing import WAIT_LIMIT_S
+
+SMALL = """name = "lab"
+dictionary = "DICT_4X4_100"
+marker_length_m = 0.2
+[[cameras]]
+name = "red"
+source = "sim:red?stations=0"
+width = 480
+height = 270
+rate_hz = 5
+"""
+
+
+class Client:
+    """A client of the setup page, with any headers."""
+
+    def __init__(self, url: str) -> None:
+        self.parts = urlsplit(url)
+        self.cookie: dict[str, str] = {}
+
+    def ask(self, path: str, body: Any = None, **headers: str) -> tuple[int, Any]:
+        connection = http.client.HTTPConnection(
+            str(self.parts.hostname), self.parts.port or 0, timeout=WAIT_LIMIT_S
+        )
+        try:
+            data = None if body is None else json.dumps(body).encode()
+            sent = {"X-Ipsys": "1", **self.cookie, **{k.replace("_", "-"): v for k, v in headers.items()}}
+            connection.request("GET" if body is None else "POST", path, data, sent)
+            answer = connection.getresponse()
+            text = answer.read()
+            if cookie := answer.getheader("set-cookie"):
+                self.cookie = {"Cookie": cookie.split(";")[0]}
+            is_json = "json" in (answer.getheader("content-type") or "")
+            return answer.status, json.loads(text) if is_json else text
+        finally:
+            connection.close()
+
+    def state(self) -> dict[str, Any]:
+        status, state = self.ask("/api/state")
+        assert status == 200
+        return dict(state)
+
+    def job_ended(self) -> dict[str, Any]:
+        """Wait for the end of the job; return its state."""
+        end = time.monotonic() + WAIT_LIMIT_S
+        while not (state := self.state())["job"]["ended"]:
+            assert time.monotonic() < end, state["job"]
+            time.sleep(0.05)
+        return dict(state["job"])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "lab"
+    path.mkdir()
+    return path
+
+
+@pytest.fixture
+def page(folder: Path) -> Iterator[Client]:
+    setup = SetupApp(LabFolder(folder))
+    with serve_app(setup.app, None, 0, has_viewers=True) as server:
+        yield Client(server.url)
+        setup.session.close()
+        assert server.exceptions.count == 0, server.exceptions.first
+
+
+def test_typed_rig_is_checked_at_its_fields_and_written(page: Client, folder: Path) -> None:
+    values = page.state()["rig"]["values"]
+    status, answer = page.ask("/api/rig", {"values": {**values, "marker_length_m": "20"}})
+    assert status == 409
+    assert [fault["field"] for fault in answer["faults"]] == ["marker_length_m"]
+    assert not (folder / "lab.toml").exists()
+    assert page.ask("/api/rig", {"values": {**values, "marker_length_m": "0.15"}}) == (200, {})
+    assert load_rig(folder / "lab.toml").marker_length_m == 0.15
+    status, answer = page.ask("/api/cameras", {"names": {"sim:red": "Red", "sim:white": "mid"}})
+    assert (status, [fault["field"] for fault in answer["faults"]]) == (409, ["sim:red"])
+    assert page.ask("/api/cameras", {"names": {"sim:red": "red"}}) == (200, {})
+    assert page.state()["next"] == "alignment"
+
+
+def test_restart_continues_where_the_files_are(page: Client, folder: Path) -> None:
+    (folder / "lab.toml").write_text(SMALL)
+    other = SetupApp(LabFolder(folder))
+    with serve_app(other.app, None, 0) as server:
+        first, second = page.state(), Client(server.url).state()
+        assert first == second
+        assert second["next"] == "alignment"
+
+
+def test_pictures_of_cameras_are_taken_and_seen_by_all(page: Client, folder: Path) -> None:
+    (folder / "lab.toml").write_text(SMALL.replace("sim:red?stations=0", "sim:red?stations=0&psf_sigma_px=1"))
+    assert page.ask("/api/start", {"action": "pictures"}) == (200, {})
+    status, answer = page.ask("/api/start", {"action": "align"})
+    assert (status, "is not finished" in answer["error"]) == (400, True)
+    assert page.ask("/api/rig", {"values": {"name": "x"}})[0] == 400
+    page.ask("/api/stop", {})
+    job = page.job_ended()
+    assert (job["action"], job["error"]) == ("pictures", "")
+    assert page.ask("/api/start", {"action": "pictures"}) == (200, {})
+    page.job_ended()
+    other = Client(page.parts.geturl())
+    first = other.state()["cameras"][0]
+    assert first["key"] == "sim:red?stations=0&psf_sigma_px=1"
+    status, data = other.ask(f"/{first['picture']}")
+    assert (status, data[:2]) == (200, b"\xff\xd8")
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/api/start", {"action": "rm -r"}),
+        ("/api/start", {"action": "live"}),
+        ("/api/start", {"action": "sheet"}),
+        ("/api/start", []),
+        ("/api/calibrate", {"camera": "../red", "board": "6x4"}),
+        ("/api/intrinsics", {"camera": "../../etc/passwd"}),
+        ("/api/cameras", {"names": {"file:/etc/passwd": "red"}}),
+        ("/api/cameras", {"names": ["red"]}),
+        ("/api/rig", {"values": 3}),
+        ("/api/simulate", {}),
+    ],
+)
+def test_impossible_request_is_refused_and_changes_no_file(
+    path: str, body: Any, page: Client, folder: Path
+) -> None:
+    (folder / "lab.toml").write_text(SMALL)
+    status, answer = page.ask(path, body)
+    assert status == 400
+    assert answer["error"]
+    assert [one.name for one in folder.iterdir()] == ["lab.toml"]
+    assert (folder / "lab.toml").read_text() == SMALL
+    assert page.state()["job"] is None
+
+
+def test_pictures_have_no_paths(page: Client) -> None:
+    for path in ("/picture/alignment/..%2f..%2flab.toml", "/picture/board/1", "/picture/camera/x"):
+        assert page.ask(path)[0] == 404
+
+
+def test_pages_without_their_job_lead_back(page: Client) -> None:
+    for path in ("/measure/", "/live/", "/live/api/scene"):
+        assert page.ask(path)[0] == 303
+
+
+def test_foreign_pages_and_hosts_cannot_write(page: Client, folder: Path) -> None:
+    assert page.ask("/api/simulate", {}, X_Ipsys="")[0] == 403
+    assert page.ask("/api/simulate", {}, Origin="http://evil.example")[0] == 403
+    assert page.ask("/api/state", None, Host="evil.example")[0] == 403
+    assert list(folder.iterdir()) == []
+
+
+def test_device_that_may_only_view_sees_and_changes_nothing(folder: Path) -> None:
+    setup = SetupApp(LabFolder(folder))
+    with serve_app(setup.app, "127.0.0.1", 0, has_viewers=True) as server:
+        assert Client(server.url).ask("/api/state")[0] == 403
+        for url, may in ((server.view_url, False), (server.url, True)):
+            client = Client(str(url))
+            assert client.ask(f"/?{client.parts.query}")[0] == 303
+            assert client.state()["may_operate"] is may
+            status, _ = client.ask("/api/rig", {"values": {}})
+            assert (status, (folder / "lab.toml").exists()) == (200 if may else 403, may)

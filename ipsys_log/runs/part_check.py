@@ -76,7 +76,9 @@ def _stateless_topics(session: Session, run: Run, outputs: Collection[str]) -> t
 def compare_with_cut(
     session: Session, names: Collection[str], repeated: Collection[str], progress: Progress
 ) -> Iterator[Comparison]:
-    """Yield whether the messages of each channel are as the cut or the merge wrote them; all bytes are read.
+    """Yield whether the messages of each channel are those that the cut or the merge wrote.
+
+    All bytes of the channels are read.
 
     Parameters
     ----------

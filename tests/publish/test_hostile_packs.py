@@ -340,7 +340,7 @@ def test_stated_size_and_checksum_are_compared(dataset: Path, refuse: Refuse) ->
 def test_damaged_log_with_valid_checksums_is_an_error(dataset: Path, refuse: Refuse) -> None:
     (dataset / "logs/lab.mcap").write_bytes(b"no log")
     sign(dataset)
-    refuse(dataset, f"ipsys: {dataset}: logs/lab.mcap: ")
+    refuse(dataset, f"ipsys: {dataset}: logs/lab.mcap is not an MCAP file")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import json
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,22 +58,35 @@ def cookie_of(url: str) -> dict[str, str]:
 
 
 class Reader:
-    """A client of the stream of events."""
+    """A client of the stream of events. As a browser, it asks for the next stream after the end of one."""
 
     def __init__(self, url: str, source: str = "127.0.0.1", **headers: str) -> None:
         parts = urlsplit(url)
         self.connection = http.client.HTTPConnection(
             str(parts.hostname), parts.port or 0, timeout=WAIT_LIMIT_S, source_address=(source, 0)
         )
-        self.connection.request("GET", "/api/live", headers=headers)
+        self._headers = headers
+        self._ask()
+
+    def _ask(self) -> None:
+        self.connection.request("GET", "/api/live", headers=self._headers)
         self.answer = self.connection.getresponse()
+        assert self.answer.status == 200
+
+    def lines(self) -> Iterator[bytes]:
+        """Yield the lines of all streams."""
+        while True:
+            try:
+                yield from iter(self.answer.readline, b"")
+            except (http.client.HTTPException, ConnectionError):
+                self.connection.close()  # a very slow server: the answer has reached its limit
+            self._ask()
 
     def next(self, name: str) -> Any:
         """Return the next data of a kind."""
-        while line := self.answer.readline():
-            if line.strip() == f"event: {name}".encode():
-                return json.loads(self.answer.readline().removeprefix(b"data: "))
-        raise AssertionError("the stream has ended")
+        lines = self.lines()
+        next(line for line in lines if line.strip() == f"event: {name}".encode())
+        return json.loads(next(lines).removeprefix(b"data: "))
 
     def until(self, name: str, condition: Callable[[Any], object]) -> Any:
         """Return the next data of a kind that fulfil a condition."""
@@ -259,12 +272,14 @@ def test_connection_of_a_page_ends_after_the_limit(lab: LiveLab) -> None:
         silent = stack.enter_context(socket.create_connection((str(parts.hostname), parts.port or 0)))
         silent.sendall(b"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         silent.settimeout(WAIT_LIMIT_S)
-        received = 1
-        while received:
-            try:
-                received = len(silent.recv(1 << 16))
-            except ConnectionResetError:
-                break
+        received = bytearray()
+        try:
+            while data := silent.recv(1 << 16):
+                received += data
+        except ConnectionResetError:
+            pass
+        assert b"event: status" in received
+        assert not received.endswith(b"0\r\n\r\n")  # the answer is cut, it has not ended
 
 
 def test_new_connections_do_not_end_a_stream(lab: LiveLab) -> None:
@@ -312,13 +327,15 @@ class Pages(threading.Thread):
 
     def _read(self, reader: Reader, loads: bool) -> None:
         caller = Caller(self.url)
-        for line in reader.answer:
+        for line in reader.lines():
             if line.startswith(b"event: "):
                 self.counts[line.strip().decode()] += 1
             elif loads and b'"picture"' in line:
                 for tile in json.loads(line.removeprefix(b"data: "))["cameras"]:
                     if "picture" in tile:
                         self.counts["picture"] += caller.ask("GET", f"/{tile['picture']}")[0] == 200
+            elif b'"end":"ended"' in line:
+                break
 
 
 class Watched(NamedTuple):

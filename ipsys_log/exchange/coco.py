@@ -107,6 +107,8 @@ def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a new folder that gets its name at the end of the block; after an error, it is removed."""
     if folder.exists() or folder.is_symlink():
         raise IpsysError(f"{folder}: exists already; choose another name")
+    if not folder.parent.is_dir():
+        raise IpsysError(f"{folder}: there is no folder {folder.parent}; make it first")
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ipsys_log.messages import (
     CameraCalibration,
@@ -63,6 +64,7 @@ class PicturedLab:
     marked: frozenset[int] = frozenset()
     empty: frozenset[int] = frozenset()
     rig: Rig | None = RIG
+    corners: NDArray[np.float64] = field(default_factory=lambda: CORNERS)
 
     def write(self, path: Path) -> Path:
         """Write the log."""
@@ -83,7 +85,7 @@ class PicturedLab:
         if number in self.images:
             yield Message("/cameras/red/image", time_ns, time_ns, self.images[number], "red")
         if number in self.marked:
-            found = () if number in self.empty else (Marker(7, CORNERS),)
+            found = () if number in self.empty else (Marker(7, self.corners),)
             markers = Markers(time_ns, found, *SIZE)
             yield Message(f"/runs/{RUN}/cameras/red/markers", time_ns, time_ns, markers, "red")
         if number in self.rows:

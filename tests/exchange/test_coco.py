@@ -77,6 +77,12 @@ def test_pictures_without_markers_are_kept_and_unsearched_left_out(tmp_path: Pat
     assert category["keypoints"] == ["top_left", "top_right", "bottom_right", "bottom_left"]
 
 
+def test_corners_without_numbers_are_left_out(tmp_path: Path) -> None:
+    lab = PicturedLab({0: image(0)}, {}, frozenset({0}), corners=np.full((4, 2), np.nan))
+    data = export(lab.write(tmp_path / "lab.mcap"), tmp_path / "coco", run=RUN)
+    assert (len(data["images"]), data["annotations"]) == (1, [])
+
+
 def test_frames_of_a_video_become_the_searched_pictures(video_log: Path, tmp_path: Path) -> None:
     with Session([video_log]) as session:
         frames = session.payloads([session.images["red"]])[:4]
@@ -139,6 +145,7 @@ def test_bad_requests_are_refused_in_one_line(tmp_path: Path, ipsys: Ipsys, lab:
         (lab, "new", (), "compute them: ipsys replay"),
         (other, "new", ("--run", RUN), f"has no images of the markers of run {RUN}"),
         (other, "old", ("--run", RUN), "exists already; choose another name"),
+        (other, "gone/new", ("--run", RUN), "gone; make it first"),
         (other, "new", ("--robot", "ada"), "a COCO data set has no robots"),
         (other, "new", ("--table", "markers"), "a COCO data set has no table markers"),
     ):

@@ -105,7 +105,6 @@ def test_cameras_are_chosen_and_named(tmp_path: Path, ipsys: Ipsys) -> None:
     rows += [compressed(4, b"depth", "/b/depth/image_raw/compressedDepth")]
     bag = write_ros1(tmp_path, rows)
     log = tmp_path / "log.mcap"
-    # Without names, the compressed images of a camera precede its raw ones.
     done = ipsys("import", "ros", bag, "-o", log)
     assert (done.code, "'16UC1' is not read" in done.err) == (1, True), done.err
     done = ipsys("import", "ros", bag, "-o", log, "--camera", "left=/a/image_raw")
@@ -114,6 +113,13 @@ def test_cameras_are_chosen_and_named(tmp_path: Path, ipsys: Ipsys) -> None:
         assert session.images == {"left": "/cameras/left/image"}
         assert session.calibrations == {"left": "/cameras/left/calibration"}
         assert [type(image) for image in session.payloads(["/cameras/left/image"])] == [RawImage]
+
+
+def test_compressed_images_precede_raw_images_of_a_camera(tmp_path: Path, ipsys: Ipsys) -> None:
+    rows = [raw(0, GREY, "mono8", "/red/image_raw"), compressed(1, jpeg(), "/red/image_raw/compressed")]
+    assert ipsys("import", "ros", write_ros1(tmp_path, rows), "-o", tmp_path / "log.mcap").code == 0
+    with Session([tmp_path / "log.mcap"]) as session:
+        assert [type(image) for image in session.payloads([session.images["red"]])] == [CompressedImage]
 
 
 def test_images_without_stamps_have_the_time_of_the_bag(tmp_path: Path, ipsys: Ipsys) -> None:

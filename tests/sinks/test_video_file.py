@@ -19,7 +19,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, RawImage
 from ipsys_log.sinks.colours import MARKER_COLOUR, robot_colour
 from tests.conftest import Ipsys
-from tests.exchange.pictured_lab import COLOUR, RUN, SIZE, START_NS, STEP_NS, PicturedLab, image, track
+from tests.exchange.pictured_lab import COLOUR, RUN, SIZE, START_NS, STEP_NS, PicturedLab, image, jpeg, track
 
 Picture = NDArray[np.uint8]
 WIDTH, HEIGHT = 640, 360
@@ -147,6 +147,15 @@ def test_camera_shows_its_picture_with_markers(tmp_path: Path) -> None:
         before = pictures[0][top + row - 2 : top + row + 3, left + column - 2 : left + column + 3]
         assert before.reshape(-1, 3).astype(float) == pytest.approx(np.tile(COLOUR[::-1], (25, 1)), abs=20)
     assert not near(pictures[2], MARKER_COLOUR).any(), "markers of an earlier picture are shown"
+
+
+def test_picture_is_shown_from_its_time_on(tmp_path: Path) -> None:
+    later = (60, 160, 60)
+    images = {n: image(n, jpeg(COLOUR if n < 2 else later)) for n in range(4)}
+    log = PicturedLab(images, {0: (track(1.0, 1.0),)}).write(tmp_path / "lab.mcap")
+    pictures = export(log, tmp_path / "lab.mp4").pictures
+    shown = [near(picture, later[::-1], 20).sum() > 1000 for picture in pictures]
+    assert shown == [False, False, True, True]
 
 
 def test_robot_without_newer_poses_disappears(tmp_path: Path) -> None:

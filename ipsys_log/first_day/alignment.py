@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import Alignment
 from ipsys_log.geometry.lenses import project
@@ -85,8 +86,8 @@ def _camera(one: Alignment, lens: CameraCalibration, picture: bytes | None) -> A
     )
 
 
-def _pixel(point_m: np.ndarray, lens: CameraCalibration) -> tuple[float, float]:
-    x_px, y_px = project(np.asarray(point_m, dtype=np.float64)[None], lens)[0].tolist()
+def _pixel(point_m: NDArray[np.float64], lens: CameraCalibration) -> tuple[float, float]:
+    x_px, y_px = project(point_m[None], lens)[0].tolist()
     return round(x_px, 1), round(y_px, 1)
 
 
@@ -95,5 +96,6 @@ def _picture(session: Session, camera: str) -> bytes | None:
     if topic is None:
         return None
     payload = next(iter(session.messages([topic]))).payload
-    is_jpeg = isinstance(payload, CompressedImage) and payload.format == "jpeg"
-    return payload.data if is_jpeg else None
+    if isinstance(payload, CompressedImage) and payload.format == "jpeg":
+        return payload.data
+    return None

@@ -88,7 +88,7 @@ class BoardSearch:
         self._kept.append(sighting)
         self.count = len(self._kept)
         # PNG: a second compression would move the corners.
-        (self._folder / f"{self.count:03d}.png").write_bytes(bytes(cv2.imencode(".png", grey)[1]))
+        (self._folder / f"{self.count:03d}.png").write_bytes(cv2.imencode(".png", grey)[1].tobytes())
 
     def _show(self, sighting: BoardSighting | None, grey: Grey) -> None:
         height, width = grey.shape

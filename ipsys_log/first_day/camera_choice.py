@@ -151,7 +151,7 @@ def _picture(frame: Frame) -> bytes | None:
     if not is_keyframe(video):
         return None
     try:
-        return bytes(cv2.imencode(".jpg", decode_grey(decode_keyframe(video)))[1])
+        return cv2.imencode(".jpg", decode_grey(decode_keyframe(video)))[1].tobytes()
     except FrameError:
         return None
 

@@ -38,7 +38,7 @@ def replace_values(text: str, values: Mapping[str, str | float]) -> str:
     """
     blocks = _split(text)
     lines = blocks[0].lines
-    for row in toml_rows_of(values):
+    for row in _toml_rows_of(values):
         key = row.partition(" ")[0]
         number = next((n for n, line in enumerate(lines) if re.match(rf"\s*{key}\s*=", line)), None)
         if number is None:
@@ -48,7 +48,7 @@ def replace_values(text: str, values: Mapping[str, str | float]) -> str:
     return _join(blocks)
 
 
-def toml_rows_of(values: Mapping[str, str | float]) -> list[str]:
+def _toml_rows_of(values: Mapping[str, str | float]) -> list[str]:
     """Return the lines of values at the top of a rig file."""
     rig = Rig(**{"name": "", "dictionary": "", "marker_length_m": 0.0, **values})  # type: ignore[arg-type]
     return [row for row in toml_rows(rig) if row.partition(" ")[0] in values]

@@ -24,7 +24,7 @@ from ipsys_log.first_day.camera_choice import (
 from ipsys_log.first_day.jobs import Job, Jobs
 from ipsys_log.first_day.lab_folder import LabFolder, LogFacts
 from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
-from ipsys_log.first_day.steps import Progress, Status, read_progress
+from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
 from ipsys_log.rig.file import load_rig
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.survey.entry import Fault
@@ -47,7 +47,7 @@ class Pages(NamedTuple):
     """The functions that show a measuring page and a dashboard until the end of their block."""
 
     measuring: Callable[[LiveScene], AbstractContextManager[object]]
-    dashboard: Callable[[work.LiveView], AbstractContextManager[Sink]]
+    dashboard: Callable[[work.LiveRecording], AbstractContextManager[Sink]]
 
 
 class _Picture(NamedTuple):
@@ -236,7 +236,7 @@ class SetupSession:
             return None
         return self._search.describe() or None
 
-    def _describe_rig(self, progress: Progress) -> dict[str, Any]:
+    def _describe_rig(self, progress: SetupProgress) -> dict[str, Any]:
         return {
             "exists": self._folder.rig_file.exists(),
             "name": progress.rig.name if progress.rig else None,
@@ -245,7 +245,7 @@ class SetupSession:
             "dictionaries": DICTIONARIES,
         }
 
-    def _describe_cameras(self, progress: Progress) -> list[dict[str, Any]]:
+    def _describe_cameras(self, progress: SetupProgress) -> list[dict[str, Any]]:
         rows = []
         for key, text, camera in list_options(progress.rig, self._found()):
             taken = self._pictures.get(key)
@@ -254,7 +254,7 @@ class SetupSession:
             rows.append({"key": key, "text": text, "name": camera.name, "picture": picture, "fault": fault})
         return rows
 
-    def _describe_alignment(self, progress: Progress) -> dict[str, Any] | None:
+    def _describe_alignment(self, progress: SetupProgress) -> dict[str, Any] | None:
         log = progress.alignment
         if log is None or log.aligned_run is None:
             return None

@@ -15,7 +15,7 @@ from ipsys_log.models.table import min_pairs
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import check_references
 
-__all__ = ["CameraIntrinsics", "Progress", "Status", "StepState", "read_progress"]
+__all__ = ["CameraIntrinsics", "SetupProgress", "Status", "StepState", "read_progress"]
 
 # The model that a replay fits, and the number of calibration points that gives good results.
 _MODEL, _GOOD = "poly", 40
@@ -57,7 +57,7 @@ class CameraIntrinsics:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class SetupProgress:
     """All facts of a folder for the first day.
 
     Attributes
@@ -85,7 +85,7 @@ class Progress:
         return next(step for step in self.steps if step.name == name)
 
 
-def read_progress(folder: LabFolder) -> Progress:
+def read_progress(folder: LabFolder) -> SetupProgress:
     """Read the state of all steps from the files of a folder."""
     rig, rig_fault = _read_rig(folder.rig_file)
     cameras = tuple(camera for camera in rig.cameras if camera.source) if rig else ()
@@ -106,7 +106,7 @@ def read_progress(folder: LabFolder) -> Progress:
         _accuracy_step(folder.calibration_logs(), logs, fit),
         _live_step(folder.calibration_logs(), logs, fit, missing),
     )
-    return Progress(rig, cameras, intrinsics, logs, alignment, fit, steps)
+    return SetupProgress(rig, cameras, intrinsics, logs, alignment, fit, steps)
 
 
 def _read_rig(path: Path) -> tuple[Rig | None, str]:

@@ -50,7 +50,7 @@ from ipsys_log.survey.live import LiveScene
 from ipsys_log.units import NS_PER_S
 
 __all__ = [
-    "LiveView",
+    "LiveRecording",
     "OpenedLab",
     "align",
     "calibrate",
@@ -77,7 +77,7 @@ class OpenedLab:
 
 
 @dataclass(frozen=True, slots=True)
-class LiveView:
+class LiveRecording:
     """A live recording that a page can show: its cameras, its log, and the run of the shown model."""
 
     lab: OpenedLab
@@ -187,7 +187,7 @@ def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
     api.replay(*folder.calibration_logs(), progress=job.progress, say=job.say)
 
 
-def track(folder: LabFolder, show: Callable[[LiveView], AbstractContextManager[Sink]], job: Job) -> None:
+def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextManager[Sink]], job: Job) -> None:
     """Track robots with live cameras until the job is stopped (``ipsys live``).
 
     Parameters
@@ -212,7 +212,7 @@ def track(folder: LabFolder, show: Callable[[LiveView], AbstractContextManager[S
         with open_streams(
             streamed, {TRACKS.topic_of(run)}, cameras.clock.now_ns, cameras.add_event, heights_m=heights_m
         ) as streams:
-            view = LiveView(lab, log, copy_model(request, name)[1], run, tuple(streams))
+            view = LiveRecording(lab, log, copy_model(request, name)[1], run, tuple(streams))
             with show(view) as sink:
                 sinks: list[Sink] = [sink, *streams]
                 pipeline.live(cameras, lab.settings, log, request, None, [lab.monitor], sinks=sinks)

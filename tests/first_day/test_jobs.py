@@ -12,7 +12,12 @@ from ipsys_log.first_day.jobs import Job, Jobs
 
 def test_second_job_is_refused_until_the_first_ends() -> None:
     jobs, going = Jobs(), threading.Event()
-    jobs.start("the fit", lambda job: job.on_stop(going.set) or going.wait())  # type: ignore[func-returns-value]
+
+    def work(job: Job) -> None:
+        job.on_stop(going.set)
+        going.wait()
+
+    jobs.start("the fit", work)
     with pytest.raises(IpsysError, match="the fit is not finished"):
         jobs.start("the alignment", lambda job: None)
     jobs.close()

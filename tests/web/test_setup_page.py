@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from ipsys_log.first_day.jobs import Job
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.rig.file import load_rig
 from ipsys_log.web.first_day.app import SetupApp
@@ -33,8 +35,8 @@ rate_hz = 5
 class Client:
     """A client of the setup page, with any headers."""
 
-    def __init__(self, url: str) -> None:
-        self.parts = urlsplit(url)
+    def __init__(self, url: str, setup: SetupApp | None = None) -> None:
+        self.parts, self.setup = urlsplit(url), setup
         self.cookie: dict[str, str] = {}
 
     def ask(self, path: str, body: Any = None, **headers: str) -> tuple[int, Any]:
@@ -79,7 +81,7 @@ def folder(tmp_path: Path) -> Path:
 def page(folder: Path) -> Iterator[Client]:
     setup = SetupApp(LabFolder(folder))
     with serve_app(setup.app, None, 0, has_viewers=True) as server:
-        yield Client(server.url)
+        yield Client(server.url, setup)
         setup.session.close()
         assert server.exceptions.count == 0, server.exceptions.first
 
@@ -107,22 +109,37 @@ def test_restart_continues_where_the_files_are(page: Client, folder: Path) -> No
         assert second["next"] == "alignment"
 
 
-def test_pictures_of_cameras_are_taken_and_seen_by_all(page: Client, folder: Path) -> None:
-    (folder / "lab.toml").write_text(SMALL.replace("sim:red?stations=0", "sim:red?stations=0&psf_sigma_px=1"))
-    assert page.ask("/api/start", {"action": "pictures"}) == (200, {})
-    status, answer = page.ask("/api/start", {"action": "align"})
-    assert (status, "is not finished" in answer["error"]) == (400, True)
-    assert page.ask("/api/rig", {"values": {"name": "x"}})[0] == 400
-    page.ask("/api/stop", {})
-    job = page.job_ended()
-    assert (job["action"], job["error"]) == ("pictures", "")
-    assert page.ask("/api/start", {"action": "pictures"}) == (200, {})
-    page.job_ended()
+def test_second_job_is_refused_and_any_device_stops_the_first(page: Client, folder: Path) -> None:
+    (folder / "lab.toml").write_text(SMALL)
+    stopped = threading.Event()
+
+    def work(job: Job) -> None:
+        job.on_stop(stopped.set)
+        stopped.wait()
+
+    assert page.setup is not None
+    page.setup.session.jobs.start("the fit", work)
     other = Client(page.parts.geturl())
-    first = other.state()["cameras"][0]
-    assert first["key"] == "sim:red?stations=0&psf_sigma_px=1"
-    status, data = other.ask(f"/{first['picture']}")
-    assert (status, data[:2]) == (200, b"\xff\xd8")
+    assert other.state()["job"]["name"] == "the fit"
+    for path, body in (("/api/start", {"action": "align"}), ("/api/rig", {"values": {"name": "x"}})):
+        status, answer = other.ask(path, body)
+        assert (status, "the fit is not finished" in answer["error"]) == (400, True)
+    assert other.ask("/api/stop", {}) == (200, {})
+    assert page.job_ended()["error"] == ""
+
+
+# Three simulated cameras are opened.
+@pytest.mark.slow
+def test_pictures_of_cameras_are_seen_by_all(page: Client, folder: Path) -> None:
+    (folder / "lab.toml").write_text(SMALL)
+    assert page.ask("/api/start", {"action": "pictures"}) == (200, {})
+    assert page.job_ended()["error"] == ""
+    other = Client(page.parts.geturl())
+    cameras = other.state()["cameras"]
+    assert [camera["key"] for camera in cameras] == ["sim:red?stations=0", "sim:white", "sim:black"]
+    for camera in cameras:
+        status, data = other.ask(f"/{camera['picture']}")
+        assert (status, data[:2]) == (200, b"\xff\xd8")
 
 
 @pytest.mark.parametrize(

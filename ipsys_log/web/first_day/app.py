@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.session import Pages, SetupSession
-from ipsys_log.first_day.work import LiveView
+from ipsys_log.first_day.work import LiveRecording
 from ipsys_log.survey.entry import Fault
 from ipsys_log.survey.live import LiveScene
 from ipsys_log.web.access import MAY_WRITE
@@ -95,7 +95,7 @@ class SetupApp:
             yield
 
     @contextmanager
-    def _show_dashboard(self, view: LiveView) -> Iterator[Dashboard]:
+    def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
         cameras = view.lab.cameras
         setting = LiveSetting(
             view.lab.rig,

@@ -147,8 +147,8 @@ function alignment(state, act) {
     make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: sentence(one.advice) }))));
   return [
     ...parts, make("div", { className: "cards" }, ...cards), make("h3", { textContent: "Floor" }),
-    ...lines([...(found.fault ? [["bad", found.fault]] : []),
-      ...found.coverage.map(([text, good]) => [good ? "good" : "warn", text]), ...found.notes.map((text) => ["warn", text])]),
+    ...lines([...(found.fault ? [["bad", found.fault]] : []), ...found.coverage.map(([text, good]) => [good ? "good" : "warn", text])]),
+    ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Notes: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
   ];
 }
 

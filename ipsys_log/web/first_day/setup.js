@@ -54,11 +54,13 @@ function drawPanel() {
   // Typed texts and the focus survive a change by another device.
   const same = shown.startsWith(`["${selected}"`);
   const typed = same ? [...$("panel").querySelectorAll("input")].filter((one) => one.value !== one.defaultValue).map((one) => [one.id, one.value]) : [];
-  const focused = same ? document.activeElement?.id : "";
+  const focused = same ? document.activeElement?.id : "", within = same && $("panel").contains(document.activeElement);
   shown = part;
   $("panel").replaceChildren(...panel(selected, state, act));
   for (const [id, value] of typed) if ($(id)) $(id).value = value;
   if (focused && $("panel").contains($(focused))) $(focused).focus();
+  // A button that has vanished leaves the keyboard in the panel.
+  if (within && !$("panel").contains(document.activeElement)) $("panel").focus();
   drawSteps();
 }
 

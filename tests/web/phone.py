@@ -33,7 +33,13 @@ class Phone:
         self._tapped_s = 0.0
 
     def send(self, method: str, **given: Any) -> dict[str, Any]:
-        """Send a command of the DevTools protocol; return its answer."""
+        """Send a command of the DevTools protocol; return its result."""
+        answer = self._answer(method, given)
+        assert "error" not in answer, answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    def _answer(self, method: str, given: dict[str, Any]) -> dict[str, Any]:
         self._number += 1
         message: dict[str, Any] = {"id": self._number, "method": method, "params": given}
         if self._session is not None:
@@ -42,9 +48,7 @@ class Phone:
         while True:
             answer = self._receive()
             if answer.get("id") == self._number:
-                assert "error" not in answer, answer
-                result: dict[str, Any] = answer["result"]
-                return result
+                return answer
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
@@ -76,6 +80,17 @@ class Phone:
             self.send(f"{domain}.enable")
         self.send("Page.navigate", url=url)
         self.wait("location.href !== 'about:blank' && document.readyState === 'complete'")
+
+    def reload(self) -> None:
+        """Load the page again, and wait until its document is complete."""
+        self.run("window.isOld = true")
+        self.send("Page.reload")
+        end = time.monotonic() + _PATIENCE_S
+        given = {"expression": "!window.isOld && document.readyState === 'complete'", "returnByValue": True}
+        # In between there is no document, and an expression has no context.
+        while not self._answer("Runtime.evaluate", given).get("result", {}).get("result", {}).get("value"):
+            assert time.monotonic() < end, "the page is not complete"
+            time.sleep(0.05)
 
     def prefer(self, scheme: str) -> None:
         """Change the colour scheme that the user prefers; colours change at once."""

@@ -32,10 +32,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
 def opened(browser: Phone, url: str, size: tuple[int, int]) -> Iterator[None]:
     """Open a page, and leave it at the end; the browser must have reported no error."""
     browser.open(url, size)
-    yield
-    browser.send("Page.navigate", url="about:blank")
-    browser.wait("location.href === 'about:blank'")
-    errors, browser.console[:] = list(browser.console), []
+    try:
+        yield
+    finally:  # a test that fails leaves nothing for the next one
+        browser.send("Page.navigate", url="about:blank")
+        browser.wait("location.href === 'about:blank'")
+        errors, browser.console[:] = list(browser.console), []
     assert errors == []
 
 
@@ -132,7 +134,7 @@ def test_operator_needs_only_the_keyboard(browser: Phone, lab: LiveLab) -> None:
         says(browser, "#events", "segment warm-up ended")
         assert [written.kind for written in lab.written] == ["mark", "segment_started", "segment_ended"]
         # After a reload it is the same device; another one may take over.
-        browser.send("Page.reload")
+        browser.reload()
         says(browser, "#operation", "This device operates")
         lab.operator.claim(True)
         says(browser, "#operation", "Another device operates")

@@ -178,9 +178,10 @@ def hide_passwords(rig: Rig) -> Rig:
 def toml_rows(item: Any) -> list[str]:
     """Return the lines of an item of a rig, without the header of its table; missing values have no line."""
     values = [(f.name, getattr(item, f.name)) for f in fields(item)]
-    # A JSON string is a TOML string, and a JSON number is a TOML number; so is a list of strings.
+    # A JSON string is a TOML string, and a JSON number is a TOML number; so is a list of strings. JSON writes
+    # some letters as pairs of escapes, which TOML refuses: they stay letters.
     return [
-        f"{name} = {json.dumps(value)}"
+        f"{name} = {json.dumps(value, ensure_ascii=False)}"
         for name, value in values
         if isinstance(value, (str, int, float)) or (value and _are_texts(value))
     ]

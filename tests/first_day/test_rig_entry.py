@@ -20,7 +20,7 @@ FAULTS = [
     ("marker_length_m", "-1", "must be above 0"),
     ("width_m", "488", "write 4.88 if it is in cm"),
     ("depth_m", "wide", "is not a number"),
-    ("first_y_m", "1e9", "is too large for m"),
+    ("first_y_m", "1000", "is too large for m"),
     ("robots", "1, x", "marker id x is not a number"),
     ("robots", "0 100", "has only the ids 0 to 99"),
 ]

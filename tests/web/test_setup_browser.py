@@ -54,6 +54,17 @@ class Visitor:
         self.wait(f"document.querySelector('#onward') && {JOB_ENDED}")
 
 
+def visit(browser: Phone, url: str, size: tuple[int, int] = PHONE) -> None:
+    """Leave the present page, which asks its server every second, and open another one."""
+    leave(browser)
+    browser.open(url, size)
+
+
+def leave(browser: Phone) -> None:
+    browser.send("Page.navigate", url="about:blank")
+    browser.wait("location.href === 'about:blank'")
+
+
 def focus(browser: Phone, selector: str) -> None:
     """Move the focus with the tabulator key only; the fields and the steps come before a button."""
     for _ in range(60):
@@ -93,9 +104,10 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, tmp_path
         visitor.tap("#onward")
         visitor.run_job("#align")
         assert browser.run("document.querySelectorAll('.shaft').length") >= 3
+        leave(browser)
     # Restarted in the middle, another server continues with the same state.
     with serving(folder) as url:
-        browser.open(url)
+        visit(browser, url)
         says(browser, "#state", "4 of 7")
         says(browser, "h2", "5. Calibration points")
         visitor.run_job("#sheet")
@@ -106,17 +118,17 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, tmp_path
         visitor.tap("#live")
         visitor.wait("document.querySelector('#open-live')")
         dashboard = url + "live/"
-        browser.open(dashboard)
+        visit(browser, dashboard)
         visitor.inputs += 1
         visitor.wait("document.querySelectorAll('#floor .robot').length === 3")
-        browser.open(url + "#live")
+        visit(browser, url + "#live")
         visitor.tap("#stop")
         visitor.wait(JOB_ENDED)
         says(browser, "#state", "7 of 7")
         assert browser.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
-        errors = browser.console
+        leave(browser)
     assert visitor.inputs == 13
-    assert errors == []
+    assert browser.console == []
     assert [step.status for step in read_progress(LabFolder(folder)).steps] == [Status.DONE] * 7
     positions_m = errors_m(folder / "live.mcap")
     assert len(positions_m) > 10
@@ -144,14 +156,15 @@ def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, tmp_path: P
         browser.run("location.hash = 'points'")
         visitor.tap("#measure")
         visitor.wait("document.querySelector('#open-measure')")
-        browser.open(url + "measure/")
+        visit(browser, url + "measure/")
         visitor.wait("document.querySelector('#sight').innerText.includes('are visible')")
-        browser.open(url + "#points")
+        visit(browser, url + "#points")
         visitor.tap("#stop")
         visitor.wait(JOB_ENDED)
         # Without a point, the step is not done.
         says(browser, "#panel", "0 points measured")
-        assert browser.console == []
+        leave(browser)
+    assert browser.console == []
 
 
 def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, tmp_path: Path) -> None:
@@ -170,7 +183,7 @@ def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, tmp_path: 
         browser.tap("#simulate")
         browser.wait("document.querySelector('#onward')")
         for size in (PHONE, DESKTOP, WALL):
-            browser.open(url, size)
+            visit(browser, url, size)
             for name in STEPS:
                 browser.wait(f"document.querySelector('#step-{name}')")
                 browser.run(f"location.hash = '{name}'")
@@ -179,7 +192,8 @@ def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, tmp_path: 
                 for scheme in ("light", "dark"):
                     browser.prefer(scheme)
                     assert low_contrasts(browser) == [], (size, name, scheme)
-        assert browser.console == []
+        leave(browser)
+    assert browser.console == []
 
 
 def test_keyboard_alone_reaches_the_next_step(browser: Phone, tmp_path: Path) -> None:

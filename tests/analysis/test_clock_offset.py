@@ -43,7 +43,7 @@ def split(seed: int, drive_s: float, shift_s: float) -> tuple[list[MarkerPath], 
     return [path for path in whole if path.camera == "red"], late
 
 
-@pytest.mark.parametrize("shift_s", [0.0371, -731.4142])
+@pytest.mark.parametrize("shift_s", first_fast(1, [-731.4142, 0.0371]))
 def test_offset_of_two_clocks_is_found_to_milliseconds(shift_s: float) -> None:
     estimate = estimate_clock_offset(*split(3, 20.0, shift_s))
     assert estimate.offset_s == pytest.approx(-shift_s, abs=2e-3)

@@ -53,6 +53,7 @@ def _shifted(message: Message, clock_ns: int) -> Message:
     )
 
 
+@pytest.mark.slow
 def test_offsets_of_three_recorders_are_estimated(
     ipsys: Ipsys, recorders: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -29,6 +29,8 @@ from ipsys_log.soundness.check import check_logs
 from tests.conftest import Ipsys
 from tests.shared_files import make_once
 
+pytestmark = pytest.mark.slow  # three logs with all stages
+
 REQUEST = Request(corners="stock", models=("rigid",))
 OFFSET_NS = 12_345_678
 

@@ -54,6 +54,16 @@ def test_unknown_layout_is_refused_and_unchanged(tmp_path: Path) -> None:
     assert path.read_text() == text
 
 
+def test_text_that_means_another_rig_is_refused(tmp_path: Path) -> None:
+    """A name in dotted or quoted form stays, so the changed text would not mean the typed name."""
+    path = tmp_path / "lab.toml"
+    text = '"name" = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+    path.write_text(text)
+    with pytest.raises(IpsysError, match="cannot change its layout"):
+        write_rig(path, text, replace(load_rig(path), name="hall"))
+    assert path.read_text() == text
+
+
 names = st.text("abcdefgh_0123456789", max_size=8).map(lambda text: f"c{text}")
 cameras = st.lists(
     st.builds(

@@ -112,20 +112,26 @@ def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement
     Raises
     ------
     IpsysError
-        Two measurements have the same id, or a measurement has no marker.
+        Two of these measurements have the same id, or one has no marker.
     """
     points: dict[str, Measurement] = {}
     withdrawn: dict[str, Measurement] = {}
+    repeated: set[str] = set()
     for measurement in measurements:
         if measurement.is_point:
             if measurement.id in points and measurement.id not in withdrawn:
-                raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
-            if measurement.marker_id is None:
-                raise IpsysError(f"measurement {measurement.id} has no marker; withdraw it and measure again")
+                repeated.add(measurement.id)
             points.pop(measurement.id, None)
             points[measurement.id] = measurement
         _follow(withdrawn, measurement)
-    return [measurement for name, measurement in points.items() if name not in withdrawn]
+        repeated -= withdrawn.keys()
+    active = [measurement for name, measurement in points.items() if name not in withdrawn]
+    for measurement in active:
+        if measurement.id in repeated:
+            raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
+        if measurement.marker_id is None:
+            raise IpsysError(f"measurement {measurement.id} has no marker; withdraw it and measure again")
+    return active
 
 
 def withdrawals(measurements: Iterable[Measurement]) -> dict[str, Measurement]:

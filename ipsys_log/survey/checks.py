@@ -10,7 +10,7 @@ from itertools import chain, count
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.analysis.pairs import active_measurements, withdrawals
 from ipsys_log.analysis.tape import TapePoint, is_on_reference, reference_points, with_usual_tape, world_point
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
@@ -96,10 +96,11 @@ def withdrawal_of(history: Sequence[Measurement], name: str, reason: str | None 
     IpsysError
         No measurement has this id, or it is withdrawn already.
     """
-    for measurement in active_measurements(history):
-        if measurement.id == name:
-            message_id = free_id(history, f"{name}_withdrawn")
-            return Measurement(measurement.timestamp, message_id, withdraws=name, reason=reason)
+    # A faulty measurement can be withdrawn, too.
+    named = [one for one in history if one.is_point and one.id == name]
+    if named and name not in withdrawals(history):
+        message_id = free_id(history, f"{name}_withdrawn")
+        return Measurement(named[-1].timestamp, message_id, withdraws=name, reason=reason)
     raise IpsysError(f"measurement {name} cannot be withdrawn: it is withdrawn already, or does not exist")
 
 

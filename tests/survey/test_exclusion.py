@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipsys_log.analysis.pairs import active_measurements, withdrawals
+from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Evaluation, Measurement, Model
+from ipsys_log.messages import Evaluation, Measurement, Message, Model
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
+from ipsys_log.runs.output import write_log
 from ipsys_log.soundness.check import check_logs
 from ipsys_log.survey.exclusion import exclude
 from tests.conftest import Ipsys, data_section
@@ -113,9 +115,6 @@ def test_unknown_point_names_the_points_of_the_log(ipsys: Ipsys, fitted: Path) -
 
 
 def test_name_of_a_point_excludes_all_its_measurements(tmp_path: Path) -> None:
-    from ipsys_log.messages import Message
-    from ipsys_log.runs.output import write_log
-
     log = tmp_path / "points.mcap"
     rows = [
         Measurement(100 + n, f"{camera}_1", marker_id=1, calibration_point="corner")
@@ -124,6 +123,25 @@ def test_name_of_a_point_excludes_all_its_measurements(tmp_path: Path) -> None:
     write_log(log, (Message("/measurements", one.timestamp, one.timestamp, one) for one in rows))
     assert exclude(log, ["corner"], "moved").changed == ("red_1", "white_1")
     assert active_measurements(measured(log)) == []
+
+
+def test_excluded_points_are_not_faulty(tmp_path: Path) -> None:
+    """A repeated id, or a point without a marker, is an error only as long as it counts."""
+    log = tmp_path / "a.mcap"
+    rows = [
+        Measurement(1, "a", marker_id=1),
+        Measurement(2, "a", marker_id=1),
+        Measurement(3, "c", marker_id=1),
+    ]
+    faulty = [*rows, Measurement(4, "b")]
+    for history, name in ((rows, "'a'"), (faulty[2:], "b has no marker")):
+        with pytest.raises(IpsysError, match=name):
+            active_measurements(history)
+    write_log(log, (Message("/measurements", one.timestamp, one.timestamp, one) for one in faulty))
+    exclude(log, ["a", "b"], "typed twice, and without a marker")
+    assert [one.id for one in active_measurements(measured(log))] == ["c"]
+    again = Measurement(9, "r", readmits="a", reason="it was right")
+    assert [one.timestamp for one in active_measurements([*measured(log), again])] == [2, 3]
 
 
 def test_measuring_page_shows_the_reason_of_an_exclusion(detected_lab: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.web.server import qr_code, serve
+from tests.playing import WAIT_LIMIT_S
 from tests.web.test_measuring_page import Recording
 
 PLACE = {"marker": "0", "distances": {"A": "170", "B": "190"}, "side": "left", "height": "10"}
@@ -30,7 +31,9 @@ class Caller:
     def ask(
         self, method: str, path: str, body: Any = None, **headers: str
     ) -> tuple[int, str, dict[str, str]]:
-        connection = http.client.HTTPConnection(str(self.parts.hostname), self.parts.port or 0, timeout=10)
+        connection = http.client.HTTPConnection(
+            str(self.parts.hostname), self.parts.port or 0, timeout=WAIT_LIMIT_S
+        )
         try:
             data = body if isinstance(body, bytes) else None if body is None else json.dumps(body).encode()
             connection.request(method, path, data, {k.replace("_", "-"): v for k, v in headers.items()})

@@ -29,11 +29,11 @@ class _Block:
 
 
 def replace_values(text: str, values: Mapping[str, str | float]) -> str:
-    """Return a rig file with other values at its top, such as ``name``; comments stay.
+    """Return a rig file with other values at its top, such as ``name``; lines of comments stay.
 
     Examples
     --------
-    >>> print(replace_values('name = "lab"  # ours', {"name": "hall"}))
+    >>> print(replace_values('name = "lab"  # ours', {"name": "hall"}), end="")
     name = "hall"
     """
     blocks = _split(text)

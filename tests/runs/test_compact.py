@@ -92,9 +92,8 @@ def test_compaction_drops_only_the_superseded_runs(ipsys: Ipsys, grown_log: Path
     assert lines[1].startswith("stopped is dropped: unfinished; 1 message, about ")
     assert lines[3].startswith(f"{small} written: ")
     assert grown_log.read_bytes() == before
-    assert stock_rows(small) == [
-        row for row in stock_rows(grown_log) if run_of(row) not in superseded(grown_log)
-    ]
+    dropped = superseded(grown_log)
+    assert stock_rows(small) == [row for row in stock_rows(grown_log) if run_of(row) not in dropped]
     assert small.stat().st_size < len(before)
     # A second compaction has nothing to do.
     again = ipsys("compact", small, "-o", tmp_path / "smaller.mcap")
@@ -132,7 +131,8 @@ def test_dry_run_lists_the_runs_and_writes_nothing(ipsys: Ipsys, grown_log: Path
     assert found["output"] is None
     # The prediction counts messages; the file also loses their indexes, and compresses other neighbours.
     predicted = sum(one["stored_bytes"] for one in found["dropped"])
-    rows = [row for row in stock_rows(grown_log) if run_of(row) in superseded(grown_log)]
+    dropped = superseded(grown_log)
+    rows = [row for row in stock_rows(grown_log) if run_of(row) in dropped]
     assert sum(one["messages"] for one in found["dropped"]) == len(rows)
     assert 0 < predicted <= sum(len(row[3]) + 31 for row in rows)
     assert real["output_bytes"] == small.stat().st_size < real["bytes"]

@@ -36,7 +36,7 @@ _MOVING_SHARE = 0.1
 # covers clocks that differ by less than 3 s: the usual case, also with a small common field of view.
 _REFINED_S, _GRID_STEP_S, _NEAR_STEPS = 0.3, 0.025, 10
 # Residuals of the maps above this share of the spread of the positions are those of unrelated paths. Another
-# offset is as good if its misfit is less than so many times that of the best one.
+# offset is a rival of the best one if the ratio of their misfits is less than this.
 _LARGEST_MISFIT, _RIVAL_MISFIT, _MOST_FITS = 0.02, 2.0, 12
 # The positions between two frames are interpolated: the error of the offset is about 0.015 frame intervals at
 # 10 Hz, with robots that stop and go. With a larger sigma, a robot at 0.5 m/s would be more than 1 cm off.

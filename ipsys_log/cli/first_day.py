@@ -60,6 +60,5 @@ def setup(folder: Folder, host: Host = None, port: Port = 8000) -> None:
         finally:
             page.session.close()
             say_faults(server, "the setup page")
-            job = page.session.jobs.present
-            if job is not None and job.bug:
-                remarks.print(job.bug, markup=False, highlight=False)
+            for bug in page.session.jobs.bugs:
+                remarks.print(bug, markup=False, highlight=False)

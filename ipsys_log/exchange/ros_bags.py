@@ -61,7 +61,7 @@ def find_bag_cameras(path: Path, named: Mapping[str, str]) -> BagCameras:
     Raises
     ------
     IpsysError
-        The file is no bag or has no images; a topic does not exist; two cameras have one name.
+        The file is not a bag or has no images; a topic does not exist; two cameras have one name.
     """
     with _open_bag(path) as reader:
         types = {connection.topic: _payload(connection) for connection in reader.connections}
@@ -198,7 +198,9 @@ def _open_bag(path: Path) -> Iterator[_Reader]:
     if not path.exists():
         raise IpsysError(f"{path}: does not exist; give a bag of ROS 1 (.bag), or a folder of ROS 2")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
-        raise IpsysError(f"{path}: is no bag of ROS 2: it has no metadata.yaml; run: ros2 bag reindex {path}")
+        raise IpsysError(
+            f"{path}: is not a bag of ROS 2: it has no metadata.yaml; run: ros2 bag reindex {path}"
+        )
     with _faults(path):
         reader = Reader1(path) if path.suffix == ".bag" else Reader2(path)
         reader.open()
@@ -219,7 +221,7 @@ def _faults(path: Path) -> Iterator[None]:
     # The readers and their libraries raise about twenty types of errors, without a common class.
     except Exception as error:
         raise IpsysError(
-            f"{path}: is no bag that can be read ({type(error).__name__}: {' '.join(str(error).split())}); "
+            f"{path}: is not a readable bag ({type(error).__name__}: {' '.join(str(error).split())}); "
             "repair it with the tools of ROS"
         ) from error
 

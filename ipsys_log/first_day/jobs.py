@@ -83,8 +83,15 @@ class Jobs:
 
     def __init__(self) -> None:
         self.present: Job | None = None
+        self._earlier_bugs: list[str] = []
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
+
+    @property
+    def bugs(self) -> list[str]:
+        """The tracebacks of the unexpected exceptions in all jobs so far."""
+        present = [self.present.bug] if self.present is not None and self.present.bug else []
+        return [*self._earlier_bugs, *present]
 
     def start(self, name: str, work: Callable[[Job], None]) -> None:
         """Start a job in its own thread.
@@ -97,6 +104,7 @@ class Jobs:
         with self._lock:
             if self.present is not None and not self.present.ended:
                 raise IpsysError(f"{self.present.name} is not finished; wait for it, or stop it")
+            self._earlier_bugs = self.bugs
             self.present = Job(name)
             self._thread = threading.Thread(target=_run, args=(self.present, work), name=name, daemon=True)
             self._thread.start()
@@ -121,6 +129,9 @@ def _run(job: Job, work: Callable[[Job], None]) -> None:
         job.error = plain_text(str(error))
     except Exception as error:
         job.bug = traceback.format_exc()
-        job.error = f"internal error of ipsys: {type(error).__name__}: {error}; the terminal shows it"
+        job.error = (
+            f"internal error of ipsys: {type(error).__name__}: {error}; the terminal shows it when the "
+            "command ends"
+        )
     finally:
         job.ended = True

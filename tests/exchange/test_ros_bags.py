@@ -152,11 +152,11 @@ def test_bad_bags_are_refused_in_one_line(tmp_path: Path, ipsys: Ipsys) -> None:
     other = write_ros1(theora, [compressed(0, b"OggS")])
     for bag, options, text in (
         (tmp_path / "gone.bag", (), "does not exist; give a bag of ROS 1"),
-        (tmp_path / "cut.bag", (), "is no bag that can be read"),
-        (tmp_path / "text.bag", (), "is no bag that can be read"),
-        (tmp_path / "text.db3", (), "is no bag that can be read"),
+        (tmp_path / "cut.bag", (), "is not a readable bag"),
+        (tmp_path / "text.bag", (), "is not a readable bag"),
+        (tmp_path / "text.db3", (), "is not a readable bag"),
         (tmp_path / "folder", (), "has no metadata.yaml"),
-        (tmp_path / "yaml", (), "is no bag that can be read"),
+        (tmp_path / "yaml", (), "is not a readable bag"),
         (other, (), "is not read (only JPEG, PNG and WebP)"),
         (good, ("--camera", "red"), "red: has no camera name; write --camera red=/red/image_raw"),
         (good, ("--camera", "red=/gone"), "topic /gone of camera red has no images (topics: /red/"),

@@ -44,7 +44,11 @@ def test_error_of_a_job_is_one_line_and_a_bug_keeps_its_traceback() -> None:
     jobs.start("the fit", breaks)
     jobs.close()
     assert "internal error of ipsys: ZeroDivisionError" in jobs.present.error
-    assert "in breaks" in jobs.present.bug
+    # A later job does not hide the bug.
+    jobs.start("the fit", fails)
+    jobs.close()
+    (bug,) = jobs.bugs
+    assert "in breaks" in bug
 
 
 def test_stop_before_the_cameras_open_still_stops_them() -> None:

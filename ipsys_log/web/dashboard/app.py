@@ -35,7 +35,7 @@ _KEPT = 30
 def build_dashboard(dashboard: Dashboard) -> Starlette:
     """Return the page of a recording, without a guard.
 
-    The guard says which device may write; a request without its word is one of the operator.
+    The guard marks the requests of devices that may write. Without a guard, all requests may write.
     """
     answers = _Answers(dashboard)
     return Starlette(
@@ -72,7 +72,7 @@ class _Answers:
             return Response(status_code=404)
         jpeg = self._encoded(camera, time_ns)
         if jpeg is None:
-            return Response(status_code=204)  # a slow page asks for a picture that is not kept any more
+            return Response(status_code=204)  # a slow page requests a picture that is not kept any more
         # The address always means the same image.
         return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})
 

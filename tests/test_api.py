@@ -209,6 +209,7 @@ def test_wrong_names_are_one_line(replayed: Path, given: dict[str, Any], text: s
         log.table(**given)
 
 
+@pytest.mark.slow
 def test_replay_returns_evaluations(lab_log: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
     result = ipsys.replay(path, models=["poly"])

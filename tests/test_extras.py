@@ -141,6 +141,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 def test_commands_without_their_extra_name_it_and_write_nothing(folder: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     results = run_without(folder, *(command.split() for command in REFUSED))

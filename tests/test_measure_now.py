@@ -167,6 +167,7 @@ def test_page_measures_points_until_it_is_stopped(
     assert all(f"p00{n}" in listed.out for n in (1, 3, 4, 5, 6))
 
 
+@pytest.mark.slow
 def test_measured_points_survive_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
     log = tmp_path / "places.mcap"
     with measuring(still_lab, log) as (program, page):
@@ -263,6 +264,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", first_fast(2, ["q\n", "\x03", "SIGTERM"]))
 def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
     log, one = tmp_path / "places.mcap", still_lab.tape[0]

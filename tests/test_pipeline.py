@@ -130,6 +130,7 @@ def test_stage_across_cameras_gets_messages_in_order() -> None:
     assert order == sorted(order)
 
 
+@pytest.mark.slow
 def test_a_replay_gives_the_same_bytes_every_time(lab_log: Path, tmp_path: Path) -> None:
     written = []
     for number in range(4):
@@ -170,6 +171,7 @@ def test_each_result_is_computed_once(ipsys: Ipsys, lab: Path) -> None:
     assert lab.read_bytes() == after
 
 
+@pytest.mark.slow
 def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     stages = stages_of(ipsys, "replay", lab, "--model", "rigid+poly")
@@ -178,6 +180,7 @@ def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
     assert stages["fuse"] == ("rigid_poly", True)
 
 
+@pytest.mark.slow
 def test_replay_in_place_equals_replay_into_a_new_log(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     beside, before = tmp_path / "derived.mcap", lab.read_bytes()
     assert ipsys("replay", lab, "-o", beside).code == 0

@@ -220,6 +220,7 @@ except InterruptError as interrupt:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "code"), [("camera", 130), ("disk", 1)])
 def test_second_interrupt_ends_a_hanging_command(what: str, code: int, ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
@@ -292,6 +293,7 @@ def test_a_signal_may_come_at_any_moment() -> None:
     subprocess.run([sys.executable, "-c", ENDING], timeout=LIMIT_S, check=True)
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
@@ -313,6 +315,7 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     assert min(ends_ns) > killed_ns - 1_300_000_000  # one second, and the time to kill it
 
 
+@pytest.mark.slow
 def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Path) -> None:
     played, rig, log = tmp_path / "played.mcap", tmp_path / "lab.toml", tmp_path / "a.mcap"
     large = [CompressedImage(n * 10**8, "red", bytes(500_000), "jpeg") for n in range(300)]

@@ -228,6 +228,7 @@ def _moved(message: Message, end_ns: int) -> Message:
     )
 
 
+@pytest.mark.slow
 def test_frames_that_were_skipped_stay_skipped(
     lab_log: Path,
     calibration: Path,

@@ -36,6 +36,7 @@ def test_the_samples_are_small() -> None:
     assert all(path.name in described for path in SAMPLES.glob("*.mcap"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.mcap")), ids=lambda path: path.stem)
 def test_a_log_of_an_earlier_release(ipsys: Ipsys, tmp_path: Path, path: Path) -> None:
     log = Path(shutil.copy(path, tmp_path))

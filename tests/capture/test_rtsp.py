@@ -74,6 +74,7 @@ def decoded(name: str, frames: list[bytes]) -> list[NDArray[np.uint8]]:
     return [np.asarray(one.to_ndarray(format="gray"), np.uint8) for one in pictures]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "protocol"),
     first_fast(1, [("h264", "tcp"), ("h264", "udp"), ("h265", "tcp"), ("jpeg", "tcp"), ("jpeg", "udp")]),

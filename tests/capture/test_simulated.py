@@ -38,6 +38,7 @@ def take(name: str, count: int, clock: Clock, **other: str) -> list[Frame]:
         return list(islice((frame for frame in frames if frame), count))
 
 
+@pytest.mark.slow
 def test_frames_show_each_marker_where_it_is() -> None:
     clock = Clock()
     source = f"sim:white?markers=4&seed=2&{BRIEF}"
@@ -73,6 +74,7 @@ def test_frames_show_each_marker_where_it_is() -> None:
     assert seen & {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_all_cameras_agree_on_the_time() -> None:
     """The same camera, opened twice with separate clocks, shows the same image at each time."""
     first = {frame.time_ns: frame.data for frame in take(f"red?{BRIEF}", 45, Clock())}

@@ -250,6 +250,7 @@ def test_a_picture_that_cannot_be_read_is_left_out_and_named(ipsys: Ipsys, red: 
     assert "13.jpg: cannot be read" in done.out
 
 
+@pytest.mark.slow
 def test_bad_camera_does_not_cost_the_others(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     """Return three good folders, and one with blurred images."""
     for name in ("blue", "green", "white"):

@@ -158,6 +158,7 @@ def test_a_proposed_point_gives_the_predicted_error(
     assert measured["mean_mm"] == pytest.approx(best["mean_after_mm"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_plan_for_joint_names_points_and_a_drive(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
     drawn = tmp_path / "plan.png"
     done = ipsys("plan", fitted, "--model", "joint", "--places", "3", "--plot", drawn, "--json")
@@ -251,6 +252,7 @@ def test_a_wrong_reading_is_named_first(ipsys: Ipsys, lab: GeometricLab, tmp_pat
     assert lines[2].startswith("  point s002: ")
 
 
+@pytest.mark.slow
 def test_nominal_field_of_view_replaces_a_chessboard(ipsys: Ipsys, lab: GeometricLab, tmp_path: Path) -> None:
     def bare(message: Message) -> Message | None:
         return None if isinstance(message.payload, CameraCalibration) else message

@@ -203,6 +203,7 @@ def test_live_align_names_the_kept_log(ipsys: Ipsys, tmp_path: Path, lab: Path) 
         assert {run.stage for run in session.runs()} == {"detect", "camera-frame"}
 
 
+@pytest.mark.slow
 def test_error_in_live_frames_names_no_deleted_file(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("calibrate", "--rig", rig, "--board", "6x4", "--seconds", "1")

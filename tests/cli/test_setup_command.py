@@ -9,10 +9,13 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import pytest
+
 from tests.conftest import Ipsys
 from tests.playing import WAIT_LIMIT_S
 
 
+@pytest.mark.slow
 def test_command_serves_a_new_folder_and_ends_in_order(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "ipsys_log", "setup", str(tmp_path / "lab"), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:

@@ -280,6 +280,7 @@ reference_points = [{ name = "A", x_m = 0.0, y_m = 0.0 }, { name = "B", x_m = 4.
 CAMERA = '[[cameras]]\nname = "{0}"\nsource = "sim:{0}?stations=0"\nwidth = 480\nheight = 270\nrate_hz = 5\n'
 
 
+@pytest.mark.slow
 def test_live_positions_are_streamed_and_recorded(
     ipsys: Ipsys, tmp_path: Path, calibration: Path, listening: socket.socket
 ) -> None:

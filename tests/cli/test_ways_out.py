@@ -250,6 +250,7 @@ def test_simulate_interrupted_says_that_nothing_was_written(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_evaluate_interrupted_names_the_runs_that_are_complete(detected: Path) -> None:
     def has_a_fit() -> bool:
         with Session([detected]) as session:

@@ -84,6 +84,7 @@ def test_exported_table_comes_back_exactly(log: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(headings_rad(stored(log)), headings_rad(tracks_of(log)), atol=1e-14)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     offset_ns=st.integers(-START_NS, 10**12),

@@ -229,6 +229,7 @@ def test_damage_gives_no_wrong_marker(interval: int, rounds: int) -> None:
     damage(interval, rounds, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])
 def test_damage_gives_no_wrong_marker_where_rows_are_decoded(interval: int) -> None:
     damage(interval, 60, 2)

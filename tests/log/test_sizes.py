@@ -4,6 +4,7 @@ import random
 import tempfile
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
@@ -84,6 +85,7 @@ def test_no_chunk_spans_a_second(times: list[int]) -> None:
         assert all(chunk.end_ns - chunk.start_ns < 10**9 for chunk in chunks)
 
 
+@pytest.mark.slow
 def test_a_recording_of_frames_cut_at_every_point(tmp_path: Path) -> None:
     """The test is that of test_crash, with frames so large that CRCs are combined."""
     chance = random.Random(8)

@@ -83,6 +83,7 @@ def test_all_files_are_there_and_differ_between_models(paper: Findings, tmp_path
             assert (picture != 255).any(axis=2).mean() > 0.01
 
 
+@pytest.mark.slow
 def test_the_same_log_gives_the_same_bytes(paper: Findings, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         write_plots(only(paper, "poly"), tmp_path / folder)
@@ -193,6 +194,7 @@ def test_log_without_points_is_refused_and_no_file_is_written(ipsys: Ipsys, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["few.mcap"]
 
 
+@pytest.mark.slow
 def test_evaluate_writes_them(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "lab.mcap"
     write_log(log, lab_messages())

@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 # Models are imported within the block, as a command does.
 LATE = """
 import json
@@ -21,6 +23,7 @@ print(json.dumps([(one["filepath"], one["num_threads"]) for one in info]))
 """
 
 
+@pytest.mark.slow
 def test_libraries_loaded_within_the_block_have_one_thread() -> None:
     environment = {name: value for name, value in os.environ.items() if "NUM_THREADS" not in name}
     done = subprocess.run(

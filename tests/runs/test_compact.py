@@ -27,6 +27,7 @@ from ipsys_log.pipeline import replay
 from ipsys_log.runs.compact import compact
 from ipsys_log.runs.cut import cut
 from ipsys_log.runs.cut_selection import CutOptions
+from ipsys_log.runs.graph import version_parameters
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.states import recorded_stages
@@ -177,7 +178,7 @@ def test_run_of_other_robots_keeps_the_run_it_reads(ipsys: Ipsys, tmp_path: Path
 
 
 def test_result_of_older_software_supersedes_nothing(tmp_path: Path) -> None:
-    """A newer run of detect 1 does not replace one of the present version, nor one of detect 3 another."""
+    """A newer run of an older version supersedes nothing; one of a newer version does."""
     log = tmp_path / "lab.mcap"
     with_versions = [
         replace(message, payload=replace(message.payload, parameters={"detect": version}))
@@ -230,7 +231,16 @@ def graph(steps: list[Step], unfinished: frozenset[int] = frozenset()) -> Iterat
         inputs = tuple(known[name] for name in reads if name in known)
         known[run] = ChannelRead(topic, 2, state.digest.hex())
         written = (ChannelWritten(topic, 4 if number in unfinished else 2),)
-        record = Run(time_ns, run, stage, input_runs=reads, inputs=inputs, outputs=written, number=number + 1)
+        record = Run(
+            time_ns,
+            run,
+            stage,
+            version_parameters(stage),
+            input_runs=reads,
+            inputs=inputs,
+            outputs=written,
+            number=number + 1,
+        )
         yield Message(f"/runs/{run}/record", time_ns + 1, time_ns, record)
 
 

@@ -159,6 +159,7 @@ def test_added_stage_is_a_command_in_the_help() -> None:
     assert all(option in text for option in ("--weight", "--model", "--method", "--corners", "--json"))
 
 
+@pytest.mark.slow
 def test_command_of_an_added_stage_gets_its_parameters(whole: Path) -> None:
     results = [
         json.loads(ipsys_with_damping("damp", whole, "--json", *options))["stages"]

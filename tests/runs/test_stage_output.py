@@ -22,13 +22,8 @@ def test_output_belongs_to_these_versions(expected: Any) -> None:
     assert expected["versions"] == VERSIONS
 
 
-@pytest.mark.parametrize(
-    ("corners", "method"),
-    [
-        pytest.param(*one, marks=() if one == ("edges", "perimeter") else pytest.mark.slow)
-        for one in COMBINATIONS
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("corners", "method"), COMBINATIONS)
 def test_output_of_stages_is_what_it_was(corners: str, method: str, expected: Any) -> None:
     found, before = computed(corners, method), expected[f"{corners} {method}"]
     assert found.keys() == before.keys()

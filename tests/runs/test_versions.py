@@ -130,6 +130,7 @@ def test_stages_that_are_not_known_here_are_left_alone(ipsys: Ipsys, log: Path) 
     assert (done.code, state in done.err) == (0, True)
 
 
+@pytest.mark.slow
 def test_state_does_not_depend_on_the_order_of_logs(
     ipsys: Ipsys, lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,6 +219,7 @@ def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, 
     assert "fit is computed again; run poly is out of date: measurements changed" in ipsys("replay", log).err
 
 
+@pytest.mark.slow
 def test_run_without_its_inputs_is_not_repeatable(ipsys: Ipsys, tmp_path: Path) -> None:
     log = Path(shutil.copy(ROOT / "sample_logs" / "paper_lab.mcap", tmp_path / "paper.mcap"))
     first = states(ipsys, log)

@@ -99,6 +99,7 @@ def replay(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
     return models
 
 
+@pytest.mark.slow
 def test_joint_model_halves_the_error_of_rayplane(ipsys: Ipsys, replayed: Path) -> None:
     models = replay(ipsys, replayed, "--model", "joint", "--model", "rayplane")
     truth = {name: model["pooled"]["truth"]["2d"]["mean_cm"] for name, model in models.items()}
@@ -118,6 +119,7 @@ def test_joint_model_halves_the_error_of_rayplane(ipsys: Ipsys, replayed: Path) 
         assert few.mean_2d_m < 0.02
 
 
+@pytest.mark.slow
 def test_results_of_the_joint_model_are_verified(ipsys: Ipsys, replayed: Path) -> None:
     """The model, its evaluation and all later results are computed again, to the same bytes."""
     verified = ipsys("verify", replayed)

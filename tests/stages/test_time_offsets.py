@@ -164,6 +164,7 @@ def times_in(payload: Any) -> set[int]:
     return {payload.timestamp} if hasattr(payload, "timestamp") else set()
 
 
+@pytest.mark.slow
 def test_messages_have_the_times_of_their_payloads(rolling: Path) -> None:
     replay([rolling], Request(models=("rayplane",)))
     with Session([rolling]) as session:

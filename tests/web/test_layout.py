@@ -62,9 +62,8 @@ def check_screen(browser: Phone) -> None:
         assert low_contrasts(browser) == [], scheme
 
 
-@pytest.mark.parametrize(
-    "size", [PHONE, pytest.param(DESKTOP, marks=pytest.mark.slow)], ids=["phone", "desktop"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
 def test_every_state_of_the_page_fits_the_screen(
     browser: Phone, unmeasured: Unmeasured, size: tuple[int, int]
 ) -> None:

@@ -66,6 +66,7 @@ def texts_at(scene: FinishedLog, tape: Sequence[Measurement], number: int) -> tu
     return typed.distances["A"], typed.distances["B"], typed.side, typed.height
 
 
+@pytest.mark.slow
 def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
@@ -132,6 +133,7 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
         assert hand.run("document.querySelectorAll('#floor path.predicted').length") > 0
 
 
+@pytest.mark.slow
 def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
@@ -152,6 +154,7 @@ def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -
     says(hand, "#notice", "The computer does not answer")
 
 
+@pytest.mark.slow
 def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with (
@@ -209,6 +212,7 @@ class Recording:
         self.done += measurements
 
 
+@pytest.mark.slow
 def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
     scene = Recording()
     scene.speed_m = 0.02

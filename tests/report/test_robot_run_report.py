@@ -64,7 +64,7 @@ def half_second(step: int) -> int:
 
 
 def at(topic: str, time_ns: int, payload: object, name: str | None = None) -> Message:
-    return Message(topic, time_ns + 1, time_ns, payload, name)  # type: ignore[arg-type]
+    return Message(topic, time_ns + 1, time_ns, payload, name)
 
 
 def cart_messages() -> Iterator[Message]:
@@ -158,7 +158,7 @@ def test_page_has_panels_also_of_a_robot_that_never_moves(log: Path) -> None:
     images = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", page)]
     assert images[0] == panels
     assert len(images) == 2
-    assert [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR).shape[2] for one in images] == [3, 3]
+    assert all(cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) is not None for one in images)
 
 
 def test_robots_without_truth_and_without_model(tmp_path: Path) -> None:

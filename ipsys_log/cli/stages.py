@@ -55,6 +55,19 @@ _SHARED: dict[str, tuple[Any, Any]] = {
         Annotated[_Path, log_option(help="Write the results to a new log, not to the last LOG.")],
         None,
     ),
+    "jobs": (
+        Annotated[
+            Optional[int],  # noqa: UP045
+            typer.Option(
+                "--jobs",
+                metavar="N",
+                min=1,
+                help="Number of processes for detection in long logs (default: the number of cores). The "
+                "results are the same with any number.",
+            ),
+        ],
+        None,
+    ),
     "as_json": (AsJson, False),
 }
 _PRINTS: dict[str, tuple[Any, Any]] = {
@@ -83,7 +96,7 @@ _PRINTS: dict[str, tuple[Any, Any]] = {
 # The order of options in the help. Parameters that are not in it come after these.
 _ORDER = (
     *("logs", "model", "model_from", "train", "seed", "rig", "calibration", "corners", "method"),
-    *("run", "output", "as_live", "skip_ambiguous"),
+    *("run", "output", "as_live", "skip_ambiguous", "jobs"),
 )
 
 MORE = "\n\nThe command runs missing stages first."
@@ -137,7 +150,7 @@ def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
 
     rig, run = given.pop("rig"), given.pop("run")
     models, calibration = given.pop("model", None) or (), given.pop("calibration", None)
-    lenses = given.pop("lenses", None) or {}
+    lenses, jobs = given.pop("lenses", None) or {}, given.pop("jobs", None)
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
     further = {name: given.pop(name) for name in [*given] if name not in known}
@@ -146,6 +159,7 @@ def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
         "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
         "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
         "run": check_name(run, "--run") if run else None,
+        "jobs": jobs,
         "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,
     }

@@ -31,10 +31,12 @@ from ipsys_log.rig.file import hide_passwords
 from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
+from ipsys_log.runs.pieces import PieceRun, merge_pieces, order_frames, split_frames
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.states import Recorded, recorded_stages
 from ipsys_log.runs.stream import in_threads, run, wire
+from ipsys_log.runs.workers import LocalWorkers
 from ipsys_log.stages.detect import skipped_frames
 from ipsys_log.units import format_time
 
@@ -312,8 +314,13 @@ def _settings(
         yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
 
 
-def compute_messages(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
-    """Yield the messages of a task's run: of its causal stage, or those computed from the whole log."""
+def compute_messages(
+    task: Task, session: Session, name: str, progress: Progress, workers: LocalWorkers | None = None
+) -> Iterator[Message]:
+    """Yield the messages of a task's run: of its causal stage, or those computed from the whole log.
+
+    ``workers`` compute a long run in pieces.
+    """
     if task.step is None:
         assert task.compute is not None
         computed = task.compute(partial(progress, task.stage.name))
@@ -324,6 +331,15 @@ def compute_messages(task: Task, session: Session, name: str, progress: Progress
             yield Message(topic, log_time_ns, payload.timestamp, payload)
         return
     wired = wire(task.stage, name, task.inputs, task.step(name))
+    if workers is not None and task.stage.pieces is not None:
+        frames = order_frames(session, task.topics)
+        run_of_pieces = PieceRun.of_task(task, session)
+        pieces = split_frames(frames, run_of_pieces.load().resets) if frames is not None else []
+        if frames is not None and workers.are_worth(len(frames.times_ns), len(pieces)):
+            advance = partial(progress, task.stage.name)
+            results = workers.compute(run_of_pieces, pieces)
+            yield from merge_pieces(wired, run_of_pieces, frames, results, advance)
+            return
     written = {(channel, name) for channel in task.stage.writes}
     is_written: dict[tuple[str, type], bool] = {}
     # Python threads wait for one another: a stage that runs Python is slower in threads than without.

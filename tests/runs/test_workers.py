@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing.connection
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,7 +35,7 @@ def newest_worker_first(receivers: Sequence[Any]) -> list[Any]:
     return list(_wait(list(receivers)[-1:]))
 
 
-_wait = workers.wait
+_wait = multiprocessing.connection.wait
 
 
 def test_bytes_are_equal_for_any_number_of_processes(
@@ -145,11 +146,11 @@ def _pretend(monkeypatch: pytest.MonkeyPatch, sent: list[int]) -> None:
     """Replace the processes by objects that have a result at once."""
 
     class Pretended:
-        def __init__(self, run: PieceRun) -> None:
+        def __init__(self, _run: PieceRun) -> None:
             self.piece: int | None = None
             self.receiver = self
 
-        def send(self, number: int, piece: Piece) -> None:
+        def send(self, number: int, _piece: Piece) -> None:
             self.piece = number
             sent.append(number)
 

@@ -75,7 +75,6 @@ EDGES, STOCK = CORNERS = ("edges", "stock")
 # Shorter periods cost more searches of whole images; longer ones keep fewer processes busy.
 _RESET_PERIOD_S = 30
 _LONGEST_PERIOD_S = 86_400
-RESETS = Resets(_RESET_PERIOD_S * NS_PER_S)
 
 _GREEN = Color(0.1, 0.9, 0.3, 1.0)
 
@@ -92,7 +91,7 @@ class FrameDetector:
     ----------
     corners : ``edges``, fitted to the edges of the print with the lens distortion, tracked over frames; or
         ``stock``, OpenCV's detector on each frame, refined as the authors do.
-    resets : the instants at which the tracking of a camera begins anew.
+    resets : the instants at which the tracking of a camera begins anew; None: never.
 
     Raises
     ------
@@ -100,7 +99,7 @@ class FrameDetector:
         A frame comes before the rig or, with ``edges``, before the calibration of its camera.
     """
 
-    def __init__(self, corners: str = EDGES, resets: Resets = RESETS) -> None:
+    def __init__(self, corners: str = EDGES, resets: Resets | None = None) -> None:
         self._corners = check_corners(corners)
         self._resets = resets
         self._rig: Rig | None = None
@@ -186,6 +185,8 @@ class FrameDetector:
 
     def _reset(self, message: Message) -> None:
         """Forget the markers of a camera at the first frame after a reset."""
+        if self._resets is None:
+            return
         number = self._resets.number(str(message.camera), message.log_time_ns)
         if self._reset_numbers.get(message.camera) != number:
             self._following.pop(message.camera, None)
@@ -200,7 +201,10 @@ class FrameDetector:
             )
         row_time_s = (camera.row_time_ns or 0) / NS_PER_S
         number = rig.cameras.index(camera) if camera in rig.cameras else 0
-        return MarkerTracker(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera)
+        return MarkerTracker(
+            *(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera),
+            is_thorough=self._resets is not None,
+        )
 
     def _rejections(self, message: Message, rig: Rig) -> Iterator[Event]:
         """Yield events for markers that are seen and cannot be measured."""
@@ -222,7 +226,7 @@ class Detect:
         As :class:`FrameDetector`; or the first frame of a camera has another size than its calibration.
     """
 
-    def __init__(self, corners: str = EDGES, resets: Resets = RESETS) -> None:
+    def __init__(self, corners: str = EDGES, resets: Resets | None = None) -> None:
         self._detector = FrameDetector(corners, resets)
         self._reports = Reports()
 

@@ -29,7 +29,7 @@ from the log to the stages, as long as the stages keep up (``backlog``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -105,14 +105,15 @@ def replay(
 
     workers = LocalWorkers(jobs)
 
-    def make(task: Task, session: Session, name: str) -> Iterable[Message]:
+    def make(task: Task, session: Session, name: str) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
-        if MODEL in task.stage.writes and task.foreign == () and unchecked:
-            check_fits(session, request, task.inputs, unchecked)
-            unchecked.clear()
-        return compute_messages(task, session, name, progress, workers)
+        with one_blas_thread():
+            if MODEL in task.stage.writes and task.foreign == () and unchecked:
+                check_fits(session, request, task.inputs, unchecked)
+                unchecked.clear()
+            yield from compute_messages(task, session, name, progress, workers)
 
-    with open_target(paths, output) as (logs, target), one_blas_thread(), workers:
+    with open_target(paths, output) as (logs, target), workers:
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""

@@ -310,8 +310,6 @@ def skipped_frames(events: Iterable[Event]) -> set[int]:
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     if not view.cameras:
         return view.newest(MARKERS)
-    import scipy.special  # noqa: F401 - before the first frame, which must not wait for it
-
     corners = options.get("corners") or usual_corners(view.cameras, view.lenses)
     skipped = skipped_frames(view.payloads(EVENTS))
     as_live = "as_live" in options and bool(skipped)
@@ -333,9 +331,15 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
             *([EVENTS] if as_live else []),
             IMAGES,
         ),
-        step=lambda run: Detect(corners, resets),
+        step=lambda run: _make_step(corners, resets),
         notes=notes,
     )
+
+
+def _make_step(corners: str, resets: Resets) -> Detect:
+    import scipy.special  # noqa: F401 - before the first frame, which must not wait for it
+
+    return Detect(corners, resets)
 
 
 def _resets(options: Mapping[str, str]) -> Resets:

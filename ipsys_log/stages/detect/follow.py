@@ -67,8 +67,8 @@ class MarkerTracker:
     number : number of the camera in the rig. Cameras search the whole image in different frames.
         Simultaneous thorough searches of all cameras would take too long for live tracking.
     camera : its name, for messages.
-    is_thorough : search the first frame thoroughly, too. After a reset, no earlier frame shows the markers that
-        only this search finds.
+    is_thorough : search the first frame thoroughly, too. After a reset, no earlier frame shows the markers
+        that only this search finds.
     """
 
     def __init__(

@@ -2,10 +2,10 @@
 
     python benchmarks/jobs.py --job-frames 7200
 
-``pipeline.replay`` up to detect takes turns over one log of three cameras of 960 x 540 at 30/s: with one process,
-which has a thread for each camera, with two workers, and with one worker for each core. The processor times
-include those of the workers. The share of the first process limits the speed with many cores: this process
-merges, encodes and writes.
+``pipeline.replay`` up to detect takes turns over one log of three cameras of 960 x 540 at 30/s: with one
+process, which has a thread for each camera, with two workers, and with one worker for each core. Processor
+times include those of the workers. The share of the first process limits the speed with many cores: this
+process merges, encodes and writes.
 
 Latency: single frames of 1920 x 1080 in one thread, from the compressed image to the markers, in the first
 frame after a reset and in all other frames.

@@ -2,9 +2,9 @@
 
     python benchmarks/startup.py
 
-``ipsys --help``, ``ipsys info`` on a log of 1 GB, ``ipsys replay`` of a log with all results, and the error of a
-missing log, compared with an interpreter that does nothing. The commands take turns. The time is wall time of
-the whole process, with the files in the page cache.
+``ipsys --help``, ``ipsys info`` on a log of 1 GB, ``ipsys camera-frame`` on a log with all results, and the
+error of a missing log, compared with an interpreter that does nothing. The commands take turns. The time is
+wall time of the whole process, with the files in the page cache.
 """
 
 from __future__ import annotations

@@ -297,6 +297,10 @@ class Session:
 
     def runs(self) -> list[Run]:
         """Return the records of the stages, oldest first: in the order of the given logs, then by number."""
+        return list(self._runs)
+
+    @cached_property
+    def _runs(self) -> list[Run]:
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
     def _runs_in(self, reader: LogReader, items: PartCounter) -> list[Run]:

@@ -40,12 +40,15 @@ __all__ = [
     "FrameResult",
     "Piece",
     "PieceFrames",
+    "PiecePlan",
     "PieceResult",
     "PieceRun",
     "compute_piece",
     "compute_piece_of_logs",
+    "given_settings",
     "merge_pieces",
     "order_frames",
+    "plan_pieces",
     "split_frames",
 ]
 
@@ -123,8 +126,25 @@ class PieceFrames(NamedTuple):
     places: NDArray[np.int64]
 
 
+class PiecePlan(NamedTuple):
+    """The division of a run into pieces, in the order of their first frames."""
+
+    run: PieceRun
+    frames: PieceFrames
+    pieces: list[Piece]
+
+
+def plan_pieces(task: Task, session: Session) -> PiecePlan | None:
+    """Divide the run of a task into pieces; None if its stage, or a video, needs all earlier frames."""
+    frames = order_frames(session, task.topics) if task.stage.pieces is not None else None
+    if frames is None:
+        return None
+    run = PieceRun.of_task(task, session)
+    return PiecePlan(run, frames, split_frames(frames, run.load().resets))
+
+
 def order_frames(session: Session, topics: Iterable[str]) -> PieceFrames | None:
-    """Return the frames of some topics; None if one is a video, whose frames need the frames before them."""
+    """Return the frames of some topics; None if there are none, or if one topic is a video."""
     wanted = set(topics)
     cameras = [camera for camera, topic in sorted(session.images.items()) if topic in wanted]
     images = [session.images[camera] for camera in cameras]
@@ -176,13 +196,20 @@ def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:
     return PieceResult(frames)
 
 
+def given_settings(
+    session: Session, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
+) -> Iterator[Message]:
+    """Yield the rig and the intrinsics that replace those of the logs, from the start on."""
+    start_ns = session.start_ns
+    if rig is not None:
+        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
+    for camera, lens in lenses.items():
+        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
+
+
 def _messages(session: Session, run: PieceRun, piece: Piece) -> Iterator[Message]:
     """Yield the rig and the intrinsics that hold before a piece, and then the messages of the piece."""
-    if run.rig is not None:
-        yield Message(RIG_TOPIC, session.start_ns, session.start_ns, run.rig)
-    if piece.camera in run.lenses:
-        topic = calibration_topic(piece.camera)
-        yield Message(topic, session.start_ns, session.start_ns, run.lenses[piece.camera], piece.camera)
+    yield from given_settings(session, run.rig, run.lenses)
     of_camera = session.calibrations.get(piece.camera)
     settings = [topic for topic in run.topics if topic in (of_camera, *session.topics(RIG))]
     for topic in settings:
@@ -195,8 +222,7 @@ def _messages(session: Session, run: PieceRun, piece: Piece) -> Iterator[Message
 
 def merge_pieces(
     wired: WiredStage,
-    run: PieceRun,
-    frames: PieceFrames,
+    plan: PiecePlan,
     results: Iterable[PieceResult],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[Message]:
@@ -205,14 +231,14 @@ def merge_pieces(
     Parameters
     ----------
     wired : gives the topics of the payloads; its step is not used.
-    results : of the pieces of :func:`split_frames`, in the same order.
+    results : of the pieces of the plan, in their order.
 
     Raises
     ------
     IpsysError
         The first error of the pieces, in log order.
     """
-    reports = run.load().reports()
+    frames, reports = plan.frames, plan.run.load().reports()
     pieces = iter(results)
     waiting: list[deque[FrameResult]] = [deque() for _ in frames.cameras]
     errors: list[IpsysError | None] = [None for _ in frames.cameras]

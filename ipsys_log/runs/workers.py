@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.interrupts import undivided
-from ipsys_log.runs.pieces import Piece, PieceResult, PieceRun
+from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
 __all__ = ["LocalWorkers", "available_cores", "serve"]
 
@@ -119,7 +119,7 @@ class LocalWorkers:
     """
 
     def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
+        self.jobs = jobs
         self._workers: list[_Worker] = []
 
     def __enter__(self) -> LocalWorkers:
@@ -130,12 +130,12 @@ class LocalWorkers:
     ) -> None:
         self._stop()
 
-    def are_worth(self, frames: int, pieces: int) -> bool:
-        """Return whether workers compute a number of frames and pieces faster than this process."""
-        return self._jobs > 1 and frames >= _MIN_FRAMES and pieces >= _MIN_PIECES
+    def are_worth(self, plan: PiecePlan) -> bool:
+        """Return whether workers compute a run faster than this process."""
+        return self.jobs > 1 and len(plan.frames.times_ns) >= _MIN_FRAMES and len(plan.pieces) >= _MIN_PIECES
 
-    def compute(self, run: PieceRun, pieces: Sequence[Piece]) -> Iterator[PieceResult]:
-        """Yield the results of pieces in their order; the workers may finish them in another order.
+    def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
+        """Yield the results of the pieces in their order; the workers may finish them in another order.
 
         Raises
         ------
@@ -144,13 +144,14 @@ class LocalWorkers:
         Exception
             An error in a worker, with a note of its traceback.
         """
-        limit = _AHEAD * self._jobs + len({piece.camera for piece in pieces})
+        pieces = plan.pieces
+        limit = _AHEAD * self.jobs + len(plan.frames.cameras)
         finished: dict[int, PieceResult] = {}
         sent = 0
         try:
-            for _ in range(min(self._jobs, len(pieces))):
+            for _ in range(min(self.jobs, len(pieces))):
                 with undivided():
-                    self._workers.append(_Worker(run))
+                    self._workers.append(_Worker(plan.run))
             for number in range(len(pieces)):
                 while number not in finished:
                     for worker in self._workers:

@@ -23,11 +23,11 @@ from ipsys_log.runs.graph import Task, plan_stage, writer_of
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.pieces import (
     PieceFrames,
-    PieceRun,
     compute_piece,
     compute_piece_of_logs,
     merge_pieces,
     order_frames,
+    plan_pieces,
     split_frames,
 )
 from ipsys_log.runs.stream import wire
@@ -114,25 +114,22 @@ def test_pieces_in_any_order_give_the_bytes_of_one_process(corners: str, part: P
     with Session([part]) as session:
         task = _task(session, corners=corners)
         alone = _rows(compute_messages(task, session, "edges", lambda *_: None))
-        run = PieceRun.of_task(task, session)
-        frames = order_frames(session, task.topics)
-        assert frames is not None
-        pieces = split_frames(frames, Resets(NS_PER_S))
+        plan = plan_pieces(task, session)
+        assert plan is not None
         assert task.step is not None
         wired = wire(task.stage, "edges", {}, task.step("edges"))
-    assert len(pieces) > 4
+    assert len(plan.pieces) > 4
     # As workers do it: pickled, each with the log opened anew, and the last piece first.
-    sent = pickle.loads(pickle.dumps((run, pieces[::-1])))
+    sent = pickle.loads(pickle.dumps((plan.run, plan.pieces[::-1])))
     results = [pickle.loads(pickle.dumps(compute_piece_of_logs(sent[0], piece))) for piece in sent[1]]
-    assert _rows(merge_pieces(wired, run, frames, results[::-1])) == alone
+    assert _rows(merge_pieces(wired, plan, results[::-1])) == alone
 
 
 def test_piece_does_not_depend_on_the_frames_before_it(part: Path, tmp_path: Path) -> None:
     with Session([part]) as session:
-        run = PieceRun.of_task(_task(session), session)
-        frames = order_frames(session, run.topics)
-        assert frames is not None
-        piece = split_frames(frames, Resets(NS_PER_S))[-1]
+        plan = plan_pieces(_task(session), session)
+        assert plan is not None
+        run, piece = plan.run, plan.pieces[-1]
         topics = ["/rig", *session.calibrations.values(), *session.images.values()]
         kept = [m for m in session.messages(topics) if m.camera is None or m.log_time_ns >= piece.start_ns]
         lenses = list(session.messages(session.calibrations.values()))
@@ -148,16 +145,16 @@ def test_piece_does_not_depend_on_the_frames_before_it(part: Path, tmp_path: Pat
 def test_error_of_a_piece_comes_at_its_frame(part: Path) -> None:
     with Session([part]) as session:
         task = _task(session)
-        run = PieceRun.of_task(task, session)
-        without = replace(run, topics=tuple(t for t in run.topics if not t.startswith("/cameras/white/cal")))
-        frames = order_frames(session, task.topics)
-        assert frames is not None
-        pieces = split_frames(frames, Resets(NS_PER_S))
-        results = [compute_piece(session, without, piece) for piece in pieces]
+        plan = plan_pieces(task, session)
+        assert plan is not None
+        topics = tuple(topic for topic in task.topics if topic != session.calibrations["white"])
+        results = [compute_piece(session, replace(plan.run, topics=topics), piece) for piece in plan.pieces]
         assert task.step is not None
         wired = wire(task.stage, "edges", {}, task.step("edges"))
-    assert {piece.camera for piece, result in zip(pieces, results, strict=True) if result.error} == {"white"}
-    messages = merge_pieces(wired, run, frames, results)
+    assert {piece.camera for piece, result in zip(plan.pieces, results, strict=True) if result.error} == {
+        "white"
+    }
+    messages = merge_pieces(wired, plan, results)
     with pytest.raises(IpsysError, match="camera white has no calibration"):
         list(messages)
 

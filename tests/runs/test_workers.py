@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import workers
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.pieces import Piece, PieceRun
+from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 from ipsys_log.runs.workers import LocalWorkers
 from tests.conftest import Ipsys
 
@@ -106,7 +107,7 @@ def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_bug_in_a_worker_keeps_its_traceback(lab_log: Path) -> None:
     run = _run(lab_log)
     with LocalWorkers(2) as local, pytest.raises(KeyError) as bug:
-        list(local.compute(run, [Piece("nobody", 0, 1)]))
+        list(local.compute(_plan(run, Piece("nobody", 0, 1))))
     assert "in compute_piece" in "".join(bug.value.__notes__)
 
 
@@ -114,7 +115,7 @@ def test_log_that_disappears_is_an_error_of_one_line(lab: Path) -> None:
     run = _run(lab)
     lab.unlink()
     with LocalWorkers(2) as local, pytest.raises(IpsysError, match=r"lab\.mcap"):
-        list(local.compute(run, [Piece("red", 0, 1)]))
+        list(local.compute(_plan(run, Piece("red", 0, 1))))
 
 
 def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
@@ -129,13 +130,18 @@ def _run(log: Path) -> PieceRun:
     return PieceRun(paths=(log,), stage="detect", parameters={"corners": "stock"}, topics=(), lenses={})
 
 
+def _plan(run: PieceRun, *pieces: Piece) -> PiecePlan:
+    none = np.empty(0, np.int64)
+    return PiecePlan(run, PieceFrames(("red",), none, none), list(pieces))
+
+
 def test_results_wait_for_at_most_some_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """While the first piece is not finished, only a limited number of later ones is computed."""
     sent: list[int] = []
     _pretend(monkeypatch, sent)
     monkeypatch.setattr(workers, "wait", lambda receivers: list(receivers)[-1:])
     with LocalWorkers(2) as local:
-        results = local.compute(_run(Path("log.mcap")), [Piece("red", n, n + 1) for n in range(100)])
+        results = local.compute(_plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(100))))
         next(results)
         assert len(sent) == 5
         assert sum(1 for _ in results) == 99

@@ -21,6 +21,7 @@ __all__ = ["BENCHMARKS", "Report", "command", "parser_of", "run_all"]
 BENCHMARKS = {
     "detection": "from a log to corners, beside a plain loop, a decoder and AprilTag",
     "replay": "the whole chain beside detection alone; memory over ten minutes",
+    "jobs": "detection with worker processes, beside one process; latency after a reset",
     "live": "recording and tracking of streams on loopback: drops, processor time, latency",
     "streams": "from a frame to ten clients of UDP, VRPN, ROS 2 and Foxglove",
     "log_write": "recording and small messages, beside mcap and foxglove-sdk",

@@ -140,6 +140,7 @@ def replay(
     parameters: Mapping[str, str] | None = None,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
+    jobs: int | None = None,
 ) -> ReplayResult:
     """Compute the results that logs lack, and append them to the last log or write them to ``output``.
 
@@ -154,6 +155,7 @@ def replay(
     parameters : options of further stages, by name.
     progress : called with the stage, the number of messages done, and the total number of messages.
     say : called with the runs that are out of date and computed again.
+    jobs : number of processes that detect markers in a long log; None: one for each core.
 
     Raises
     ------
@@ -162,6 +164,7 @@ def replay(
     """
     from ipsys_log import pipeline
     from ipsys_log.rig.file import load_rig
+    from ipsys_log.runs.workers import available_cores
 
     request = Request(
         models=tuple(models),
@@ -179,7 +182,8 @@ def replay(
     )
     logs = [Path(path) for path in paths]
     target = None if output is None else Path(output)
-    outcomes = pipeline.replay(logs, request, until, target, progress, say)
+    count = available_cores() if jobs is None else jobs
+    outcomes = pipeline.replay(logs, request, until, target, progress, say, count)
     written = [target] if target is not None and target.exists() else []
     with Session([*logs, *written]) as session:
         return ReplayResult(tuple(outcomes), _evaluations(session, outcomes))

@@ -29,7 +29,7 @@ from the log to the stages, as long as the stages keep up (``backlog``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -60,6 +60,7 @@ from ipsys_log.runs.output import open_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import WiredStage, in_threads, run
+from ipsys_log.runs.workers import LocalWorkers
 from ipsys_log.sinks.sink import Consumer, Consumers, Sink
 
 __all__ = ["live", "measure", "record", "replay"]
@@ -73,6 +74,7 @@ def replay(
     output: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
+    jobs: int = 1,
 ) -> list[Outcome]:
     """Compute the results that a log lacks, up to a stage, and append them; or write them to a new log.
 
@@ -83,6 +85,7 @@ def replay(
     paths : the logs, read as one; results go to the last of them, or to ``output``.
     until : the last stage; None: all stages. With fuse, models are also evaluated if points are held out.
     say : called before the computation, with the runs that are out of date and the reason.
+    jobs : number of processes that detect markers in a long log; the bytes are the same with any number.
 
     Returns
     -------
@@ -100,14 +103,17 @@ def replay(
     outcomes: list[Outcome] = []
     unchecked = list(models) if len(models) > 1 else []
 
-    def make(task: Task, session: Session, name: str) -> Iterable[Message]:
-        """Compute a run. Before the first fit, check that all models can be fitted."""
-        if MODEL in task.stage.writes and task.foreign == () and unchecked:
-            check_fits(session, request, task.inputs, unchecked)
-            unchecked.clear()
-        return compute_messages(task, session, name, progress)
+    workers = LocalWorkers(jobs)
 
-    with open_target(paths, output) as (logs, target), one_blas_thread():
+    def make(task: Task, session: Session, name: str) -> Iterator[Message]:
+        """Compute a run. Before the first fit, check that all models can be fitted."""
+        with one_blas_thread():
+            if MODEL in task.stage.writes and task.foreign == () and unchecked:
+                check_fits(session, request, task.inputs, unchecked)
+                unchecked.clear()
+            yield from compute_messages(task, session, name, progress, workers)
+
+    with open_target(paths, output) as (logs, target), workers:
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""

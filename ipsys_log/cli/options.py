@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import os
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -34,6 +35,7 @@ __all__ = [
     "annotate",
     "build_option",
     "cameras_of",
+    "check_present",
     "load_calibrations",
     "load_lab",
     "load_matching_rig",
@@ -69,6 +71,21 @@ _OTHER_FILES = (
     *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
     *(".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp"),
 )
+
+
+def check_present(logs: Sequence[Path]) -> None:
+    """Check that logs exist, before the imports of the pipeline, which take longer.
+
+    Raises
+    ------
+    LogError
+        A log is missing.
+    """
+    for log in logs:
+        if not log.exists():
+            from ipsys_log.log.byte_source import open_for_reading
+
+            os.close(open_for_reading(log))
 
 
 def _named_as_log(path: Path | None) -> Path | None:
@@ -152,12 +169,14 @@ def load_calibrations(
     IpsysError
         An option has another form, or a file contains no calibration.
     """
+    if not options:
+        return {}
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
 
     lenses: dict[str, CameraCalibration] = {}
-    for option in options or []:
+    for option in options:
         camera, equals, name = option.partition("=")
         if equals:
             calibrations = {camera: read_intrinsics(Path(name), camera)}

@@ -21,6 +21,7 @@ from ipsys_log.cli.options import (
     RigFile,
     annotate,
     cameras_of,
+    check_present,
     load_calibrations,
     load_matching_rig,
     log_option,
@@ -30,7 +31,9 @@ from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
+    from ipsys_log.messages import CameraCalibration
     from ipsys_log.report.accuracy import Accuracy
+    from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
 __all__ = ["MORE", "add_commands", "build_command", "derive", "options_until"]
@@ -53,6 +56,19 @@ _SHARED: dict[str, tuple[Any, Any]] = {
     ),
     "output": (
         Annotated[_Path, log_option(help="Write the results to a new log, not to the last LOG.")],
+        None,
+    ),
+    "jobs": (
+        Annotated[
+            Optional[int],  # noqa: UP045
+            typer.Option(
+                "--jobs",
+                metavar="N",
+                min=1,
+                help="Number of processes for detection in long logs (default: the number of cores). The "
+                "results are the same with any number.",
+            ),
+        ],
         None,
     ),
     "as_json": (AsJson, False),
@@ -83,7 +99,7 @@ _PRINTS: dict[str, tuple[Any, Any]] = {
 # The order of options in the help. Parameters that are not in it come after these.
 _ORDER = (
     *("logs", "model", "model_from", "train", "seed", "rig", "calibration", "corners", "method"),
-    *("run", "output", "as_live", "skip_ambiguous"),
+    *("run", "output", "as_live", "skip_ambiguous", "jobs"),
 )
 
 MORE = "\n\nThe command runs missing stages first."
@@ -130,44 +146,56 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
     return command
 
 
-def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
-    """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
+def _request(
+    logs: list[Path],
+    rig: Path | None,
+    run: str | None,
+    calibration: list[str] | None = None,
+    model: list[str] | None = None,
+    lenses: Mapping[str, CameraCalibration] | None = None,
+    **given: Any,
+) -> Request:
+    """Return the options of a command as a request; options of further stages are its parameters."""
     from ipsys_log.rig.file import check_name
     from ipsys_log.runs.options import Request
 
-    rig, run = given.pop("rig"), given.pop("run")
-    models, calibration = given.pop("model", None) or (), given.pop("calibration", None)
-    lenses = given.pop("lenses", None) or {}
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
     further = {name: given.pop(name) for name in [*given] if name not in known}
-    return {
-        "models": models,
-        "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
-        "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
-        "run": check_name(run, "--run") if run else None,
-        "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
+    return Request(
+        models=tuple(model or ()),
+        rig=load_matching_rig(rig, lambda: cameras_of(logs)),
+        lenses={**load_calibrations(calibration, lambda: cameras_of(logs)), **(lenses or {})},
+        run=check_name(run, "--run") if run else None,
+        parameters={name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,
-    }
+    )
 
 
 @contextmanager
 def derive(
-    logs: list[Path], until: str | None, output: Path | None = None, kept: bool = True, **given: Any
+    logs: list[Path],
+    until: str | None,
+    output: Path | None = None,
+    kept: bool = True,
+    jobs: int | None = None,
+    **given: Any,
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
     The texts do not name a log that is not ``kept``. ``lenses`` are intrinsics by camera, in addition to the
     files of ``calibration``.
     """
-    from ipsys_log import api
+    check_present(logs)
+    from ipsys_log import pipeline
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.accuracy import read_accuracy
+    from ipsys_log.runs.workers import available_cores
 
-    options = _options(logs, **given)
+    request = _request(logs, **given)
+    processes = available_cores() if jobs is None else jobs
     with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
-        replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
-    outcomes = list(replayed.outcomes)
+        outcomes = pipeline.replay(logs, request, until, output, progress, say, processes)
     # A new log exists only if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
@@ -211,14 +239,8 @@ def _derive(
     details: bool = False,
     **given: Any,
 ) -> None:
-    from ipsys_log.extras import check_installed
-    from ipsys_log.report.files import check_figure_file, check_folder
-
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
-    if plots is not None:
-        check_installed("--plots needs", "matplotlib")
-        check_folder(plots, "--plots")
+    if plot is not None or plots is not None:
+        _check_figures(logs, plot, plots)
     with derive(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)
     if as_json:
@@ -227,6 +249,17 @@ def _derive(
         _print(accuracies, details)
     for line in drawn:
         remarks.print(line)
+
+
+def _check_figures(logs: list[Path], plot: Path | None, plots: Path | None) -> None:
+    from ipsys_log.extras import check_installed
+    from ipsys_log.report.files import check_figure_file, check_folder
+
+    if plot is not None:
+        check_figure_file(plot, "--plot", logs)
+    if plots is not None:
+        check_installed("--plots needs", "matplotlib")
+        check_folder(plots, "--plots")
 
 
 def _draw(

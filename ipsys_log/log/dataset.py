@@ -132,6 +132,21 @@ class Session:
         *_, message = reader.messages([topic], start_ns=int(last_ns))
         return message.log_time_ns, message.publish_time_ns
 
+    def order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the log times in ns and the places in ``topics`` of messages, (N,) each, in log order."""
+        times_ns, places = zip(*(reader.order(topics) for reader in self.readers), strict=True)
+        order = np.argsort(joined_ns := np.concatenate(times_ns), kind="stable")
+        return joined_ns[order], np.concatenate(places)[order]
+
+    def latest(self, topic: str, before_ns: int) -> Message | None:
+        """Return the last message of a topic before a log time in ns; the first one if there is none."""
+        before = [times[times < before_ns] for reader in self.readers if len(times := _times(reader, topic))]
+        last_ns = max((int(times[-1]) for times in before if len(times)), default=None)
+        if last_ns is None:
+            return next(self.messages([topic]), None)
+        *_, message = self.messages([topic], last_ns, last_ns + 1)
+        return message
+
     def run_names(self) -> set[str]:
         """Return the names of all runs that have a channel, complete or not."""
         return {run for reader in self.readers for topic in reader.channels if (run := run_of_topic(topic))}
@@ -282,6 +297,10 @@ class Session:
 
     def runs(self) -> list[Run]:
         """Return the records of the stages, oldest first: in the order of the given logs, then by number."""
+        return list(self._runs)
+
+    @cached_property
+    def _runs(self) -> list[Run]:
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
     def _runs_in(self, reader: LogReader, items: PartCounter) -> list[Run]:
@@ -361,7 +380,7 @@ class Session:
         """Return the topic by camera; if a camera has topics of several types, that of the first type."""
         cameras: dict[str, str] = {}
         for payload in channel.payloads:
-            topics = [topic for topic in self.topics(channel) if self._has_payload(topic, payload)]
+            topics = [topic for topic in self.topics(channel) if self.has_payload(topic, payload)]
             names = [camera_of_topic(topic) or parse_foreign_camera(topic) for topic in topics]
             topic_of: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
@@ -376,7 +395,8 @@ class Session:
             cameras = topic_of | cameras
         return cameras
 
-    def _has_payload(self, topic: str, payload: type) -> bool:
+    def has_payload(self, topic: str, payload: type) -> bool:
+        """Return whether a topic has messages of a type, in one of the logs."""
         stored = (reader.channels[topic] for reader in self.readers if topic in reader.channels)
         return any(
             channel.schema is not None and payload_type(channel.schema.name) is payload for channel in stored

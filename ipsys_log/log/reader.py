@@ -4,7 +4,7 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
     RangeCache,
+    Rows,
     chunk_entries,
     open_chunk,
     open_unchunked,
@@ -204,6 +205,31 @@ class LogReader:
         times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
         return np.sort(times).astype(np.int64)
 
+    def order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the log times in ns and the places in ``topics`` of messages, (N,) each, in log order.
+
+        They are read from the indexes alone.
+        """
+        places = {key: topics.index(topic) for key, topic in self._topics_by_id(topics).items()}
+        # Rows of log time, offset of the chunk, offset in the chunk, and place. Unchunked messages have their
+        # offset in the file, as in `in_log_order`.
+        parts = [
+            _positions(rows, rows[:, 1], places[key])
+            for key, rows in to_rows(self._contents.unchunked).items()
+            if key in places
+        ]
+        for chunk in self._contents.chunks:
+            if not chunk.index_offsets or not places.keys().isdisjoint(chunk.index_offsets):
+                entries = chunk_entries(self._view, chunk, self._cache.searched, set(places))
+                parts += [
+                    _positions(rows, chunk.offset, places[key])
+                    for key, rows in entries.items()
+                    if key in places
+                ]
+        rows = np.concatenate(parts) if parts else np.empty((0, 4), np.uint64)
+        ordered = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))].astype(np.int64)
+        return ordered[:, 0], ordered[:, 3]
+
     def channel_hash(self, topic: str) -> str:
         """Return the hash over times and payloads of a channel in log order, in hexadecimal.
 
@@ -255,6 +281,17 @@ class LogReader:
         for topic in sorted(self.conflicts.keys() & wanted):
             raise LogError(f"{self.path}: {self.conflicts[topic]}: the topic cannot be read as one channel")
         return {key: c.topic for key, c in self._contents.channels.items() if c.topic in wanted}
+
+
+def _positions(rows: Rows, chunk_offsets: Rows | int, place: int) -> Rows:
+    positions = np.empty((len(rows), 4), np.uint64)
+    positions[:, 0], positions[:, 1], positions[:, 2], positions[:, 3] = (
+        rows[:, 0],
+        chunk_offsets,
+        rows[:, 1],
+        place,
+    )
+    return positions
 
 
 def stored_hashes(view: LogBytes, contents: Contents) -> dict[str, ChannelHash]:

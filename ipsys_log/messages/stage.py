@@ -8,12 +8,15 @@ from typing import Any, NamedTuple, Protocol
 
 from ipsys_log.messages.channels import MODEL, Channel
 from ipsys_log.messages.message import Message
+from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.rig import CameraCalibration, Rig
 
-__all__ = ["Plan", "Progress", "Stage", "StageView", "Step", "Timed", "model_read"]
+__all__ = ["Pieces", "Plan", "Progress", "Reports", "Stage", "StageView", "Step", "Timed", "model_read"]
 
 # A step turns a message into payloads; it is called with the messages in log order.
 Step = Callable[[Message], Iterable[Any]]
+# Turns the payloads of a frame of a camera into those that go into the log; called in log order.
+Reports = Callable[[str | None, Iterable[Any]], Iterable[Any]]
 # Called with the number of steps done, and the number of all steps.
 Progress = Callable[[int, int], None]
 
@@ -62,6 +65,21 @@ class Timed(NamedTuple):
     payload: Any
 
 
+class Pieces(NamedTuple):
+    """The division of the work of a causal stage: frames of a camera between two resets are one piece.
+
+    Attributes
+    ----------
+    resets : the bounds of the pieces.
+    step : makes the step for one piece; its first messages are the rig and the intrinsics.
+    reports : makes the function that sees the payloads of all pieces, in log order.
+    """
+
+    resets: Resets
+    step: Callable[[], Step]
+    reports: Callable[[], Reports]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """The plan of one run of a stage: everything on which its result depends.
@@ -106,6 +124,7 @@ class Stage:
     on_demand : it runs only if the user names it, or a stage that needs it.
     stateless : the channels, by the parameters of a run and its view, of which each message follows from one
         input message and from lasting channels such as the rig. A part of a log can repeat them.
+    pieces : the pieces of a run with these parameters, if its frames can be processed in pieces.
     """
 
     name: str
@@ -121,6 +140,7 @@ class Stage:
     of_model: bool = False
     on_demand: bool = False
     stateless: Callable[[Mapping[str, str], StageView], Collection[Channel]] = lambda parameters, view: ()
+    pieces: Callable[[Mapping[str, str]], Pieces] | None = None
 
     def __repr__(self) -> str:
         return f"<stage {self.name}>"

@@ -12,18 +12,14 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
-    RIG_TOPIC,
-    CameraCalibration,
     ChannelWritten,
     CompressedVideo,
     Event,
     Lens,
     Message,
     Model,
-    Rig,
     Run,
     SkippedVideo,
-    calibration_topic,
 )
 from ipsys_log.messages.channels import EVENTS, MODEL, RIG, Channel, channel_of
 from ipsys_log.messages.stage import Stage, Timed
@@ -31,10 +27,12 @@ from ipsys_log.rig.file import hide_passwords
 from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
+from ipsys_log.runs.pieces import given_settings, merge_pieces, plan_pieces
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.states import Recorded, recorded_stages
-from ipsys_log.runs.stream import in_threads, run, wire
+from ipsys_log.runs.stream import WiredStage, in_threads, run, wire
+from ipsys_log.runs.workers import LocalWorkers
 from ipsys_log.stages.detect import skipped_frames
 from ipsys_log.units import format_time
 
@@ -284,7 +282,7 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     The first rig and intrinsics of the log are valid from its start, even if they were recorded a little
     later. Settings given by the user come first.
     """
-    yield from _settings(session, task.lenses, task.rig)
+    yield from given_settings(session, task.rig, task.lenses)
     for topic in sorted(task.topics):
         if topic in (*session.topics(RIG), *session.calibrations.values()):
             yield next(session.messages([topic]))
@@ -302,34 +300,41 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
         progress(task.stage.name, done, total)
 
 
-def _settings(
-    session: Session, lenses: Mapping[str, CameraCalibration], rig: Rig | None
+def compute_messages(
+    task: Task, session: Session, name: str, progress: Progress, workers: LocalWorkers | None = None
 ) -> Iterator[Message]:
-    start_ns = session.start_ns
-    if rig is not None:
-        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
-    for camera, lens in lenses.items():
-        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
+    """Yield the messages of a task's run: of its causal stage, or those computed from the whole log.
 
-
-def compute_messages(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
-    """Yield the messages of a task's run: of its causal stage, or those computed from the whole log."""
+    ``workers`` compute a long run in pieces.
+    """
     if task.step is None:
-        assert task.compute is not None
-        computed = task.compute(partial(progress, task.stage.name))
-        # One payload, such as a model, speaks of the whole log: it belongs to the last message.
-        rows = computed if isinstance(computed, list) else [Timed(session.last(task.topics)[0], computed)]
-        for log_time_ns, payload in rows:
-            topic = task.stage.channel_for(type(payload)).topic_of(name)
-            yield Message(topic, log_time_ns, payload.timestamp, payload)
+        yield from _compute_whole(task, session, name, progress)
         return
     wired = wire(task.stage, name, task.inputs, task.step(name))
-    written = {(channel, name) for channel in task.stage.writes}
+    plan = plan_pieces(task, session) if workers is not None and workers.jobs > 1 else None
+    if workers is not None and plan is not None and workers.are_worth(plan):
+        yield from merge_pieces(wired, plan, workers.compute(plan), partial(progress, task.stage.name))
+    else:
+        yield from _stream(task, session, wired, progress)
+
+
+def _compute_whole(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
+    assert task.compute is not None
+    computed = task.compute(partial(progress, task.stage.name))
+    # One payload, such as a model, speaks of the whole log: it belongs to the last message.
+    rows = computed if isinstance(computed, list) else [Timed(session.last(task.topics)[0], computed)]
+    for log_time_ns, payload in rows:
+        topic = task.stage.channel_for(type(payload)).topic_of(name)
+        yield Message(topic, log_time_ns, payload.timestamp, payload)
+
+
+def _stream(task: Task, session: Session, wired: WiredStage, progress: Progress) -> Iterator[Message]:
+    """Yield the messages that a causal stage makes from the messages of the log, in this process."""
+    written = {(channel, wired.run) for channel in task.stage.writes}
     is_written: dict[tuple[str, type], bool] = {}
     # Python threads wait for one another: a stage that runs Python is slower in threads than without.
-    for message in run(
-        inputs(session, task, progress), [wired], in_threads if task.stage.in_threads else map
-    ):
+    mapped = in_threads if task.stage.in_threads else map
+    for message in run(inputs(session, task, progress), [wired], mapped):
         key = message.topic, type(message.payload)
         if key not in is_written:
             is_written[key] = (channel_of(*key), run_of_topic(message.topic)) in written

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any
 
 from ipsys_log.geometry.lenses import same_intrinsics
@@ -21,7 +20,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import Outcome, read_channels
 from ipsys_log.runs.select import fitted_in
 from ipsys_log.runs.view import LogView
-from ipsys_log.stages import ENTRIES, fit
+from ipsys_log.stages import ENTRIES, fit, load_stage
 
 __all__ = [
     "STAGES",
@@ -40,9 +39,7 @@ __all__ = [
     "writes",
 ]
 
-STAGES: tuple[Stage, ...] = tuple(
-    import_module(f"ipsys_log.stages.{entry.module}").STAGE for entry in ENTRIES
-)
+STAGES: tuple[Stage, ...] = tuple(load_stage(entry.name) for entry in ENTRIES)
 VERSIONS: dict[str, int] = {name: number for stage in STAGES for name, number in stage.versions.items()}
 
 

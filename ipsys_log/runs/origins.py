@@ -20,17 +20,22 @@ __all__ = [
     "origin_of_run",
     "own_inputs",
     "present_inputs",
+    "shift_of_run",
     "was_complete",
 ]
 
 
 class Origin(NamedTuple):
-    """A channel before a cut, or before a merge: the number of its messages, their hash, and its logs."""
+    """A channel before a cut, or before a merge: the number of its messages, their hash, and its logs.
+
+    ``shift_ns`` is the time that merges have added to its log times since then.
+    """
 
     messages: int
     hash: str
     logs: tuple[str, ...]
     is_merged: bool
+    shift_ns: int
 
     def text(self, run: str) -> str:
         """Return the state of a run with such a channel."""
@@ -51,12 +56,14 @@ def _origins(session: Session, topic: str) -> list[Origin]:
     if not cuts:
         return []
     states, origins = {(session.count(topic), session.hash(topic))}, []
+    shift_ns = 0
     for cut in reversed(cuts):
         before = next((one for one in cut.channels if one.topic == topic and not one.shared), None)
         if before is not None and (before.kept, before.kept_hash or "") in states:
             states.add((before.messages, before.hash))
             is_merged = isinstance(cut, MergedLog)
-            origins.append(Origin(before.messages, before.hash, cut.logs, is_merged))
+            shift_ns += cut.offset_ns if isinstance(cut, MergedLog) else 0
+            origins.append(Origin(before.messages, before.hash, cut.logs, is_merged, shift_ns))
     return origins
 
 
@@ -98,6 +105,12 @@ def origin_of_run(session: Session, run: Run) -> Origin | None:
                 return None
             origins.append(origin)
     return min(origins, key=lambda one: one.is_merged, default=None)
+
+
+def shift_of_run(session: Session, run: Run) -> int:
+    """Return the time in ns that merges have added to the log times of a run since it was computed."""
+    origins = (_origin_of(session, read) for read in run.inputs if not is_whole(session, read))
+    return next((one.shift_ns for one in origins if one is not None and one.shift_ns), 0)
 
 
 def own_inputs(session: Session, run: Run) -> dict[str, str]:

@@ -64,6 +64,8 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 def fingerprint() -> dict[str, str]:
     """Return the environment on which the digits of a result can depend: versions and BLAS kernel."""
+    import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be named
+
     kernels = {
         f"{library.get('internal_api')} {library.get('version')} {library.get('architecture', '')}".strip()
         for library in threadpoolctl.threadpool_info()

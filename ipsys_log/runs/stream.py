@@ -17,7 +17,7 @@ from ipsys_log.messages import FrameTransforms, Message
 from ipsys_log.messages.channels import Channel, channel_of
 from ipsys_log.messages.stage import Stage, Step
 
-__all__ = ["Route", "WiredStage", "in_threads", "run", "wire"]
+__all__ = ["Route", "WiredStage", "derive", "in_threads", "run", "wire"]
 
 Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
@@ -79,12 +79,17 @@ def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator
 
     for message, payloads in (map if wired.stage.per_camera else builtins.map)(work, source):
         yield message
-        for payload in payloads:
-            # Each transform has its own time; drawings on an image have the time of the image.
-            stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
-            time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
-            topic = wired.topic_of(payload, message.camera)
-            yield Message(topic, message.log_time_ns, time_ns, payload, message.camera)
+        yield from derive(wired, message, payloads)
+
+
+def derive(wired: WiredStage, message: Message, payloads: Iterable[Any]) -> Iterator[Message]:
+    """Yield the messages with the payloads that a stage has made from a message."""
+    for payload in payloads:
+        # Each transform has its own time; drawings on an image have the time of the image.
+        stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
+        time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
+        topic = wired.topic_of(payload, message.camera)
+        yield Message(topic, message.log_time_ns, time_ns, payload, message.camera)
 
 
 def in_threads(function: Callable[[Message], Any], messages: Iterable[Message]) -> Iterator[Any]:

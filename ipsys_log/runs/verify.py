@@ -28,7 +28,7 @@ from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run
+from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run, shift_of_run
 from ipsys_log.runs.part_check import compare_with_cut, repeatable_topics
 from ipsys_log.runs.provenance import replaced_lenses
 from ipsys_log.runs.renaming import rename_frames, rename_topic
@@ -271,10 +271,11 @@ def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stor
     images = {read.topic for read in run.inputs} & set(session.images.values())
     if session.cuts and images:  # a merged log has cameras that the stage did not read
         session = session.with_images(images)
+    # Resets stay at the frames at which they were before a merge has shifted the times.
+    shift_ns = shift_of_run(session, run) if session.cuts else 0
+    options = {**run.parameters, "shift_ns": str(shift_ns)}
     task = (
-        plan_stage(stage, session, run.parameters, input_runs(run), run.rig, replaced_lenses(run))
-        if stage
-        else ""
+        plan_stage(stage, session, options, input_runs(run), run.rig, replaced_lenses(run)) if stage else ""
     )
     if isinstance(task, Task):
         for message in compute_messages(task, session, run.run, progress):

@@ -7,10 +7,14 @@ no stage, so that the help of a command appears at once; :mod:`ipsys_log.runs.gr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["CORNERS", "ENTRIES", "METHOD", "StageEntry", "StageParameter", "parameters_until"]
+if TYPE_CHECKING:
+    from ipsys_log.messages.stage import Stage
+
+__all__ = ["CORNERS", "ENTRIES", "METHOD", "StageEntry", "StageParameter", "load_stage", "parameters_until"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,6 +144,13 @@ ENTRIES: tuple[StageEntry, ...] = (
     StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),
     StageEntry(name="smooth", help="Smooth the tracks by the sightings before and after each pose."),
 )
+
+
+def load_stage(name: str) -> Stage:
+    """Load the row of one stage by its name, without those of the other stages."""
+    entry = next(entry for entry in ENTRIES if entry.name == name)
+    stage: Stage = import_module(f"{__name__}.{entry.module}").STAGE
+    return stage
 
 
 def parameters_until(name: str | None) -> list[StageParameter]:

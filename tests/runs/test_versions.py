@@ -51,7 +51,7 @@ def test_version_is_named_from_the_second_on(monkeypatch: pytest.MonkeyPatch) ->
     assert version_parameters("fit", "rigid+kriging") == {}
     monkeypatch.setitem(VERSIONS, "kriging", 3)
     assert version_parameters("fit", "rigid+kriging") == {"kriging": "3"}
-    assert version_parameters("detect") == {}
+    assert version_parameters("camera-frame") == {}
 
 
 def test_current_runs_are_found_again(ipsys: Ipsys, log: Path) -> None:
@@ -66,9 +66,10 @@ def test_current_runs_are_found_again(ipsys: Ipsys, log: Path) -> None:
 def test_changed_stage_is_done_again_beside_the_old_run(
     changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(VERSIONS, changed, VERSIONS[changed] + 1)
+    before = VERSIONS[changed]
+    monkeypatch.setitem(VERSIONS, changed, before + 1)
     rows = states(ipsys, log)
-    reason = f"out of date: made by {changed} 1, this is {changed} 2"
+    reason = f"out of date: made by {changed} {before}, this is {changed} {before + 1}"
     assert rows["edges", "detect"]["state"] == reason
     assert rows["edges", "camera-frame"]["state"] == "out of date: input edges is"
     assert rows["poly", "fuse"]["state"] == "out of date: input poly is"
@@ -79,8 +80,8 @@ def test_changed_stage_is_done_again_beside_the_old_run(
         frames = sum(session.count(topic) for topic in session.images.values())
     assert f"detect is computed again for {frames} frames; run edges is {reason}" in done.err
     rows = states(ipsys, log)
-    assert rows["edges_2", "detect"]["parameters"][changed] == "2"
-    assert rows["edges_2", "detect"]["stage_version"] == (2 if changed == "detect" else 1)
+    assert rows["edges_2", "detect"]["parameters"][changed] == str(before + 1)
+    assert rows["edges_2", "detect"]["stage_version"] == VERSIONS["detect"]
     assert rows["poly_2", "fuse"]["state"] == "current"
     assert rows["poly", "fuse"]["out_of_date"]
     assert not any(new for _, new in made(ipsys, log).values())
@@ -108,7 +109,7 @@ def test_name_of_a_run_that_is_out_of_date_is_refused_first(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made(ipsys, log, "--run", "mine")
-    monkeypatch.setitem(VERSIONS, "detect", 2)
+    monkeypatch.setitem(VERSIONS, "detect", VERSIONS["detect"] + 1)
     before = log.read_bytes()
     done = ipsys("replay", log, "--run", "mine")
     assert done.code == 1
@@ -169,7 +170,6 @@ def test_run_of_newer_software_is_never_replaced(
     with monkeypatch.context() as newer:
         newer.setitem(VERSIONS, "detect", 3)
         made(ipsys, log)
-    monkeypatch.setitem(VERSIONS, "detect", 2)
     before = log.read_bytes()
     done = ipsys("replay", log)
     assert done.code == 1
@@ -181,11 +181,11 @@ def test_run_of_newer_software_is_never_replaced(
 def test_verify_names_results_of_other_versions(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(VERSIONS, "detect", 2)
+    monkeypatch.setitem(VERSIONS, "detect", 3)
     done = ipsys("verify", log)
     assert done.code == 0, done.out
     assert (
-        "run edges: detect is out of date: made by detect 1, this is detect 2; it is not verified" in done.err
+        "run edges: detect is out of date: made by detect 2, this is detect 3; it is not verified" in done.err
     )
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
     for name in (stage.name for stage in STAGES):

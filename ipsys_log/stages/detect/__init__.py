@@ -41,9 +41,17 @@ from ipsys_log.messages.channels import (
     RUN_EVENTS,
     Channel,
 )
-from ipsys_log.messages.stage import Plan, Stage, StageView
+from ipsys_log.messages.resets import Resets
+from ipsys_log.messages.stage import Pieces, Plan, Stage, StageView
 from ipsys_log.stages.detect.edges import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
+from ipsys_log.stages.detect.reports import (
+    NO_KEYFRAME,
+    REJECTED_MARKER,
+    UNKNOWN_MARKER,
+    OtherSize,
+    Reports,
+)
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
 from ipsys_log.units import NS_PER_S
 
@@ -53,6 +61,7 @@ __all__ = [
     "STAGE",
     "STOCK",
     "Detect",
+    "FrameDetector",
     "check_corners",
     "decode_grey",
     "detect_markers",
@@ -63,39 +72,41 @@ __all__ = [
 
 EDGES, STOCK = CORNERS = ("edges", "stock")
 
+# Shorter periods cost more searches of whole images; longer ones keep fewer processes busy.
+_RESET_PERIOD_S = 30
+_LONGEST_PERIOD_S = 86_400
+
 _GREEN = Color(0.1, 0.9, 0.3, 1.0)
 
 
-class Detect:
-    """The stage *detect*, one for all cameras.
+class FrameDetector:
+    """The detection in frames of all cameras, with a memory that ends at each reset.
 
     It yields for a frame its :class:`Markers` and their drawing for viewers. It yields an :class:`Event` for
-    a frame that cannot be decoded, or that suddenly has another size than the calibration. It leaves out a
-    marker id that is seen twice in a frame or is not in the rig; an event names the id. Another event names a
-    marker of the rig that is seen and cannot be measured, once for each reason.
+    a frame that cannot be decoded, and :class:`OtherSize` for a frame of another size than the calibration.
+    It leaves out a marker id that is seen twice in a frame or is not in the rig; an event names the id.
+    Another event names a marker of the rig that is seen and cannot be measured.
 
     Parameters
     ----------
     corners : ``edges``, fitted to the edges of the print with the lens distortion, tracked over frames; or
         ``stock``, OpenCV's detector on each frame, refined as the authors do.
+    resets : the instants at which the tracking of a camera begins anew; None: never.
 
     Raises
     ------
     IpsysError
-        A frame comes before the rig or, with ``edges``, before the calibration of its camera; or the first
-        frame of a camera has another size than its calibration.
+        A frame comes before the rig or, with ``edges``, before the calibration of its camera.
     """
 
-    def __init__(self, corners: str = EDGES) -> None:
+    def __init__(self, corners: str = EDGES, resets: Resets | None = None) -> None:
         self._corners = check_corners(corners)
+        self._resets = resets
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
         self._following: dict[str | None, MarkerTracker] = {}
+        self._reset_numbers: dict[str | None, int] = {}
         self._videos: dict[str | None, Video] = {}
-        self._said: dict[str | None, set[int | None]] = {}
-        self._rejected: set[tuple[str | None, int, str]] = set()
-        # Cameras with at least one frame of the size of their calibration.
-        self._fitted: set[str | None] = set()
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
@@ -110,7 +121,6 @@ class Detect:
             self._lenses[message.camera] = lens
             if known is None or not same_intrinsics(known, lens):
                 self._following.pop(message.camera, None)
-                self._fitted.discard(message.camera)
         elif isinstance(payload, SkippedVideo):
             with suppress(FrameError):
                 self._video(message.camera, payload.frame).skip(payload.frame)
@@ -126,7 +136,8 @@ class Detect:
             if isinstance(message.payload, CompressedVideo):
                 picture = self._video(message.camera, message.payload)(message.payload)
                 if picture is None:
-                    yield from self._before_keyframe(message)
+                    text = f"{message.topic}: begins before a keyframe; up to that there are no pictures"
+                    yield Event(message.publish_time_ns, NO_KEYFRAME, text, message.camera)
                     return
                 message = replace(message, payload=picture)
             markers_in_frame, width, height = self._find(message, self._rig)
@@ -135,32 +146,25 @@ class Detect:
             yield Event(message.publish_time_ns, "corrupt_frame", text, message.camera)
             return
         except SizeError as error:
-            # Without this error, a camera whose frames never fit would give no results at all.
-            if message.camera not in self._fitted:
-                raise
-            text = f"{message.topic}: a frame is left out: {error}"
-            yield Event(message.publish_time_ns, "wrong_size", text, message.camera)
+            yield self._other_size(message, str(error))
             return
-        self._fitted.add(message.camera)
         markers, events = _sift(markers_in_frame, self._rig, message)
-        yield from self._unsaid(events)
+        yield from events
         yield from self._rejections(message, self._rig)
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
 
+    def _other_size(self, message: Message, error: str) -> OtherSize:
+        text = f"{message.topic}: a frame is left out: {error}"
+        event = Event(message.publish_time_ns, "wrong_size", text, message.camera)
+        lens = self._lenses[message.camera]
+        return OtherSize(event, error, (lens.width, lens.height))
+
     def _video(self, camera: str | None, frame: CompressedVideo) -> Video:
-        """Return the decoder of a camera; it must get all frames of the camera."""
+        """Return the decoder of a camera; it must get all frames of the camera, and no reset clears it."""
         if camera not in self._videos:
             self._videos[camera] = Video(frame.format)
         return self._videos[camera]
-
-    def _before_keyframe(self, message: Message) -> Iterator[Event]:
-        """Yield an event at the first frame before a keyframe: such frames cannot be decoded."""
-        said = self._said.setdefault(message.camera, set())
-        if None not in said:
-            said.add(None)
-            text = f"{message.topic}: begins before a keyframe; up to that there are no pictures"
-            yield Event(message.publish_time_ns, "no_keyframe", text, message.camera)
 
     def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], int, int]:
         """Return the markers in a frame, and its width and height."""
@@ -172,11 +176,21 @@ class Detect:
                 check_size(self._lenses[message.camera], width, height, message.camera)
             markers = detect_markers(grey, rig.dictionary)
         else:
+            self._reset(message)
             if message.camera not in self._following:
                 self._following[message.camera] = self._follow(message, rig, camera)
             fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
             markers = [_marker(fit) for fit in fits]
         return [_timed(marker, camera) for marker in markers], width, height
+
+    def _reset(self, message: Message) -> None:
+        """Forget the markers of a camera at the first frame after a reset."""
+        if self._resets is None:
+            return
+        number = self._resets.number(str(message.camera), message.log_time_ns)
+        if self._reset_numbers.get(message.camera) != number:
+            self._following.pop(message.camera, None)
+            self._reset_numbers[message.camera] = number
 
     def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> MarkerTracker:
         lens = self._lenses.get(message.camera)
@@ -187,26 +201,37 @@ class Detect:
             )
         row_time_s = (camera.row_time_ns or 0) / NS_PER_S
         number = rig.cameras.index(camera) if camera in rig.cameras else 0
-        return MarkerTracker(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera)
-
-    def _unsaid(self, events: list[Event]) -> Iterator[Event]:
-        """Yield events; an id that is not in the rig is named once per camera, other events every time."""
-        for event in events:
-            said = self._said.setdefault(event.camera, set())
-            if event.kind != "unknown_marker" or event.marker_id not in said:
-                yield event
-            if event.kind == "unknown_marker":
-                said.add(event.marker_id)
+        return MarkerTracker(
+            *(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera),
+            is_thorough=self._resets is not None,
+        )
 
     def _rejections(self, message: Message, rig: Rig) -> Iterator[Event]:
-        """Yield events for markers that are seen and cannot be measured, once for each reason."""
+        """Yield events for markers that are seen and cannot be measured."""
         following = self._following.get(message.camera)
         for marker in following.rejections if following is not None else ():
-            said = message.camera, marker.id, marker.reason
-            if rig.knows(marker.id) and said not in self._rejected:
-                self._rejected.add(said)
+            if rig.knows(marker.id):
                 text = f"{message.topic}: marker {marker.id} is seen and not measured: {marker.reason}"
-                yield Event(message.publish_time_ns, "rejected_marker", text, message.camera, marker.id)
+                yield Event(message.publish_time_ns, REJECTED_MARKER, text, message.camera, marker.id)
+
+
+class Detect:
+    """The stage *detect*, one for all cameras: detection in frames, with each event reported once.
+
+    The parameters are those of :class:`FrameDetector`.
+
+    Raises
+    ------
+    IpsysError
+        As :class:`FrameDetector`; or the first frame of a camera has another size than its calibration.
+    """
+
+    def __init__(self, corners: str = EDGES, resets: Resets | None = None) -> None:
+        self._detector = FrameDetector(corners, resets)
+        self._reports = Reports()
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        yield from self._reports(message.camera, self._detector(message))
 
 
 def check_corners(name: str) -> str:
@@ -242,7 +267,7 @@ def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker
     events = []
     for marker_id, count in sorted(counts.items()):
         if not rig.knows(marker_id):
-            kind, text = "unknown_marker", f"marker {marker_id} is not in the rig"
+            kind, text = UNKNOWN_MARKER, f"marker {marker_id} is not in the rig"
         elif count > 1:
             kind, text = "ambiguous_marker", f"marker {marker_id} is seen {count} times in one frame"
         else:
@@ -285,8 +310,6 @@ def skipped_frames(events: Iterable[Event]) -> set[int]:
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     if not view.cameras:
         return view.newest(MARKERS)
-    import scipy.special  # noqa: F401 - before the first frame, which must not wait for it
-
     corners = options.get("corners") or usual_corners(view.cameras, view.lenses)
     skipped = skipped_frames(view.payloads(EVENTS))
     as_live = "as_live" in options and bool(skipped)
@@ -297,18 +320,47 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
             f"the new run includes {len(skipped)} frames that live processing skipped; --as-live excludes "
             "them"
         )
+    resets = _resets(options)
+    period = {} if corners == STOCK else {"reset_s": str(resets.period_ns // NS_PER_S)}
     return Plan(
         run=corners,
-        parameters={"corners": corners, **({"as_live": "yes"} if as_live else {})},
+        parameters={"corners": corners, **period, **({"as_live": "yes"} if as_live else {})},
         reads=(
             RIG,
             *([CALIBRATIONS] if corners == EDGES else []),
             *([EVENTS] if as_live else []),
             IMAGES,
         ),
-        step=lambda run: Detect(corners),
+        step=lambda run: _make_step(corners, resets),
         notes=notes,
     )
+
+
+def _make_step(corners: str, resets: Resets) -> Detect:
+    import scipy.special  # noqa: F401 - before the first frame, which must not wait for it
+
+    return Detect(corners, resets)
+
+
+def _resets(options: Mapping[str, str]) -> Resets:
+    """Return the resets with the period of a recorded run, or with the usual period.
+
+    ``shift_ns`` is the time that merges have added to the log times since the run.
+    """
+    text = options.get("reset_s", str(_RESET_PERIOD_S))
+    period_s = int(text) if text.isascii() and text.isdigit() and len(text) <= len("86400") else 0
+    if not 0 < period_s <= _LONGEST_PERIOD_S:
+        raise IpsysError(
+            f"the record of a run has the parameter reset_s = {text!r}, which is no period from 1 to "
+            f"{_LONGEST_PERIOD_S} s; run 'ipsys replay' to compute a new run"
+        )
+    return Resets(period_s * NS_PER_S, int(options.get("shift_ns", "0")))
+
+
+def _pieces(parameters: Mapping[str, str]) -> Pieces:
+    """Return how the frames of a camera between two resets are processed alone."""
+    resets = _resets(parameters)
+    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports)
 
 
 def _why_stock(camera: str) -> str:
@@ -345,7 +397,7 @@ def _has_video(view: StageView) -> bool:
 
 STAGE = Stage(
     name="detect",
-    versions={"detect": 1, EDGES: 1, STOCK: 1},
+    versions={"detect": 2, EDGES: 1, STOCK: 1},
     reads=(RIG, CALIBRATIONS, IMAGES, EVENTS),
     writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
     plan=_plan,
@@ -353,4 +405,5 @@ STAGE = Stage(
     method=lambda parameters, view: parameters.get("corners", ""),
     in_threads=True,
     stateless=_stateless,
+    pieces=_pieces,
 )

@@ -67,6 +67,8 @@ class MarkerTracker:
     number : number of the camera in the rig. Cameras search the whole image in different frames.
         Simultaneous thorough searches of all cameras would take too long for live tracking.
     camera : its name, for messages.
+    is_thorough : search the first frame thoroughly, too. After a reset, no earlier frame shows the markers
+        that only this search finds.
     """
 
     def __init__(
@@ -77,8 +79,10 @@ class MarkerTracker:
         row_time_s: float,
         number: int = 0,
         camera: str | None = None,
+        is_thorough: bool = False,
     ) -> None:
         self._dictionary = dictionary
+        self._is_thorough = is_thorough
         self._lens, self._camera = lens, camera
         self._edge_offset_px = edge_offset_px
         self._row_time_s = row_time_s
@@ -118,6 +122,7 @@ class MarkerTracker:
         turn = self._frames
         fresh = self._last_ns is None or not 0 < (time_ns - self._last_ns) / NS_PER_S < LONG_S
         due = turn % _SEARCH_EVERY == 0 or fresh
+        thorough = turn % _THOROUGH_EVERY == _SEARCH_EVERY or (self._is_thorough and self._last_ns is None)
         self._rejections = []
         grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
         # A frame that cannot be decoded raises an error before this line: the next frame takes its turn.
@@ -135,7 +140,7 @@ class MarkerTracker:
             known_px = [fit.corners_px for fit in fits]
             leftovers = search_unexplained_areas(grey, self._dictionary, samples, known_px)
             fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
-        if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
+        if thorough or lost - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
         elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
             # A new object without a detected marker may be a marker in shadow.

@@ -1,0 +1,135 @@
+"""Detection in a long log with worker processes, beside one process; latency of a frame after a reset.
+
+    python benchmarks/jobs.py --job-frames 7200
+
+``pipeline.replay`` up to detect takes turns over one log of three cameras of 960 x 540 at 30/s: with one
+process, which has a thread for each camera, with two workers, and with one worker for each core. Processor
+times include those of the workers. The share of the first process limits the speed with many cores: this
+process merges, encodes and writes.
+
+Latency: single frames of 1920 x 1080 in one thread, from the compressed image to the markers, in the first
+frame after a reset and in all other frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from results import Report, command
+from rounds import Contender, Row, Turn, race, ratio_row
+from scenes import CACHE, drawn, lengthened
+
+from ipsys_log.simulation.settings import LabSettings
+
+__all__ = ["measure"]
+
+_MS_PER_S = 1e3
+
+
+class _Turn(NamedTuple):
+    """Processor times in s of the first process and of its workers, and a hash of the written log."""
+
+    own_s: float
+    workers_s: float
+    digest: str
+
+
+def _detection(path: Path, jobs: int) -> Turn:
+    from ipsys_log.pipeline import replay
+    from ipsys_log.runs.options import Request
+
+    target = path.with_name(f"jobs_{jobs}.mcap")
+
+    def turn(_number: int) -> _Turn:
+        target.unlink(missing_ok=True)
+        before = os.times()
+        replay([path], Request(), until="detect", output=target, jobs=jobs)
+        after = os.times()
+        return _Turn(
+            after.user + after.system - before.user - before.system,
+            after.children_user + after.children_system - before.children_user - before.children_system,
+            hashlib.sha256(target.read_bytes()).hexdigest(),
+        )
+
+    return turn
+
+
+def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report) -> None:
+    cores = len(os.sched_getaffinity(0))
+    counts = sorted({1, 2, cores})
+    contenders = [Contender(f"--jobs {jobs}", _detection, (path, jobs)) for jobs in counts]
+    timings = race(contenders, 1, options.rounds)
+    turns: dict[str, _Turn] = {name: timing.kept[0] for name, timing in timings.items()}
+    if len({turn.digest for turn in turns.values()}) != 1:
+        raise SystemExit("jobs: the logs differ")
+    for jobs in counts[1:]:
+        name = f"--jobs {jobs}"
+        wanted = (">=", 1.8) if jobs == 2 else None
+        report.rows.append(
+            ratio_row(f"--jobs 1 / {name}", timings["--jobs 1"], timings[name], wanted, wall=True)
+        )
+        turn = turns[name]
+        share = turn.own_s / (turn.own_s + turn.workers_s)
+        report.rows.append(Row(f"{name}: share of the first process", (share,)))
+        extra = (turn.own_s + turn.workers_s) / sum(turns["--jobs 1"][:2])
+        report.rows.append(Row(f"{name} / 1, by processor", (extra,)))
+    for name, timing in timings.items():
+        report.rows.append(Row(name, tuple(frames / s for s in timing.wall_s), "frames/s"))
+        report.details[name] = {"wall_s": timing.wall_s, "first_round": turns[name]._asdict()}
+
+
+def _latency(path: Path, report: Report) -> None:
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import CALIBRATIONS, RIG
+    from ipsys_log.messages.resets import Resets
+    from ipsys_log.stages.detect import EDGES, Detect
+    from ipsys_log.units import NS_PER_S
+
+    resets = Resets(NS_PER_S // 2)
+    times_ms: dict[bool, list[float]] = {True: [], False: []}
+    with Session([path]) as session:
+        for camera, topic in session.images.items():
+            detect, last = Detect(EDGES, resets), -1
+            for message in session.messages([*session.topics(RIG), *session.topics(CALIBRATIONS), topic]):
+                begin = time.thread_time()
+                list(detect(message))
+                if message.topic == topic:
+                    number = resets.number(camera, message.log_time_ns)
+                    times_ms[number != last].append((time.thread_time() - begin) * _MS_PER_S)
+                    last = number
+    report.rows.append(Row("first frame after a reset", (statistics.median(times_ms[True]),), "ms"))
+    report.rows.append(Row("other frames, median", (statistics.median(times_ms[False]),), "ms"))
+    slow = statistics.quantiles(times_ms[False], n=100)[98]
+    report.rows.append(Row("other frames, 99 %", (slow,), "ms"))
+    report.details["latency_ms"] = {"after_reset": times_ms[True], "others": times_ms[False]}
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """Measure speed, then latency."""
+    report = Report("jobs")
+    CACHE.mkdir(parents=True, exist_ok=True)
+    drive_s = 0.5 if options.smoke else 4.0
+    small = LabSettings(width=960, height=540, stations=0, drive_s=drive_s)
+    with tempfile.TemporaryDirectory(dir=CACHE) as folder:
+        path = Path(folder) / "long.mcap"
+        frames = 90 if options.smoke else options.job_frames
+        lengthened(drawn(small), path, frames)
+        report.remarks.append(f"{frames} frames, {path.stat().st_size / 1e9:.2f} GB")
+        _speed(path, frames, options, report)
+    _latency(drawn(small if options.smoke else LabSettings(stations=0, drive_s=drive_s)), report)
+    return report
+
+
+def add_options(parser: argparse._ArgumentGroup) -> None:
+    parser.add_argument("--job-frames", type=int, default=7200, help="of the log, for speed")
+
+
+if __name__ == "__main__":
+    command("jobs")

@@ -1,0 +1,258 @@
+"""Pieces of a run: the frames of one camera between two resets, computed alone and merged in log order.
+
+:func:`compute_piece` may run in any process, and pieces may finish in any order. :func:`merge_pieces` gives
+the messages of the run, with the same bytes as one process without pieces. Neither starts a process.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import (
+    RIG_TOPIC,
+    CameraCalibration,
+    CompressedVideo,
+    Message,
+    Rig,
+    calibration_topic,
+)
+from ipsys_log.messages.channels import EVENTS, RIG
+from ipsys_log.messages.resets import Resets
+from ipsys_log.messages.stage import Pieces
+from ipsys_log.runs.blas import one_blas_thread
+from ipsys_log.runs.stream import WiredStage, derive
+from ipsys_log.stages import load_stage
+from ipsys_log.stages.detect import skipped_frames
+
+if TYPE_CHECKING:
+    from ipsys_log.runs.graph import Task
+
+__all__ = [
+    "FrameResult",
+    "Piece",
+    "PieceFrames",
+    "PiecePlan",
+    "PieceResult",
+    "PieceRun",
+    "compute_piece",
+    "compute_piece_of_logs",
+    "given_settings",
+    "merge_pieces",
+    "order_frames",
+    "plan_pieces",
+    "split_frames",
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PieceRun:
+    """The part of a run that all its pieces have in common. It can be pickled.
+
+    Attributes
+    ----------
+    paths : the logs.
+    stage, parameters : of the run.
+    topics : the topics that the run reads.
+    rig, lenses : they replace those of the logs; intrinsics by camera.
+    skipped : log times in ns of the frames that the run leaves out.
+    """
+
+    paths: tuple[Path, ...]
+    stage: str
+    parameters: Mapping[str, str]
+    topics: tuple[str, ...]
+    rig: Rig | None = None
+    lenses: Mapping[str, CameraCalibration]
+    skipped: frozenset[int] = frozenset()
+
+    @classmethod
+    def of_task(cls, task: Task, session: Session) -> PieceRun:
+        """Return what the pieces of a task need."""
+        is_as_live = "as_live" in task.parameters
+        events = session.payloads(session.topics(EVENTS)) if is_as_live else []
+        return cls(
+            paths=tuple(session.paths),
+            stage=task.stage.name,
+            parameters=dict(task.parameters),
+            topics=task.topics,
+            rig=task.rig,
+            lenses=dict(task.lenses),
+            skipped=frozenset(skipped_frames(events)),
+        )
+
+    def load(self) -> Pieces:
+        """Return how the stage processes pieces."""
+        pieces = load_stage(self.stage).pieces
+        assert pieces is not None, f"{self.stage} has no pieces"
+        return pieces(self.parameters)
+
+
+class Piece(NamedTuple):
+    """The frames of a camera with ``start_ns`` <= log time < ``end_ns``."""
+
+    camera: str
+    start_ns: int
+    end_ns: int
+
+
+class FrameResult(NamedTuple):
+    """The publish time of a frame in ns, and the payloads that were made from it."""
+
+    publish_time_ns: int
+    payloads: tuple[Any, ...]
+
+
+class PieceResult(NamedTuple):
+    """The results of the frames of a piece, in log order, up to the frame with an ``error``."""
+
+    frames: list[FrameResult]
+    error: IpsysError | None = None
+
+
+class PieceFrames(NamedTuple):
+    """The frames of all cameras in log order: log times in ns and places in ``cameras``, (N,) each."""
+
+    cameras: Sequence[str]
+    times_ns: NDArray[np.int64]
+    places: NDArray[np.int64]
+
+
+class PiecePlan(NamedTuple):
+    """The division of a run into pieces, in the order of their first frames."""
+
+    run: PieceRun
+    frames: PieceFrames
+    pieces: list[Piece]
+
+
+def plan_pieces(task: Task, session: Session) -> PiecePlan | None:
+    """Divide the run of a task into pieces; None if its stage, or a video, needs all earlier frames."""
+    frames = order_frames(session, task.topics) if task.stage.pieces is not None else None
+    if frames is None:
+        return None
+    run = PieceRun.of_task(task, session)
+    return PiecePlan(run, frames, split_frames(frames, run.load().resets))
+
+
+def order_frames(session: Session, topics: Iterable[str]) -> PieceFrames | None:
+    """Return the frames of some topics; None if there are none, or if one topic is a video."""
+    wanted = set(topics)
+    cameras = [camera for camera, topic in sorted(session.images.items()) if topic in wanted]
+    images = [session.images[camera] for camera in cameras]
+    if not images or any(session.has_payload(topic, CompressedVideo) for topic in images):
+        return None
+    return PieceFrames(cameras, *session.order(images))
+
+
+def split_frames(frames: PieceFrames, resets: Resets) -> list[Piece]:
+    """Return the pieces with at least one frame, in the order of their first frames."""
+    firsts: list[tuple[int, Piece]] = []
+    for place, camera in enumerate(frames.cameras):
+        indices = np.flatnonzero(frames.places == place)
+        times_ns = frames.times_ns[indices]
+        row = 0
+        while row < len(indices):
+            number = resets.number(camera, int(times_ns[row]))
+            piece = Piece(camera, resets.start_ns(camera, number), resets.start_ns(camera, number + 1))
+            firsts.append((int(indices[row]), piece))
+            row = int(np.searchsorted(times_ns, piece.end_ns))
+    return [piece for _, piece in sorted(firsts)]
+
+
+def compute_piece_of_logs(run: PieceRun, piece: Piece) -> PieceResult:
+    """Open the logs of a run, and compute one piece.
+
+    Raises
+    ------
+    IpsysError
+        A log cannot be opened.
+    """
+    with Session(run.paths) as session, one_blas_thread():
+        return compute_piece(session, run, piece)
+
+
+def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:
+    """Compute one piece from the open logs of a run; an error of the input is a part of the result."""
+    step = run.load().step()
+    topic = session.images[piece.camera]
+    frames: list[FrameResult] = []
+    try:
+        for message in _messages(session, run, piece):
+            is_left_out = message.topic == topic and message.log_time_ns in run.skipped
+            payloads = () if is_left_out else tuple(step(message))
+            if message.topic == topic:
+                frames.append(FrameResult(message.publish_time_ns, payloads))
+    except IpsysError as error:
+        return PieceResult(frames, error)
+    return PieceResult(frames)
+
+
+def given_settings(
+    session: Session, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
+) -> Iterator[Message]:
+    """Yield the rig and the intrinsics that replace those of the logs, from the start on."""
+    start_ns = session.start_ns
+    if rig is not None:
+        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
+    for camera, lens in lenses.items():
+        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
+
+
+def _messages(session: Session, run: PieceRun, piece: Piece) -> Iterator[Message]:
+    """Yield the rig and the intrinsics that hold before a piece, and then the messages of the piece."""
+    yield from given_settings(session, run.rig, run.lenses)
+    of_camera = session.calibrations.get(piece.camera)
+    settings = [topic for topic in run.topics if topic in (of_camera, *session.topics(RIG))]
+    for topic in settings:
+        message = session.latest(topic, piece.start_ns)
+        if message is not None:
+            yield message
+    images = session.images[piece.camera]
+    yield from session.messages([*settings, images], piece.start_ns, piece.end_ns)
+
+
+def merge_pieces(
+    wired: WiredStage,
+    plan: PiecePlan,
+    results: Iterable[PieceResult],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Iterator[Message]:
+    """Yield the messages of a run in log order.
+
+    Parameters
+    ----------
+    wired : gives the topics of the payloads; its step is not used.
+    results : of the pieces of the plan, in their order.
+
+    Raises
+    ------
+    IpsysError
+        The first error of the pieces, in log order.
+    """
+    frames, reports = plan.frames, plan.run.load().reports()
+    pieces = iter(results)
+    waiting: list[deque[FrameResult]] = [deque() for _ in frames.cameras]
+    errors: list[IpsysError | None] = [None for _ in frames.cameras]
+    total = len(frames.times_ns)
+    progress(0, total)
+    order = zip(frames.times_ns.tolist(), frames.places.tolist(), strict=True)
+    for done, (time_ns, place) in enumerate(order, 1):
+        while not waiting[place]:
+            if (error := errors[place]) is not None:
+                raise error
+            result = next(pieces)
+            waiting[place].extend(result.frames)
+            errors[place] = result.error
+        publish_time_ns, payloads = waiting[place].popleft()
+        frame = Message("", time_ns, publish_time_ns, None, frames.cameras[place])
+        yield from derive(wired, frame, reports(frame.camera, payloads))
+        progress(done, total)

@@ -1,0 +1,169 @@
+"""Worker processes: the same bytes with any number of them, and their ends, killed or interrupted."""
+
+from __future__ import annotations
+
+import multiprocessing.connection
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.pipeline import replay
+from ipsys_log.runs import workers
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
+from ipsys_log.runs.workers import LocalWorkers
+from tests.conftest import Ipsys
+
+pytestmark = pytest.mark.slow  # each process imports the package
+
+REQUEST = Request(parameters={"reset_s": "2"})
+# A worker that was told to end has a minute to do so.
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(autouse=True)
+def _workers_for_short_logs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_MIN_FRAMES", 1)
+
+
+def newest_worker_first(receivers: Sequence[Any]) -> list[Any]:
+    """Wait for the last busy worker only: its pieces finish before those of the others."""
+    return list(_wait(list(receivers)[-1:]))
+
+
+_wait = multiprocessing.connection.wait
+
+
+def test_bytes_are_equal_for_any_number_of_processes(
+    lab_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = _count_workers(monkeypatch)
+    monkeypatch.setattr(workers, "wait", newest_worker_first)
+    logs = {jobs: Path(shutil.copy(lab_log, tmp_path / f"{jobs}.mcap")) for jobs in (1, 2, 5)}
+    counts = {}
+    for jobs, log in logs.items():
+        replay([log], REQUEST, "camera-frame", jobs=jobs)
+        counts[jobs] = len(started)
+    assert counts == {1: 0, 2: 2, 5: 7}
+    assert len({log.read_bytes() for log in logs.values()}) == 1
+
+
+def _count_workers(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return a list that gets each worker that starts."""
+    started: list[Any] = []
+    create = workers._Worker.__init__
+
+    def counted(self: Any, run: PieceRun) -> None:
+        started.append(self)
+        create(self, run)
+
+    monkeypatch.setattr(workers._Worker, "__init__", counted)
+    return started
+
+
+def test_killed_worker_leaves_the_log_unchanged(
+    lab: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = _count_workers(monkeypatch)
+    send = workers._Worker.send
+
+    def send_and_kill(self: Any, number: int, piece: Piece) -> None:
+        send(self, number, piece)
+        if number == 1:
+            self.process.kill()
+
+    monkeypatch.setattr(workers._Worker, "send", send_and_kill)
+    before = lab.read_bytes()
+    done = ipsys("detect", lab, "--jobs", "2")
+    assert done.code == 1
+    assert "a worker process has ended by signal 9" in done.err
+    assert "--jobs" in done.err
+    assert "Traceback" not in done.err
+    assert lab.read_bytes() == before
+    assert [worker.process.poll() for worker in started] == [-9, -9]
+    monkeypatch.setattr(workers._Worker, "send", send)
+    assert ipsys("detect", lab, "--jobs", "2").code == 0
+
+
+def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started = _count_workers(monkeypatch)
+
+    def interrupted(_: Sequence[Any]) -> list[Any]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workers, "wait", interrupted)
+    before = lab.read_bytes()
+    with pytest.raises(KeyboardInterrupt):
+        replay([lab], REQUEST, "detect", jobs=2)
+    assert lab.read_bytes() == before
+    assert [worker.process.poll() for worker in started] == [-9, -9]
+
+
+def test_bug_in_a_worker_keeps_its_traceback(lab_log: Path) -> None:
+    run = _run(lab_log)
+    with LocalWorkers(2) as local, pytest.raises(KeyError) as bug:
+        list(local.compute(_plan(run, Piece("nobody", 0, 1))))
+    assert "in compute_piece" in "".join(bug.value.__notes__)
+
+
+def test_log_that_disappears_is_an_error_of_one_line(lab: Path) -> None:
+    run = _run(lab)
+    lab.unlink()
+    with LocalWorkers(2) as local, pytest.raises(IpsysError, match=r"lab\.mcap"):
+        list(local.compute(_plan(run, Piece("red", 0, 1))))
+
+
+def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
+    worker = workers._Worker(_run(lab_log))
+    worker.send(0, Piece("red", 0, 1))
+    assert worker.receive().frames == []
+    worker.close()
+    assert worker.process.wait(PATIENCE_S) == 0
+
+
+def _run(log: Path) -> PieceRun:
+    return PieceRun(paths=(log,), stage="detect", parameters={"corners": "stock"}, topics=(), lenses={})
+
+
+def _plan(run: PieceRun, *pieces: Piece) -> PiecePlan:
+    none = np.empty(0, np.int64)
+    return PiecePlan(run, PieceFrames(("red",), none, none), list(pieces))
+
+
+def test_results_wait_for_at_most_some_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the first piece is not finished, only a limited number of later ones is computed."""
+    sent: list[int] = []
+    _pretend(monkeypatch, sent)
+    monkeypatch.setattr(workers, "wait", lambda receivers: list(receivers)[-1:])
+    with LocalWorkers(2) as local:
+        results = local.compute(_plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(100))))
+        next(results)
+        assert len(sent) == 5
+        assert sum(1 for _ in results) == 99
+    assert sent == list(range(100))
+
+
+def _pretend(monkeypatch: pytest.MonkeyPatch, sent: list[int]) -> None:
+    """Replace the processes by objects that have a result at once."""
+
+    class Pretended:
+        def __init__(self, _run: PieceRun) -> None:
+            self.piece: int | None = None
+            self.receiver = self
+
+        def send(self, number: int, _piece: Piece) -> None:
+            self.piece = number
+            sent.append(number)
+
+        def receive(self) -> Any:
+            self.piece = None
+            return object()
+
+        def stop(self) -> None: ...
+
+    monkeypatch.setattr(workers, "_Worker", Pretended)

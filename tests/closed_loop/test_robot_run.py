@@ -152,6 +152,22 @@ def test_robot_drives_with_positions_of_vrpn(
     assert max(point.control_m for point in robot.reached) < 0.02
 
 
+def test_robot_drives_with_delayed_poses_of_ros_2(
+    replayed_log: Path, short_run: Callable[[RobotRun, str], Path]
+) -> None:
+    pytest.importorskip("zenoh")
+    run = replace(settings_of(replayed_log, SHORT), over="ros2", loss=0.1, delay_s=0.1)
+    log = short_run(run, "ros2.mcap")
+    (robot,) = result_of(log).robots
+    assert robot.is_finished
+    assert max(point.control_m for point in robot.reached) < 0.02
+    with Session([log]) as session:
+        used = {command.position_time for command in session.payloads(session.topics(COMMANDS))} - {None}
+        sent = {message.publish_time_ns for message in session.messages(session.topics(TRACKS, "poly"))}
+    assert used < sent
+    assert log.read_bytes() == short_run(run, "again.mcap").read_bytes()
+
+
 def test_three_robots_keep_their_distance(
     replayed_log: Path, short_run: Callable[[RobotRun, str], Path]
 ) -> None:

@@ -245,9 +245,9 @@ def _cost_ms(settings: StreamSettings) -> float:
     step_ns, topic = 33_000_000, "/runs/poly/tracks"
 
     def message(number: int) -> Message:
-        rows = (Track(f"robot_{n}", n, 0.01 * number, n, 0.1, 0.3, np.eye(3) * 1e-4) for n in range(3))
         time_ns = number * step_ns
-        return Message(topic, time_ns, time_ns, Tracks(time_ns, tuple(rows)))
+        rows = tuple(_track(n, 0.01 * number) for n in range(3))
+        return Message(topic, time_ns, time_ns, Tracks(time_ns, rows))
 
     messages = [message(number) for number in range(_MESSAGES)]
     with open_streams(settings, {topic}, lambda: 0, lambda kind, text: None, 1) as (stream,):
@@ -255,6 +255,26 @@ def _cost_ms(settings: StreamSettings) -> float:
         begin_s = time.process_time()
         stream.consume(iter(messages[10:]))
         return _MS_PER_S * (time.process_time() - begin_s) / (_MESSAGES - 10)
+
+
+def _track(number: int, x_m: float) -> Track:
+    """Return a track with all that ``fuse`` gives."""
+    return Track(
+        f"robot_{number}",
+        number,
+        x_m,
+        float(number),
+        0.1,
+        0.3,
+        np.eye(3) * 1e-4,
+        ("red",),
+        True,
+        velocity_m_s=np.array([0.3, 0.0, 0.0]),
+        velocity_covariance_m2_s2=np.eye(3) * 1e-4,
+        heading_sigma_rad=0.01,
+        turn_rate_rad_s=0.0,
+        turn_rate_sigma_rad_s=0.02,
+    )
 
 
 def measure(options: argparse.Namespace) -> Report:

@@ -80,15 +80,18 @@ def test_relay_passes_only_what_it_is_told_to() -> None:
     """The first pose is lost between stream and robot; the others arrive unchanged, of one robot only."""
     arrived: list[bytes] = []
     port = free_port()
-    with publishing() as stream, open_ros2("ada", stream.port, port, arrived.append) as send:
-        with closing(receivers.Ros2Positions(("127.0.0.1", port), "ada")) as robot:
-            stream.consume(iter([tracks(n, track("ada", 1.0 + n), track("bob", 9.0)) for n in range(3)]))
-            wait_for(lambda: len(arrived) == 3)
-            for data in arrived[1:]:
-                send(data)
-            while robot.count < 2:
-                robot.receive(_LIMIT_S, 7.0)
-            robot.receive(0.0, 8.0)
+    with (
+        publishing() as stream,
+        open_ros2("ada", stream.port, port, arrived.append) as send,
+        closing(receivers.Ros2Positions(("127.0.0.1", port), "ada")) as robot,
+    ):
+        stream.consume(iter([tracks(n, track("ada", 1.0 + n), track("bob", 9.0)) for n in range(3)]))
+        wait_for(lambda: len(arrived) == 3)
+        for data in arrived[1:]:
+            send(data)
+        while robot.count < 2:
+            robot.receive(_LIMIT_S, 7.0)
+        robot.receive(0.0, 8.0)
     assert robot.count == 2
     assert (robot.pose.x_m, robot.pose.y_m) == (3.0, 2.0)
     assert (robot.pose.time_ns, robot.pose.arrival_s) == (START_NS + 2 * STEP_NS, 7.0)

@@ -15,7 +15,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,16 +24,16 @@ from results import Report, command
 from rounds import Row
 from scenes import drawn
 from stream_clients import CLIENTS
+from stream_costs import ROBOT, cost_rows, hand_over_rows
 from stream_server import free_ports, loops_of, serve
 
 from ipsys_log import pipeline
 from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import FRAME_SKIPPED, Latency, Message, Track, Tracks
+from ipsys_log.messages import FRAME_SKIPPED, Latency, Tracks
 from ipsys_log.messages.channels import EVENTS, TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
 
 __all__ = ["measure"]
 
@@ -43,10 +42,8 @@ _LIMIT_S = 120.0
 # Positions before the clients are connected, and those on their way at the end, are not counted.
 _EDGE_S = 2.0
 _FRESH_NS = 300_000_000
-# The robot of the lab whose autopilot gets its positions.
-_ROBOT = "robot_0"
-# Messages with three robots each, for the processor time.
-_MESSAGES, _MS_PER_S = 1000, 1e3
+# Messages of the measurement of the hand-over.
+_HANDED_OVER = 300
 
 
 @dataclass(slots=True)
@@ -77,7 +74,7 @@ def _go_live(folder: Path, lab: Path, calibrated: Path, seconds: float, with_str
         options = [text for port in udp for text in ("--udp", f"127.0.0.1:{port}")]
         options += [
             "--mavlink",
-            f"{_ROBOT}=127.0.0.1:{mavlink}",
+            f"{ROBOT}=127.0.0.1:{mavlink}",
             "--vrpn-port",
             str(vrpn),
             "--ros2-port",
@@ -140,7 +137,7 @@ def _read(log: Path, arrivals: dict[str, list[list[tuple[int, int]]]]) -> _Run:
         for track in row.tracks
         if track.inside is not False and track.heading_rad is not None
     ]
-    poses, of_first = [t for t, _ in good], [t for t, robot in good if robot == _ROBOT]
+    poses, of_first = [t for t, _ in good], [t for t, robot in good if robot == ROBOT]
     skipped = sum(event.kind == FRAME_SKIPPED for event in events)
     return _Run(recorded_latencies([log]), skipped, frames, poses, of_first, arrivals)
 
@@ -222,61 +219,6 @@ def _cell(values: NDArray[np.float64]) -> str:
     return f"{f'{np.percentile(values, 50):.1f} / {np.percentile(values, 99):.1f}':>15}"
 
 
-def _costs(rounds: int) -> list[Row]:
-    """Return the processor time of each stream for a message with three robots, without clients.
-
-    Unlike latencies, it does not depend on other programs.
-    """
-    *ports, udp, mavlink = free_ports(5)
-    streams = {
-        "UDP": StreamSettings(udp=(f"127.0.0.1:{udp}",)),
-        "MAVLink": StreamSettings(mavlink=(f"{_ROBOT}=127.0.0.1:{mavlink}",)),
-        "VRPN": StreamSettings(vrpn=ports[0]),
-        "ROS 2": StreamSettings(ros2=ports[1]),
-        "Foxglove": StreamSettings(foxglove=ports[2]),
-    }
-    return [
-        Row(f"processor time, {name}", tuple(_cost_ms(settings) for _ in range(rounds)), "ms/message")
-        for name, settings in streams.items()
-    ]
-
-
-def _cost_ms(settings: StreamSettings) -> float:
-    step_ns, topic = 33_000_000, "/runs/poly/tracks"
-
-    def message(number: int) -> Message:
-        time_ns = number * step_ns
-        rows = tuple(_track(n, 0.01 * number) for n in range(3))
-        return Message(topic, time_ns, time_ns, Tracks(time_ns, rows))
-
-    messages = [message(number) for number in range(_MESSAGES)]
-    with open_streams(settings, {topic}, lambda: 0, lambda kind, text: None, 1) as (stream,):
-        stream.consume(iter(messages[:10]))
-        begin_s = time.process_time()
-        stream.consume(iter(messages[10:]))
-        return _MS_PER_S * (time.process_time() - begin_s) / (_MESSAGES - 10)
-
-
-def _track(number: int, x_m: float) -> Track:
-    """Return a track with all that ``fuse`` gives."""
-    return Track(
-        f"robot_{number}",
-        number,
-        x_m,
-        float(number),
-        0.1,
-        0.3,
-        np.eye(3) * 1e-4,
-        ("red",),
-        True,
-        velocity_m_s=np.array([0.3, 0.0, 0.0]),
-        velocity_covariance_m2_s2=np.eye(3) * 1e-4,
-        heading_sigma_rad=0.01,
-        turn_rate_rad_s=0.0,
-        turn_rate_sigma_rad_s=0.02,
-    )
-
-
 def measure(options: argparse.Namespace) -> Report:
     """Measure the latency of streams, in runs with and without streams that alternate."""
     report = Report("streams")
@@ -294,7 +236,8 @@ def measure(options: argparse.Namespace) -> Report:
         for _ in range(options.rounds):
             without = _go_live(folder, lab, calibrated, seconds, with_streams=False)
             pairs.append((without, _go_live(folder, lab, calibrated, seconds, with_streams=True)))
-    report.rows += _costs(options.rounds)
+    report.rows += cost_rows(options.rounds)
+    report.rows += hand_over_rows(options.rounds, 10 if options.smoke else _HANDED_OVER)
     _rows(pairs, report)
     report.tables.append(_table(pairs))
     report.details["latency_ms"] = {

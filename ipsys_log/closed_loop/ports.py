@@ -12,6 +12,8 @@ from ipsys_log.errors import IpsysError
 __all__ = ["Ports", "find_ports"]
 
 _LOOPBACK = "127.0.0.1"
+# Of the search for any free port.
+_ATTEMPTS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,22 +58,24 @@ def find_ports(first: int, robots: int, has_server: bool, has_relay: bool) -> Po
 
 def _bindable(first: int, count: int) -> Sequence[int]:
     with ExitStack() as stack:
-        ports = []
-        for number in range(count):
-            wanted = first + number if first else 0
-            probes = [
-                stack.enter_context(socket.socket(socket.AF_INET, kind))
-                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM)
-            ]
+        return [_probe(first + number if first else 0, first, stack) for number in range(count)]
+
+
+def _probe(wanted: int, first: int, stack: ExitStack) -> int:
+    """Return a port that is free for UDP and TCP; it stays in use until the stack is closed."""
+    for _ in range(1 if wanted else _ATTEMPTS):
+        port = wanted
+        with ExitStack() as probes:
             try:
-                for probe in probes:
-                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, probe is probes[1])
-                    probe.bind((_LOOPBACK, wanted))
-                    wanted = wanted or probe.getsockname()[1]
-            except OSError as error:
-                raise IpsysError(
-                    f"--port {first}: port {wanted} is in use, perhaps by another run; end it, or give "
-                    "another port"
-                ) from error
-            ports.append(int(wanted))
-        return ports
+                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+                    probe = probes.enter_context(socket.socket(socket.AF_INET, kind))
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, kind is socket.SOCK_STREAM)
+                    probe.bind((_LOOPBACK, port))
+                    port = port or int(probe.getsockname()[1])
+            except OSError:  # a port that is free for UDP may be in use for TCP
+                continue
+            stack.push(probes.pop_all())
+            return port
+    raise IpsysError(
+        f"--port {first}: port {port} is in use, perhaps by another run; end it, or give another port"
+    )

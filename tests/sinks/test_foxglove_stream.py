@@ -179,6 +179,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "wrong secret": ({"token": "the-secret2"}, "has not the secret"),
     "no secret": ({"token": ""}, "has not the secret"),
     "foreign host": ({"host": "evil.example"}, "names another host"),
+    "other version": ({"subprotocols": ["foxglove.websocket.v0"]}, "does not speak foxglove.sdk.v1; use a"),
+    "no protocol": ({"subprotocols": None}, "does not speak foxglove.sdk.v1"),
 }
 
 

@@ -196,6 +196,11 @@ class FoxgloveStream:
             return self._refuse(
                 connection, name, "has not the secret; use the full address that ipsys printed"
             )
+        offered = ",".join(headers.get_all("Sec-WebSocket-Protocol")).replace(" ", "").split(",")
+        if not set(SUBPROTOCOLS) & set(offered):
+            return self._refuse(
+                connection, name, f"does not speak {SUBPROTOCOLS[0]}; use a newer version of Foxglove"
+            )
         if len(self._clients) >= _MOST_CLIENTS:
             return self._refuse(connection, name, f"is too much: there are {_MOST_CLIENTS} clients already")
         return None

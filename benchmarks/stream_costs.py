@@ -23,7 +23,7 @@ from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
 
 __all__ = ["ROBOT", "cost_rows", "hand_over_rows"]
 
-# Of three cameras with 30 frames/s.
+# The interval of positions from three cameras with 30 frames/s.
 _PERIOD_S = 0.011
 _BUSY_THREADS, _PYTHON_STEPS = 2, 15_000
 _LIMIT_S = 60.0

@@ -12,7 +12,7 @@ from ipsys_log.errors import IpsysError
 __all__ = ["Ports", "find_ports"]
 
 _LOOPBACK = "127.0.0.1"
-# Of the search for any free port.
+# Attempts to find any free port.
 _ATTEMPTS = 100
 
 

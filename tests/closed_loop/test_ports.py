@@ -43,6 +43,7 @@ def test_wanted_port_in_use_is_named(kind: int) -> None:
 
 def test_robots_share_a_server_unless_they_have_relays() -> None:
     shared = find_ports(0, 2, has_server=True, has_relay=False)
+    assert shared.server is not None
     assert shared == Ports(shared.wheels, shared.server, (shared.server,) * 2, ())
     relayed = find_ports(0, 2, has_server=True, has_relay=True)
     assert len({relayed.wheels, relayed.server, *relayed.positions, *relayed.relays}) == 6

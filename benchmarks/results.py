@@ -23,7 +23,7 @@ BENCHMARKS = {
     "replay": "the whole chain beside detection alone; memory over ten minutes",
     "jobs": "detection with worker processes, beside one process; latency after a reset",
     "live": "recording and tracking of streams on loopback: drops, processor time, latency",
-    "streams": "from a frame to ten clients of UDP, VRPN, ROS 2 and Foxglove",
+    "streams": "from a frame to ten clients of UDP, MAVLink, VRPN, ROS 2 and Foxglove",
     "log_write": "recording and small messages, beside mcap and foxglove-sdk",
     "log_read": "reading, beside mcap",
     "table": "a channel as a table, beside decoding its messages",

@@ -1,10 +1,10 @@
 """Clients of the streams, in a process of their own: capture time and time of arrival of each position.
 
-    python benchmarks/stream_clients.py UDP,UDP,UDP VRPN ROS2 ADDRESS
+    python benchmarks/stream_clients.py UDP,UDP MAVLINK VRPN ROS2 ADDRESS
 
-The arguments are ports on loopback, and the address for Foxglove. Three clients listen on UDP, two on VRPN,
-one each on ROS 2 and Foxglove. Another one never reads, one sends garbage, and one vanishes. The end of
-standard input ends the process; it prints JSON: by stream and client, capture time and arrival in ns (UTC).
+The arguments are ports on loopback, and the address for Foxglove. Two clients listen on UDP, two on VRPN,
+one each on MAVLink, ROS 2 and Foxglove. Another one never reads, one sends garbage, and one vanishes. The
+end of standard input ends the process; it prints JSON: by stream and client, capture time and arrival in ns.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import time
 from collections.abc import Callable, Iterator
 
 import zenoh
+from pymavlink.dialects.v20 import common
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 __all__ = ["CLIENTS"]
 
 # The clients whose messages are counted, by stream.
-CLIENTS = {"UDP": 3, "VRPN": 2, "ROS 2": 1, "Foxglove": 1}
+CLIENTS = {"UDP": 2, "MAVLink": 1, "VRPN": 2, "ROS 2": 1, "Foxglove": 1}
 _GREETING = b"vrpn: ver. 07.38  0".ljust(24, b"\0")
 _HEADER = struct.Struct(">iiiiii")
 _ALIGNMENT, _NS_PER_US = 8, 1000
@@ -36,13 +37,26 @@ Arrivals = list[tuple[int, int]]
 _READY_S = 60.0
 
 
-def _udp(port: int, arrivals: Arrivals) -> None:
+def _datagrams(port: int) -> Iterator[tuple[bytes, int]]:
+    """Yield the datagrams that arrive at a port, and their times of arrival."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         sock.bind(("127.0.0.1", port))
         while True:
-            data = sock.recv(4096)
-            arrivals.append((json.loads(data)["time_ns"], time.time_ns()))
+            yield sock.recv(4096), time.time_ns()
+
+
+def _udp(port: int, arrivals: Arrivals) -> None:
+    for data, arrived_ns in _datagrams(port):
+        arrivals.append((json.loads(data)["time_ns"], arrived_ns))
+
+
+def _mavlink(port: int, arrivals: Arrivals) -> None:
+    parser = common.MAVLink(None)
+    for data, arrived_ns in _datagrams(port):
+        for message in parser.parse_buffer(data) or ():
+            if message.get_type() == "ODOMETRY":
+                arrivals.append((message.time_usec * _NS_PER_US, arrived_ns))
 
 
 def _connected(port: int) -> socket.socket:
@@ -144,7 +158,7 @@ def _foxglove(address: str, arrivals: Arrivals) -> None:
                 client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
 
-def main(udp: str, vrpn: int, ros2: int, foxglove: str) -> None:
+def main(udp: str, mavlink: int, vrpn: int, ros2: int, foxglove: str) -> None:
     """Run the clients until standard input ends; ``foxglove`` is an address with its secret."""
     arrivals: dict[str, list[Arrivals]] = {name: [[] for _ in range(n)] for name, n in CLIENTS.items()}
     port = int(foxglove.split(":")[2].partition("/")[0])
@@ -155,6 +169,7 @@ def main(udp: str, vrpn: int, ros2: int, foxglove: str) -> None:
         for n, rows in zip(udp.split(","), arrivals["UDP"], strict=True)
     ]
     jobs += [lambda rows=rows: _vrpn(vrpn, rows) for rows in arrivals["VRPN"]]  # type: ignore[misc]
+    jobs += [lambda: _mavlink(mavlink, arrivals["MAVLink"][0])]
     jobs += [lambda: _ros2(ros2, arrivals["ROS 2"][0]), lambda: _foxglove(foxglove, arrivals["Foxglove"][0])]
     for job in jobs:
         threading.Thread(target=_quietly, args=(job,), daemon=True).start()
@@ -172,4 +187,4 @@ def _quietly(job: Callable[[], None]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]), sys.argv[5])

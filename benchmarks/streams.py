@@ -3,8 +3,8 @@
     python benchmarks/streams.py --stream-seconds 20 --rounds 3
 
 FFmpeg serves three streams of 1920 x 1080 at 30/s, as for ``live``. ``ipsys live`` runs without and with
-streams, in turns. Ten clients are in a process of their own: three on UDP, two on VRPN, one each on ROS 2 and
-Foxglove; one that never reads, one that sends garbage, and one that vanishes.
+streams, in turns. Ten clients are in a process of their own: two on UDP, two on VRPN, one each on MAVLink,
+ROS 2 and Foxglove; one that never reads, one that sends garbage, and one that vanishes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,16 +24,16 @@ from results import Report, command
 from rounds import Row
 from scenes import drawn
 from stream_clients import CLIENTS
+from stream_costs import ROBOT, cost_rows, hand_over_rows
 from stream_server import free_ports, loops_of, serve
 
 from ipsys_log import pipeline
 from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import FRAME_SKIPPED, Latency, Message, Track, Tracks
+from ipsys_log.messages import FRAME_SKIPPED, Latency, Tracks
 from ipsys_log.messages.channels import EVENTS, TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
 
 __all__ = ["measure"]
 
@@ -43,8 +42,8 @@ _LIMIT_S = 120.0
 # Positions before the clients are connected, and those on their way at the end, are not counted.
 _EDGE_S = 2.0
 _FRESH_NS = 300_000_000
-# Messages with three robots each, for the processor time.
-_MESSAGES, _MS_PER_S = 1000, 1e3
+# Messages of the measurement of the hand-over.
+_HANDED_OVER = 300
 
 
 @dataclass(slots=True)
@@ -52,23 +51,37 @@ class _Run:
     """A run of ``ipsys live``: its ledger, the times of its positions, and the arrivals at each client.
 
     A position outside the calibrated volume or without heading is not counted: some streams withhold it.
+
+    Attributes
+    ----------
+    poses : capture times of the positions; ``poses_of_first``: of those of the first robot.
     """
 
     ledger: list[Latency]
     skipped: int
     frames: int
     poses: list[int]
+    poses_of_first: list[int]
     arrivals: dict[str, list[list[tuple[int, int]]]] = field(default_factory=dict)
 
 
 def _go_live(folder: Path, lab: Path, calibrated: Path, seconds: float, with_streams: bool) -> _Run:
     loops, log = loops_of(lab, folder), folder / "live.mcap"
     log.unlink(missing_ok=True)
-    *udp, vrpn, ros2, foxglove = free_ports(CLIENTS["UDP"] + 3)
+    *udp, mavlink, vrpn, ros2, foxglove = free_ports(CLIENTS["UDP"] + 4)
     options: list[str] = []
     if with_streams:
         options = [text for port in udp for text in ("--udp", f"127.0.0.1:{port}")]
-        options += ["--vrpn-port", str(vrpn), "--ros2-port", str(ros2), "--foxglove-port", str(foxglove)]
+        options += [
+            "--mavlink",
+            f"{ROBOT}=127.0.0.1:{mavlink}",
+            "--vrpn-port",
+            str(vrpn),
+            "--ros2-port",
+            str(ros2),
+            "--foxglove-port",
+            str(foxglove),
+        ]
     with serve(lab, loops, 3, folder, _LIMIT_S) as served:
         program = subprocess.Popen(
             [
@@ -79,7 +92,7 @@ def _go_live(folder: Path, lab: Path, calibrated: Path, seconds: float, with_str
             stderr=subprocess.PIPE,
             text=True,
         )
-        arrivals = _listen(program, udp, vrpn, ros2) if with_streams else {}
+        arrivals = _listen(program, udp, mavlink, vrpn, ros2) if with_streams else {}
         _, said = program.communicate()
         if program.returncode:
             raise SystemExit(f"ipsys live ended with {program.returncode}: {said.strip()[-200:]}")
@@ -87,7 +100,7 @@ def _go_live(folder: Path, lab: Path, calibrated: Path, seconds: float, with_str
 
 
 def _listen(
-    program: subprocess.Popen[str], udp: list[int], vrpn: int, ros2: int
+    program: subprocess.Popen[str], udp: list[int], mavlink: int, vrpn: int, ros2: int
 ) -> dict[str, list[list[tuple[int, int]]]]:
     """Run the clients as long as the program; return the arrivals at each client."""
     assert program.stderr is not None
@@ -97,7 +110,7 @@ def _listen(
             break
     else:
         raise SystemExit("ipsys live printed no address for Foxglove")
-    arguments = [",".join(map(str, udp)), str(vrpn), str(ros2), address]
+    arguments = [",".join(map(str, udp)), str(mavlink), str(vrpn), str(ros2), address]
     script = str(Path(__file__).with_name("stream_clients.py"))
     with subprocess.Popen(
         [sys.executable, script, *arguments],
@@ -118,13 +131,15 @@ def _read(log: Path, arrivals: dict[str, list[list[tuple[int, int]]]]) -> _Run:
         events = session.payloads(session.topics(EVENTS))
         frames = sum(session.count(topic) for topic in session.images.values())
         tracks: list[Tracks] = session.payloads(session.topics(TRACKS))
-    poses = [
-        row.timestamp
+    good = [
+        (row.timestamp, track.robot)
         for row in tracks
-        if any(track.inside is not False and track.heading_rad is not None for track in row.tracks)
+        for track in row.tracks
+        if track.inside is not False and track.heading_rad is not None
     ]
+    poses, of_first = [t for t, _ in good], [t for t, robot in good if robot == ROBOT]
     skipped = sum(event.kind == FRAME_SKIPPED for event in events)
-    return _Run(recorded_latencies([log]), skipped, frames, poses, arrivals)
+    return _Run(recorded_latencies([log]), skipped, frames, poses, of_first, arrivals)
 
 
 def _after_ms(run: _Run, client: list[tuple[int, int]]) -> NDArray[np.float64]:
@@ -135,16 +150,16 @@ def _after_ms(run: _Run, client: list[tuple[int, int]]) -> NDArray[np.float64]:
     return np.array(late, dtype=np.float64) / _NS_PER_MS
 
 
-def _lost(run: _Run, client: list[tuple[int, int]]) -> int:
-    """Return how many positions a client missed, without the edges of the run and old positions.
+def _lost(run: _Run, poses: list[int], client: list[tuple[int, int]]) -> int:
+    """Return how many poses a client missed, without the edges of the run and old positions.
 
-    VRPN and ROS 2 withhold positions that are older than 0.5 s: those of a machine that is too slow.
+    Most streams withhold positions that are older than 0.5 s: those of a machine that is too slow.
     """
     edge_ns = round(_EDGE_S * 1e9)
     first_ns = client[0][0] + edge_ns if client else 0
-    last_ns = max(run.poses, default=0) - edge_ns
+    last_ns = max(poses, default=0) - edge_ns
     fresh = {e.timestamp // 1000 for e in run.ledger if e.published - e.timestamp < _FRESH_NS}
-    expected = {t // 1000 for t in run.poses if first_ns <= t <= last_ns} & fresh
+    expected = {t // 1000 for t in poses if first_ns <= t <= last_ns} & fresh
     return len(expected - {t // 1000 for t, _ in client})
 
 
@@ -164,7 +179,10 @@ def _rows(pairs: list[tuple[_Run, _Run]], report: Report) -> None:
             for title, share, most in (("median", 50, 2), ("99 %", 99, 10)):
                 values = tuple(float(np.percentile(rows, share)) for rows in joined)
                 report.rows.append(Row(f"position to {stream}, {title}", values, "ms", ("<=", most)))
-        lost = [sum(_lost(run, client) for client in run.arrivals[stream]) for _, run in pairs]
+        lost = []
+        for _, run in pairs:
+            poses = run.poses_of_first if stream == "MAVLink" else run.poses
+            lost.append(sum(_lost(run, poses, client) for client in run.arrivals[stream]))
         name = f"lost by {stream} clients ({count})"
         report.rows.append(Row(name, tuple(map(float, lost)), "positions", ("<=", 0)))
     for name, index in (("without", 0), ("with", 1)):
@@ -201,40 +219,6 @@ def _cell(values: NDArray[np.float64]) -> str:
     return f"{f'{np.percentile(values, 50):.1f} / {np.percentile(values, 99):.1f}':>15}"
 
 
-def _costs(rounds: int) -> list[Row]:
-    """Return the processor time of each stream for a message with three robots, without clients.
-
-    Unlike latencies, it does not depend on other programs.
-    """
-    *ports, udp = free_ports(4)
-    streams = {
-        "UDP": StreamSettings(udp=(f"127.0.0.1:{udp}",)),
-        "VRPN": StreamSettings(vrpn=ports[0]),
-        "ROS 2": StreamSettings(ros2=ports[1]),
-        "Foxglove": StreamSettings(foxglove=ports[2]),
-    }
-    return [
-        Row(f"processor time, {name}", tuple(_cost_ms(settings) for _ in range(rounds)), "ms/message")
-        for name, settings in streams.items()
-    ]
-
-
-def _cost_ms(settings: StreamSettings) -> float:
-    step_ns, topic = 33_000_000, "/runs/poly/tracks"
-
-    def message(number: int) -> Message:
-        rows = (Track(f"robot_{n}", n, 0.01 * number, n, 0.1, 0.3, np.eye(3) * 1e-4) for n in range(3))
-        time_ns = number * step_ns
-        return Message(topic, time_ns, time_ns, Tracks(time_ns, tuple(rows)))
-
-    messages = [message(number) for number in range(_MESSAGES)]
-    with open_streams(settings, {topic}, lambda: 0, lambda kind, text: None, 1) as (stream,):
-        stream.consume(iter(messages[:10]))
-        begin_s = time.process_time()
-        stream.consume(iter(messages[10:]))
-        return _MS_PER_S * (time.process_time() - begin_s) / (_MESSAGES - 10)
-
-
 def measure(options: argparse.Namespace) -> Report:
     """Measure the latency of streams, in runs with and without streams that alternate."""
     report = Report("streams")
@@ -252,7 +236,8 @@ def measure(options: argparse.Namespace) -> Report:
         for _ in range(options.rounds):
             without = _go_live(folder, lab, calibrated, seconds, with_streams=False)
             pairs.append((without, _go_live(folder, lab, calibrated, seconds, with_streams=True)))
-    report.rows += _costs(options.rounds)
+    report.rows += cost_rows(options.rounds)
+    report.rows += hand_over_rows(options.rounds, 10 if options.smoke else _HANDED_OVER)
     _rows(pairs, report)
     report.tables.append(_table(pairs))
     report.details["latency_ms"] = {

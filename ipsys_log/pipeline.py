@@ -321,20 +321,21 @@ def _put_through(
 ) -> IpsysError | None:
     """Write the results of the stages for incoming frames, then show them; return the error of a stage.
 
-    The results are shown with their latencies, and with the ``events`` that were written meanwhile.
+    The results are shown with the ``events`` that were written meanwhile, and before their latencies.
     """
     try:
         for message in _through(stages, frames, ledger):
             if message is TICK:
                 _show_all(show, events(), None)
                 continue
-            made = [message]
+            entry = None
             if run_of_topic(message.topic) is not None:  # all other messages are written already
                 entry = ledger.entry(message)
-                made += [] if entry is None else [entry]
-                for result in made:
-                    log.put(result)
-            _show_all(show, events(), *made)
+                log.put(message)
+            _show_all(show, events(), message)
+            if entry is not None:
+                log.put(entry)
+                _show_all(show, (), entry)
     except (LogError, SourceError):
         raise
     except IpsysError as fault:

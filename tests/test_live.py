@@ -18,6 +18,7 @@ from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recorder import Recording
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
@@ -38,7 +39,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.verify import diff, verify
 from ipsys_log.runs.view import LogView
-from ipsys_log.sinks.sink import Consumer
+from ipsys_log.sinks.sink import Consumer, send_all
 from ipsys_log.stages.detect import Detect
 from ipsys_log.survey.checks import check_entry, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry
@@ -293,6 +294,54 @@ def test_consumer_that_fails_ends_no_recording(
     assert len(images) == sum(frames.values())
     if stages:
         assert all(one.equal for one in again(target))
+
+
+class Noting:
+    """A stream that notes what it sends."""
+
+    name = "noting"
+    payloads: tuple[type, ...] = (Tracks, Latency)
+
+    def __init__(self, steps: list[tuple[str, type, int]]) -> None:
+        self._steps = steps
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        send_all(self, messages)
+
+    def send(self, message: Message) -> None:
+        self._steps.append(("sent", type(message.payload), message.log_time_ns))
+
+    def finish(self) -> None:
+        self._steps.append(("ended", Tracks, 0))
+
+
+@pytest.mark.slow
+def test_position_is_sent_after_its_write_and_before_its_latency(
+    lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[tuple[str, type, int]] = []
+    put = Recording.put
+
+    def noted(self: Recording, message: Message) -> None:
+        put(self, message)
+        if isinstance(message.payload, (Tracks, Latency)):
+            steps.append(("written", type(message.payload), message.log_time_ns))
+
+    monkeypatch.setattr(Recording, "put", noted)
+    attached, settings, clock = attached_in_steps(lab_log)
+    request, sinks = Request(model_from=calibration), [Noting(steps)]
+    with attached:
+        pipeline.live(attached, settings, tmp_path / "x.mcap", request, None, [clock.watch], sinks=sinks)
+    assert steps.pop() == ("ended", Tracks, 0)
+    assert [step for step, *_ in steps] == ["written", "sent"] * (len(steps) // 2)
+    assert [row[1:] for row in steps[::2]] == [row[1:] for row in steps[1::2]]
+    times_ns = [time_ns for step, kind, time_ns in steps if (step, kind) == ("sent", Tracks)]
+    assert len(times_ns) > 0
+    latencies = [
+        number for number, (step, kind, _) in enumerate(steps) if (step, kind) == ("written", Latency)
+    ]
+    assert all(steps[number - 1][2] == steps[number][2] for number in latencies)
+    assert len(latencies) == len(times_ns)
 
 
 def test_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> None:

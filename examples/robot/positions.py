@@ -27,6 +27,9 @@ class UdpPositions:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(address)
 
+    def close(self):
+        self.socket.close()
+
     def receive(self, wait_s, now_s):
         """Read what has arrived; wait for the first datagram at most this long."""
         while select.select([self.socket], [], [], wait_s)[0]:
@@ -68,6 +71,9 @@ class VrpnPositions:
         self.parse(0.0)
         while b"vrpn_Tracker Pos_Quat" not in self.types.values():  # then the server knows this client
             self.receive(1.0, 0.0)
+
+    def close(self):
+        self.socket.close()
 
     def more(self):
         data = self.socket.recv(65536)

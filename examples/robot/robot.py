@@ -27,10 +27,19 @@ def address_of(text):
 def parse():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robot", required=True, help="its name in the stream")
-    parser.add_argument("--positions", required=True, help="udp://HOST:PORT or vrpn://HOST:PORT")
+    parser.add_argument("--positions", required=True, help="udp://HOST:PORT, vrpn:// or ros2://")
     parser.add_argument("--wheels", required=True, help="HOST:PORT of the simulated wheels")
     parser.add_argument("--path", required=True, help='waypoints in m: "0.5,0.5 0.5,2.5"')
     return parser.parse_args()
+
+
+def open_positions(text, robot):
+    kind = text.partition("://")[0]
+    if kind == "ros2":  # needs the package eclipse-zenoh
+        from ros2_positions import Ros2Positions
+
+        return Ros2Positions(address_of(text), robot)
+    return (VrpnPositions if kind == "vrpn" else UdpPositions)(address_of(text), robot)
 
 
 def wait_for_positions(positions, count, now_s):
@@ -43,8 +52,7 @@ def wait_for_positions(positions, count, now_s):
 
 def main():
     options = parse()
-    receiver = VrpnPositions if options.positions.startswith("vrpn:") else UdpPositions
-    positions = receiver(address_of(options.positions), options.robot)
+    positions = open_positions(options.positions, options.robot)
     controller = Controller([tuple(map(float, point.split(","))) for point in options.path.split()])
     wheels = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wheels.connect(address_of(options.wheels))
@@ -62,6 +70,7 @@ def main():
         if pose is not None:
             command |= {"x_m": pose.x_m, "y_m": pose.y_m, "time_ns": pose.time_ns}
         wheels.send(json.dumps(command).encode())
+    positions.close()
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from ipsys_log.messages import (
     Rig,
     calibration_topic,
 )
-from ipsys_log.runs.output import write_message
+from ipsys_log.runs.output import serialize, write_message
 
 __all__ = [
     "CameraSource",
@@ -137,7 +137,8 @@ class Recording:
         WriteError
             The disk is full, and the reserved space is used up too.
         """
-        self._write(lambda: write_message(self._writer, message, self.counts))
+        data = serialize(message)  # another thread may write meanwhile
+        self._write(lambda: write_message(self._writer, message, self.counts, data))
 
     def flush(self) -> None:
         """Pass all messages to the disk."""

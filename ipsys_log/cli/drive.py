@@ -59,7 +59,7 @@ def drive(
         Path, typer.Option("--program", metavar="FILE", help="The program of the robots.")
     ] = Path("examples/robot/robot.py"),
     over: Annotated[
-        str, typer.Option("--over", metavar="udp|vrpn", help="The stream of the positions.")
+        str, typer.Option("--over", metavar="udp|vrpn|ros2", help="The stream of the positions.")
     ] = "udp",
     loss: Annotated[
         float, typer.Option("--loss", metavar="SHARE", help="Lose this share of the datagrams, such as 0.05.")

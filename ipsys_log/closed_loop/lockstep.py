@@ -77,7 +77,7 @@ class SyncPoint:
             return
         self._shown += isinstance(message.payload, CompressedImage)
         for pose in self._poses.read(message):
-            # VRPN has no poses without a heading.
+            # VRPN and ROS 2 have no poses without a heading.
             if not self._good_only or (pose.is_good and pose.track.heading_rad is not None):
                 self.sent[pose.track.robot] += 1
 

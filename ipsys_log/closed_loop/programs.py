@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ipsys_log.capture.frames import Clock
+from ipsys_log.closed_loop.ports import Ports
 from ipsys_log.closed_loop.settings import RobotRun
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Waypoint
@@ -86,23 +87,21 @@ class RelayLink:
 
 
 @contextmanager
-def start_programs(run: RobotRun, wheels: str, ports: Sequence[int]) -> Iterator[Programs]:
+def start_programs(run: RobotRun, wheels: str, ports: Ports) -> Iterator[Programs]:
     """Start a program for each robot, and a relay if the run has one; they end after the block.
 
     Parameters
     ----------
     wheels : the address of the wheels.
-    ports : of the positions of each robot (of all robots with VRPN), then of each relay.
     """
     with ExitStack() as stack:
         relays: dict[str, RelayLink] = {}
         processes: dict[str, subprocess.Popen[bytes]] = {}
         for number, (robot, path) in enumerate(run.paths.items()):
-            port = ports[0] if run.over == "vrpn" else ports[number]
             if run.has_relay:
-                relays[robot] = _start_relay(run, number, ports[len(run.paths) + number], port, stack)
-            command = _command(run.program, robot, f"{run.over}://{_LOOPBACK}:{port}", wheels, path)
-            processes[robot] = _start(command, stack)
+                relays[robot] = _start_relay(run, robot, number, ports, stack)
+            address = f"{run.over}://{_LOOPBACK}:{ports.positions[number]}"
+            processes[robot] = _start(_command(run.program, robot, address, wheels, path), stack)
         yield Programs(run.program, processes, relays)
 
 
@@ -114,16 +113,13 @@ def _command(
     return [*runs, "--robot", robot, "--positions", positions, "--wheels", wheels, "--path", places]
 
 
-def _start_relay(run: RobotRun, number: int, port: int, target: int, stack: ExitStack) -> RelayLink:
+def _start_relay(run: RobotRun, robot: str, number: int, ports: Ports, stack: ExitStack) -> RelayLink:
+    port, target = ports.relays[number], ports.positions[number]
     command = [sys.executable, "-m", "ipsys_log.closed_loop.relay", "--port", str(port), "--to", str(target)]
-    command += [
-        "--loss",
-        str(run.loss),
-        "--delay-s",
-        str(run.delay_s),
-        "--seed",
-        str(run.seed + 1000 * number),
-    ]
+    command += ["--loss", str(run.loss), "--delay-s", str(run.delay_s)]
+    command += ["--seed", str(run.seed + 1000 * number)]
+    if run.over == "ros2":
+        command += ["--ros2", str(ports.server), "--robot", robot]
     process = _start([*command, *["--lockstep"] * run.lockstep], stack, subprocess.PIPE)
     assert process.stdout is not None
     stack.callback(process.stdout.close)

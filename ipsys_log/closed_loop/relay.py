@@ -4,7 +4,7 @@
 
 The relay listens on loopback, and sends to another port of loopback. With ``--lockstep`` its clock is that of
 the ticks, which the simulator sends to the same port; the relay answers with the number of datagrams that it
-has sent on.
+has sent on. With ``--ros2`` it does the same with the poses of ROS 2: see ``ros2_relay.py``.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import json
 import select
 import socket
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from ipsys_log.capture.frames import Clock
@@ -25,6 +27,7 @@ __all__ = ["Relay"]
 _LOOPBACK = "127.0.0.1"
 _TURN_S = 0.005
 _LONGEST_BYTES = 2048
+Send = Callable[[bytes], object]
 
 
 class Relay:
@@ -68,17 +71,17 @@ def _tick_of(datagram: bytes) -> dict[str, Any] | None:
         return None
 
 
-def _serve(sock: socket.socket, relay: Relay, target: tuple[str, int]) -> None:
+def _serve(sock: socket.socket, relay: Relay, send: Send) -> None:
     """Forward datagrams by the real clock, until the process is ended."""
     clock = Clock()
     while True:
         if select.select([sock], [], [], _TURN_S)[0]:
             relay.put(sock.recv(_LONGEST_BYTES), clock.now_ns())
         for datagram in relay.take(clock.now_ns()):
-            sock.sendto(datagram, target)
+            send(datagram)
 
 
-def _serve_lockstep(sock: socket.socket, relay: Relay, target: tuple[str, int]) -> None:
+def _serve_lockstep(sock: socket.socket, relay: Relay, send: Send) -> None:
     """Forward datagrams by the clock of the ticks, until the process is ended."""
     early: list[bytes] = []
     tick: dict[str, Any] | None = None
@@ -94,10 +97,24 @@ def _serve_lockstep(sock: socket.socket, relay: Relay, target: tuple[str, int]) 
             relay.put(waiting, tick["time_ns"])
         early.clear()
         for due in relay.take(tick["time_ns"]):
-            sock.sendto(due, target)
+            send(due)
         answer = {"relay_tick": tick["relay_tick"], "forwarded": relay.forwarded}
         sock.sendto(json.dumps(answer).encode(), simulator)
         tick = None
+
+
+@contextmanager
+def _open_output(sock: socket.socket, options: argparse.Namespace) -> Iterator[Send]:
+    """Open the way to the robot. With ROS 2, its messages come in through ``sock``, too."""
+    if options.ros2 is None:
+        yield lambda datagram: sock.sendto(datagram, (_LOOPBACK, options.to))
+        return
+    from ipsys_log.closed_loop.ros2_relay import open_ros2
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inward:
+        inward.connect(sock.getsockname())
+        with open_ros2(options.robot, options.ros2, options.to, inward.send) as send:
+            yield send
 
 
 def main() -> None:
@@ -108,13 +125,16 @@ def main() -> None:
     parser.add_argument("--delay-s", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--lockstep", action="store_true")
+    parser.add_argument("--ros2", type=int, help="the port of the router that sends the poses of --robot")
+    parser.add_argument("--robot")
     options = parser.parse_args()
     relay = Relay(options.loss, round(options.delay_s * NS_PER_S), options.seed)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((_LOOPBACK, options.port))
-        print("ready", flush=True)  # noqa: T201
-        serve = _serve_lockstep if options.lockstep else _serve
-        serve(sock, relay, (_LOOPBACK, options.to))
+        with _open_output(sock, options) as send:
+            print("ready", flush=True)  # noqa: T201
+            serve = _serve_lockstep if options.lockstep else _serve
+            serve(sock, relay, send)
 
 
 if __name__ == "__main__":

@@ -118,7 +118,7 @@ class _Parts:
         run, ports = self.run, self.run.ports()
         with ExitStack() as stack:
             streams: list[Stream] = []
-            for robots, settings in run.streams(ports[1:]):
+            for robots, settings in run.streams(ports):
                 heights_m = {robot: self.rig.robot_heights_m().get(robot) for robot in robots}
                 opened = open_streams(
                     settings, [self.topic], cameras.clock.now_ns, cameras.add_event, heights_m=heights_m
@@ -130,9 +130,9 @@ class _Parts:
                 for started in programs:
                     started.check()
 
-            wheels = Wheels(ports[0], run.paths, check, self.say)
+            wheels = Wheels(ports.wheels, run.paths, check, self.say)
             stack.enter_context(closing(wheels))
-            programs.append(stack.enter_context(start_programs(run, wheels.address, ports[1:])))
+            programs.append(stack.enter_context(start_programs(run, wheels.address, ports)))
             wheels.wait_for_robots()
             yield streams, wheels, programs[0]
 
@@ -154,7 +154,7 @@ def _drive_lockstep(parts: _Parts) -> list[Outcome]:
     """Drive in simulated time."""
     clock = SimulatedClock()
     lab = parts.lab(clock.now_ns())
-    sync = SyncPoint(parts.topic, tuple(parts.run.paths), clock, parts.run.over == "vrpn")
+    sync = SyncPoint(parts.topic, tuple(parts.run.paths), clock, parts.run.sends_good_only)
     cameras = LockstepCameras(parts.run, lab, clock, sync, parts.say)
     with parts.connect(cameras) as (streams, wheels, programs):
         cameras.steering = Steering(parts.run, lab, wheels, programs, clock.now_ns(), parts.say)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import atan2
@@ -13,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ipsys_log.closed_loop.ports import Ports, find_ports
 from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Waypoint
 from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing
@@ -68,8 +68,8 @@ class RobotRun:
     lab : the simulated lab that the model is fitted to; its rate is that of the cameras.
     paths : the waypoints of each robot.
     program : the program of the robots.
-    over : the stream of the positions: ``udp`` or ``vrpn``.
-    loss, delay_s : share of lost datagrams, and added delay.
+    over : the stream of the positions: ``udp``, ``vrpn`` or ``ros2``.
+    loss, delay_s : share of lost datagrams (ROS 2: messages), and added delay.
     failures : cameras that send nothing for some time.
     lockstep : simulated time, which advances from frame to frame; otherwise real time.
     seed : seed of the wheels, the start and the lost datagrams.
@@ -95,6 +95,11 @@ class RobotRun:
     def has_relay(self) -> bool:
         return bool(self.loss or self.delay_s)
 
+    @property
+    def sends_good_only(self) -> bool:
+        """True if the stream withholds stale and extrapolated positions."""
+        return self.over != "udp"
+
     def check(self) -> None:
         """Check all settings.
 
@@ -108,10 +113,7 @@ class RobotRun:
                 f"--program {self.program}: does not exist; name the program of the robots, such as "
                 f"{PROGRAM} in the source of ipsys"
             )
-        if self.over not in ("udp", "vrpn"):
-            raise IpsysError(f"--over {self.over}: is no stream of robots; use udp or vrpn")
-        if self.has_relay and self.over != "udp":
-            raise IpsysError("--loss and --delay-ms need --over udp: VRPN uses TCP, which loses nothing")
+        self._check_stream()
         if not 0 <= self.loss < 1:
             raise IpsysError(f"--loss {self.loss:g}: give a share from 0 to below 1, such as 0.05")
         if not 0 <= self.delay_s <= 10:
@@ -124,6 +126,14 @@ class RobotRun:
                 )
         self._check_waypoints()
         self.ports()
+
+    def _check_stream(self) -> None:
+        if self.over not in ("udp", "vrpn", "ros2"):
+            raise IpsysError(f"--over {self.over}: is no stream of robots; use udp, vrpn or ros2")
+        if self.over == "ros2":
+            check_installed("--over ros2 needs", "zenoh", "rosbags", "xxhash")
+        if self.has_relay and self.over == "vrpn":
+            raise IpsysError("--loss and --delay-ms need --over udp or --over ros2: VRPN has no relay")
 
     def _check_waypoints(self) -> None:
         cameras = mount_cameras(self.lab)
@@ -140,56 +150,33 @@ class RobotRun:
         """Return the settings as a line of text."""
         parts = [f"seed {self.seed}", "simulated time" if self.lockstep else "real time"]
         parts += [f"{self.lab.rate_hz:g} frames/s", f"positions over {self.over}"]
-        parts += [f"{100 * self.loss:g} % of the datagrams lost"] if self.loss else []
+        unit = "datagrams" if self.over == "udp" else "messages"
+        parts += [f"{100 * self.loss:g} % of the {unit} lost"] if self.loss else []
         parts += [f"{1000 * self.delay_s:g} ms of delay"] if self.delay_s else []
         parts += [f"camera {f.camera} fails at {f.start_s:g} s for {f.duration_s:g} s" for f in self.failures]
         return ", ".join(parts)
 
-    def streams(self, ports: Sequence[int]) -> list[tuple[tuple[str, ...], StreamSettings]]:
-        """Return the robots and the settings of each stream: with UDP, each robot gets its own positions.
-
-        Parameters
-        ----------
-        ports : all ports after that of the wheels.
-        """
+    def streams(self, ports: Ports) -> list[tuple[tuple[str, ...], StreamSettings]]:
+        """Return the robots and the settings of each stream: with UDP, each robot gets its own positions."""
         robots = tuple(self.paths)
         if self.over == "vrpn":
-            return [(robots, StreamSettings(vrpn=ports[0], robots=robots))]
-        first = len(robots) if self.has_relay else 0
+            return [(robots, StreamSettings(vrpn=ports.server, robots=robots))]
+        if self.over == "ros2":
+            return [(robots, StreamSettings(ros2=ports.server, robots=robots))]
         return [
             ((robot,), StreamSettings(udp=(f"127.0.0.1:{port}",), robots=(robot,)))
-            for robot, port in zip(robots, ports[first:], strict=False)
+            for robot, port in zip(robots, ports.relays or ports.positions, strict=True)
         ]
 
-    def ports(self) -> list[int]:
-        """Return ports of loopback that are free now: wheels, positions of each robot, relay of each robot.
+    def ports(self) -> Ports:
+        """Return ports of loopback that are free now.
 
         Raises
         ------
         IpsysError
             A port is in use.
         """
-        count = 2 if self.over == "vrpn" else 1 + len(self.paths) * (1 + self.has_relay)
-        with ExitStack() as stack:
-            ports = []
-            for number in range(count):
-                wanted = self.port + number if self.port else 0
-                probes = [
-                    stack.enter_context(socket.socket(socket.AF_INET, kind))
-                    for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM)
-                ]
-                try:
-                    for probe in probes:
-                        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, probe is probes[1])
-                        probe.bind(("127.0.0.1", wanted))
-                        wanted = wanted or probe.getsockname()[1]
-                except OSError as error:
-                    raise IpsysError(
-                        f"--port {self.port}: port {wanted} is in use, perhaps by another run; end it, or "
-                        "give another port"
-                    ) from error
-                ports.append(int(wanted))
-            return ports
+        return find_ports(self.port, len(self.paths), self.over != "udp", self.has_relay)
 
 
 def choose_paths(count: int, given: Sequence[str] = ()) -> dict[str, tuple[Waypoint, ...]]:

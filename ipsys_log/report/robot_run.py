@@ -144,7 +144,7 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from ipsys_log.report.figures import png, svg_data_uri
-    from ipsys_log.report.robot_run_figure import draw_drive, draw_panels
+    from ipsys_log.report.robot_run_figure import draw_drive, draw_panels, draw_paths
 
     result = read_robot_run(session)
     panels = [png(draw_panels(session, result, robot), _PANELS_DPI) for robot in result.robots]
@@ -167,6 +167,7 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
         log=session.paths[-1].name,
         seconds=f"{(result.end_ns - result.start_ns) / NS_PER_S:.1f}",
         nearest=None if result.nearest_m is None else f"{result.nearest_m:.2f}",
+        paths=svg_data_uri(draw_paths(session, result)) if len(robots) > 1 else None,
         robots=robots,
     )
     return text, panels[0]

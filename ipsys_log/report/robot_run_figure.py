@@ -20,7 +20,7 @@ from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, TEST, robot_colour, shorten
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["draw_drive", "draw_panels"]
+__all__ = ["draw_drive", "draw_panels", "draw_paths"]
 
 Image = NDArray[np.uint8]
 
@@ -202,6 +202,28 @@ def draw_drive(session: Session, robot: RobotResult) -> Figure:
     axes.plot(*places_m.T, "x", color=TEST, ms=9, mew=1.8, ls="none", label="waypoints")
     for number, place in enumerate(places_m, 1):
         axes.annotate(f"P{number}", place, (6, -12), textcoords="offset points", color=TEST, fontsize=9)
+    axes.tick_params(labelsize=8, colors=NOTE)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def draw_paths(session: Session, result: RobotRunResult) -> Figure:
+    """Draw the floor with the paths of all robots, and the time in s at which each reached its waypoints."""
+    figure = Figure(figsize=(4.7, 5.2), layout="constrained")
+    axes = figure.add_subplot()
+    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    places_m = [np.array([(place.x_m, place.y_m) for place in robot.path]) for robot in result.robots]
+    draw_ground(axes, rigs[-1] if rigs else None, places_m)
+    for number, (robot, at_m) in enumerate(zip(result.robots, places_m, strict=True)):
+        colour, path = robot_colour(number), robot.received if robot.true is None else robot.true
+        axes.plot(*path.points_m[:, :2].T, color=colour, lw=1.4, label=robot.name)
+        axes.plot(*at_m.T, "x", color=colour, ms=8, mew=1.8)
+        for point in robot.reached:
+            at_s = (point.start_ns - result.start_ns) / NS_PER_S
+            where, offset = at_m[point.number - 1], (6, 5)
+            axes.annotate(
+                f"{at_s:.0f} s", where, offset, textcoords="offset points", color=colour, fontsize=9
+            )
     axes.tick_params(labelsize=8, colors=NOTE)
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8, frameon=False)
     return figure

@@ -29,6 +29,7 @@ __all__ = [
     "create_copy",
     "open_target",
     "record_message",
+    "serialize",
     "write_log",
     "write_message",
     "write_messages",
@@ -43,14 +44,20 @@ def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, 
     return counts
 
 
-def write_message(writer: LogWriter, message: Message, counts: dict[str, int]) -> None:
-    """Write a message to an open log, and count it by its topic. Passwords are removed before."""
-    payload = hide_passwords(message.payload) if isinstance(message.payload, Rig) else message.payload
+def serialize(message: Message) -> bytes:
+    """Return the bytes of a message in a log. Passwords are removed."""
+    return encode(hide_passwords(message.payload) if isinstance(message.payload, Rig) else message.payload)
+
+
+def write_message(
+    writer: LogWriter, message: Message, counts: dict[str, int], data: bytes | None = None
+) -> None:
+    """Write a message to an open log, and count it by its topic; ``data`` is that of :func:`serialize`."""
     name = schema_name(type(message.payload))
     # A camera can begin to send another message type: this check refuses another schema on a known topic.
     if message.topic not in counts or message.camera is not None:
         writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
-    writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(payload))
+    writer.write(message.topic, message.log_time_ns, message.publish_time_ns, data or serialize(message))
     counts[message.topic] = counts.get(message.topic, 0) + 1
 
 

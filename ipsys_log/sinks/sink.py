@@ -12,7 +12,18 @@ from typing import Protocol, runtime_checkable
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
 
-__all__ = ["Consumer", "Consumers", "DropReport", "LiveQueue", "LiveSinks", "SelectiveSink", "Sink", "Warn"]
+__all__ = [
+    "Consumer",
+    "Consumers",
+    "DropReport",
+    "LiveQueue",
+    "LiveSinks",
+    "PromptSink",
+    "SelectiveSink",
+    "Sink",
+    "Warn",
+    "send_all",
+]
 
 # Limits of a sink's queue: above the first limit images are dropped, above the second all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
@@ -45,6 +56,29 @@ class SelectiveSink(Sink, Protocol):
     """A sink that gets only messages with payloads of some types: images do not fill its queue."""
 
     payloads: tuple[type, ...]
+
+
+@runtime_checkable
+class PromptSink(SelectiveSink, Protocol):
+    """A sink that never waits, such as a stream of datagrams: it drops what its receivers cannot take.
+
+    During a recording, it gets its messages in the thread that publishes them. A queue would delay them: a
+    thread that wakes up waits for Python's lock (GIL), up to 5 ms for each switch of threads.
+    """
+
+    def send(self, message: Message) -> None:
+        """Process one message, and return at once."""
+
+    def finish(self) -> None:
+        """Process the end of the messages."""
+
+
+def send_all(sink: PromptSink, messages: Iterator[Message | None]) -> None:
+    """Let a prompt sink process messages until they end."""
+    for message in messages:
+        if message is not None:
+            sink.send(message)
+    sink.finish()
 
 
 class DropReport:
@@ -102,8 +136,6 @@ class LiveQueue:
 
     def put(self, message: Message) -> bool:
         """Enqueue a message; return False if it is dropped."""
-        if isinstance(message.payload, SkippedVideo):
-            message = replace(message, payload=message.payload.frame)
         with self._changed:
             if self._closed:
                 return True
@@ -151,19 +183,21 @@ class LiveSinks:
 
     Parameters
     ----------
-    sinks : each gets every message.
+    sinks : each gets every message; prompt sinks at once, the others in their own threads.
     warn : makes an event of a kind and a text, and prints it; called from any thread.
     """
 
     def __init__(self, sinks: Sequence[Sink], warn: Warn) -> None:
-        self.queues = {sink.name: LiveQueue() for sink in sinks}
-        self._payloads = {sink.name: sink.payloads for sink in sinks if isinstance(sink, SelectiveSink)}
-        self._drops = {sink.name: DropReport(sink.name, warn) for sink in sinks}
+        self._prompt = [sink for sink in sinks if isinstance(sink, PromptSink)]
+        queued = [sink for sink in sinks if not isinstance(sink, PromptSink)]
+        self.queues = {sink.name: LiveQueue() for sink in queued}
+        self._payloads = {sink.name: sink.payloads for sink in queued if isinstance(sink, SelectiveSink)}
+        self._drops = {sink.name: DropReport(sink.name, warn) for sink in queued}
         self._warn = warn
         self._fault: Exception | None = None
         self._threads = [
             threading.Thread(target=self._run, args=(sink,), name=f"sink {sink.name}", daemon=True)
-            for sink in sinks
+            for sink in queued
         ]
 
     def __enter__(self) -> LiveSinks:
@@ -174,6 +208,8 @@ class LiveSinks:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for sink in tuple(self._prompt):
+            self._call(sink, sink.finish)
         for waiting in self.queues.values():
             waiting.close()
         for thread in self._threads:
@@ -185,6 +221,11 @@ class LiveSinks:
         """Hand a message to each sink."""
         if message is None:
             return
+        if isinstance(message.payload, SkippedVideo):
+            message = replace(message, payload=message.payload.frame)
+        for sink in tuple(self._prompt):
+            if isinstance(message.payload, sink.payloads):
+                self._call(sink, sink.send, message)
         for name, waiting in self.queues.items():
             wanted = name not in self._payloads or isinstance(message.payload, self._payloads[name])
             if wanted and not waiting.put(message):
@@ -195,14 +236,24 @@ class LiveSinks:
         if self._fault is not None:
             raise self._fault
 
+    def _call(self, sink: PromptSink, function: Callable[..., None], *arguments: Message) -> None:
+        try:
+            function(*arguments)
+        except Exception as fault:  # any error: the frames are more important
+            self._prompt.remove(sink)
+            self._report(sink, fault)
+
     def _run(self, sink: Sink) -> None:
         waiting = self.queues[sink.name]
         try:
             sink.consume(iter(waiting))
         except Exception as fault:  # any error: the frames are more important
-            self._fault = self._fault or fault
             waiting.close()
-            self._warn("sink_stopped", f"{sink.name} stopped ({_text_of(fault)}); the recording continues")
+            self._report(sink, fault)
+
+    def _report(self, sink: Sink, fault: Exception) -> None:
+        self._fault = self._fault or fault
+        self._warn("sink_stopped", f"{sink.name} stopped ({_text_of(fault)}); the recording continues")
 
 
 class Consumers:
@@ -219,7 +270,8 @@ class Consumers:
 
     def __init__(self, consumers: Sequence[Consumer], warn: Warn, sinks: Sequence[Sink] = ()) -> None:
         self._sinks = LiveSinks(sinks, warn)
-        self._consumers: list[Consumer] = [*consumers, self._sinks]
+        # Streams come first: each step before them delays the positions.
+        self._consumers: list[Consumer] = [self._sinks, *consumers]
         self._warn = warn
         self._fault: Exception | None = None
 

@@ -28,9 +28,9 @@ REFUSED = {
     ("--fail", "blue=5:2"): "--fail blue: the lab has no camera of this name; it has red, white, black",
     ("--fail", "red"): "--fail red: write CAMERA=START:SECONDS, such as white=20:5",
     ("--fail", "red=0:2"): "--fail red=0:2: a camera must send for 1 s first; give a later start",
-    ("--over", "natnet"): "--over natnet: is no stream of robots; use udp or vrpn",
-    ("--over", "vrpn", "--loss", "0.1"): "--loss and --delay-ms need --over udp: VRPN uses TCP, which loses "
-    "nothing",
+    ("--over", "natnet"): "--over natnet: is no stream of robots; use udp, vrpn or ros2",
+    ("--over", "vrpn", "--loss", "0.1"): "--loss and --delay-ms need --over udp or --over ros2: VRPN has no "
+    "relay",
     ("--loss", "1.5"): "--loss 1.5: give a share from 0 to below 1, such as 0.05",
     ("--delay-ms", "-1"): "--delay-ms -1: give a delay from 0 to 10000 ms",
     ("--program", "none.py"): "--program none.py: does not exist; name the program of the robots, such as "

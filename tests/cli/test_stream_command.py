@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 import ipsys_log
-from ipsys_log.cli.keys import read_keys
+from ipsys_log.cli.keys import press, read_keys
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigMarker, RigStream
 from ipsys_log.messages.channels import RIG, TRACKS
@@ -85,6 +85,7 @@ def test_no_socket_is_open_beyond_loopback_without_host(
     log: Path, listening: socket.socket, host: str | None
 ) -> None:
     options = ["--udp", f"127.0.0.1:{port_of(listening)}", "--udp", "239.255.0.1:9870", "--loop"]
+    options += ["--mavlink", "ada=127.0.0.1:9"]
     ports = [free_port() for _ in range(3)]
     for name, port in zip(("vrpn", "ros2", "foxglove"), ports, strict=True):
         options += [f"--{name}-port", str(port)]
@@ -93,7 +94,9 @@ def test_no_socket_is_open_beyond_loopback_without_host(
         listening.recv(2048)
         opened = open_sockets(program.pid)
         assert {port for *_, port in opened} >= set(ports)
-        assert len(opened) == 6
+        assert len(opened) == 7
+        addresses = {address for address, port in listening_sockets() if port in ports}
+        assert addresses == ({host} if host else {"127.0.0.1"})
         assert bool(exposed(program.pid)) is (host is not None)
     finally:
         text = stop(program)
@@ -156,6 +159,23 @@ def test_keys_of_the_terminal_control_the_player(log: Path, listening: socket.so
         os.close(theirs)
 
 
+def test_keys_change_rate_pause_and_loop(log: Path) -> None:
+    with ipsys_log.play(log, start_paused=True) as player:
+        rates = []
+        for key in "++++-----------":
+            press(player, key)
+            rates.append(player.rate)
+        assert (rates[:5], rates[-2:]) == ([2.0, 5.0, 10.0, 10.0, 5.0], [0.1, 0.1])
+        states = []
+        for key in (" ", " ", "l", "l", "x", "."):
+            press(player, key)
+            states.append((player.is_paused, player.loop))
+        assert states == [
+            *((False, False), (True, False), (True, True), (True, False), (True, False)),
+            (True, False),
+        ]
+
+
 def test_background_job_leaves_the_terminal_alone(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     terminal, theirs = pty.openpty()
     with os.fdopen(theirs) as stdin, ipsys_log.play(log, start_paused=True) as player:
@@ -205,6 +225,9 @@ REFUSED = {
     "--udp 9870 --run best": "run 'best' has no tracks; poly has",
     "--udp 9870 --topics /nothing": "--topics /nothing: the log has no such topic",
     "--udp 9870 --topics /rig": "name one topic with tracks: /runs/poly/tracks",
+    "--udp 9870 --start-offset 7": "start offset 7 s: the log ends after 1.960 s",
+    "--udp 9870 --start-offset -1": "start offset -1.0 s: give a time of at least 0 s",
+    "--mavlink eve=9870": "robot 'eve' is not known; the rig has ada, bob",
     "--host 0.0.0.0": "--host: has no effect without a stream",
     "--robot ada": "--robot: has no effect without a stream",
     "--ros2-domain 0": "--ros2-domain: has no effect without a stream",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -152,14 +153,45 @@ def test_robot_drives_with_positions_of_vrpn(
     assert max(point.control_m for point in robot.reached) < 0.02
 
 
-def test_three_robots_keep_their_distance(
+def test_robot_drives_with_delayed_poses_of_ros_2(
     replayed_log: Path, short_run: Callable[[RobotRun, str], Path]
 ) -> None:
-    result = result_of(short_run(settings_of(replayed_log, robots=3), "three.mcap"))
+    pytest.importorskip("zenoh")
+    run = replace(settings_of(replayed_log, SHORT), over="ros2", loss=0.1, delay_s=0.1)
+    log = short_run(run, "ros2.mcap")
+    (robot,) = result_of(log).robots
+    assert robot.is_finished
+    assert max(point.control_m for point in robot.reached) < 0.02
+    with Session([log]) as session:
+        used = {command.position_time for command in session.payloads(session.topics(COMMANDS))} - {None}
+        sent = {message.publish_time_ns for message in session.messages(session.topics(TRACKS, "poly"))}
+    assert used < sent
+    assert log.read_bytes() == short_run(run, "again.mcap").read_bytes()
+
+
+def test_three_robots_keep_their_distance(
+    replayed_log: Path, short_run: Callable[[RobotRun, str], Path], ipsys: Ipsys, tmp_path: Path
+) -> None:
+    log = short_run(settings_of(replayed_log, robots=3), "three.mcap")
+    result = result_of(log)
     assert [(robot.is_finished, len(robot.reached)) for robot in result.robots] == [(True, 4)] * 3
     assert max(point.control_m for robot in result.robots for point in robot.reached) < 0.02
     assert result.nearest_m is not None
     assert result.nearest_m > 0.45  # diagonals of two markers with margins: 0.42 m
+    assert _crossings(result) >= 2
+    assert ipsys("report", log, "--html", tmp_path / "three.html").code == 0
+    page = (tmp_path / "three.html").read_text(encoding="utf-8")
+    assert f"Smallest distance between two robots: {result.nearest_m:.2f} m" in page
+    assert page.count("data:image/") == 2 * 3 + 1  # panels and map of each, and a map of all
+
+
+def _crossings(result: RobotRunResult) -> int:
+    """Return the number of pairs of robots whose true paths come within 5 cm of each other, at any times."""
+    paths_m = [robot.true.points_m[:, None, :2] for robot in result.robots if robot.true is not None]
+    return sum(
+        np.linalg.norm(one - other.transpose(1, 0, 2), axis=2).min() < 0.05
+        for one, other in combinations(paths_m, 2)
+    )
 
 
 def test_real_time_run_records_frames_and_commands(

@@ -25,7 +25,9 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log import codec as log_codec
 from ipsys_log.messages import CompressedImage, Event, Message
+from ipsys_log.sinks.streams import foxglove as foxglove_stream
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.foxglove_messages import SUBPROTOCOLS, Subscriptions
 from ipsys_log.sinks.streams.poses import NewSession
@@ -177,6 +179,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "wrong secret": ({"token": "the-secret2"}, "has not the secret"),
     "no secret": ({"token": ""}, "has not the secret"),
     "foreign host": ({"host": "evil.example"}, "names another host"),
+    "other version": ({"subprotocols": ["foxglove.websocket.v0"]}, "does not speak foxglove.sdk.v1; use a"),
+    "no protocol": ({"subprotocols": None}, "does not speak foxglove.sdk.v1"),
 }
 
 
@@ -252,6 +256,26 @@ def test_any_text_of_a_client_is_read_or_refused(text: str) -> None:
     subscriptions = Subscriptions()
     with suppress(ValueError):
         assert subscriptions.read(text) == []
+
+
+def test_messages_without_a_subscriber_are_not_serialised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording has hundreds of messages in a second; a viewer shows a few topics."""
+    serialised: list[str] = []
+
+    def encode(payload: Any) -> bytes:
+        serialised.append(type(payload).__name__)
+        return log_codec.encode(payload)
+
+    monkeypatch.setattr(foxglove_stream, "encode", encode)
+    with streaming() as (stream, _), opened(stream) as client:
+        wait_for(lambda: stream.client_count)
+        stream.consume(iter([tracks(0)] * 3))
+        assert serialised == []
+        subscribed(client, 1)
+        wait_for(lambda: any(one.subscriptions.number_of(1) for one in stream._clients))
+        stream.consume(iter([tracks(1)]))
+        assert isinstance(client.recv(_LIMIT_S), bytes)
+    assert serialised == ["Tracks"]
 
 
 def test_ended_subscription_gets_no_message() -> None:

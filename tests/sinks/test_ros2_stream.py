@@ -73,8 +73,8 @@ def streaming(
 def listening(stream: Ros2Stream, *topics: str) -> Iterator[ZenohListener]:
     """A listener whose subscriptions have arrived at the stream."""
     with closing(ZenohListener(stream.port, *topics)) as listener:
-        # A late subscriber gets the latched message only.
-        time.sleep(0.3)
+        # The router answers after it has read the subscriptions.
+        listener.tokens()
         yield listener
 
 

@@ -19,7 +19,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig, RigCamera, Tracks
 from ipsys_log.messages.channels import EVENTS
 from ipsys_log.sinks.player import play
-from ipsys_log.sinks.sink import LiveQueue, Sink
+from ipsys_log.sinks.sink import Consumers, LiveQueue, LiveSinks, Sink, send_all
 from tests.stages.drawing import jpeg
 
 _LIMIT_S = 120.0
@@ -40,6 +40,31 @@ class Collected:
             self.messages.append(message)
             if len(self.messages) == self._fault_at:
                 raise ZeroDivisionError("a fault\nin the sink")
+
+
+class Prompt:
+    """A sink that never waits; it keeps the messages and their thread, and may raise at the n-th message."""
+
+    name = "prompt"
+    payloads: tuple[type, ...] = (Tracks,)
+
+    def __init__(self, fault_at: int | None = None) -> None:
+        self.messages: list[Message] = []
+        self.threads: set[int] = set()
+        self.has_ended = False
+        self._fault_at = fault_at
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        send_all(self, messages)
+
+    def send(self, message: Message) -> None:
+        self.messages.append(message)
+        self.threads.add(threading.get_ident())
+        if len(self.messages) == self._fault_at:
+            raise ZeroDivisionError("a fault")
+
+    def finish(self) -> None:
+        self.has_ended = True
 
 
 class Stuck:
@@ -90,6 +115,36 @@ def test_waiting_messages_are_bounded() -> None:
     for number in range(1000):
         waiting.put(tracks(number))
     assert (len(waiting), waiting.dropped["tracks"]) == (200, 800)
+
+
+def test_prompt_sink_gets_messages_before_the_call_returns() -> None:
+    """A queue and a thread would delay positions on their way to robots."""
+    stuck, prompt = Stuck(), Prompt()
+    shown: list[int] = []
+    with Consumers([lambda _: shown.append(len(prompt.messages))], lambda *_: None, [stuck, prompt]) as show:
+        for number in range(300):
+            show(tracks(number))
+            show(image(number))
+        assert [message.log_time_ns for message in prompt.messages] == list(range(300))
+        assert prompt.threads == {threading.get_ident()}
+        assert shown[0] == 1  # streams come before displays
+        assert not prompt.has_ended
+        stuck.released.set()
+    assert prompt.has_ended
+
+
+def test_failing_prompt_sink_does_not_affect_the_others() -> None:
+    events: list[str] = []
+    broken, good, collected = Prompt(fault_at=3), Prompt(), Collected()
+    sinks = LiveSinks([broken, good, collected], lambda kind, text: events.append(f"{kind}: {text}"))
+    with sinks as show:
+        for number in range(10):
+            show(tracks(number))
+    assert events == ["sink_stopped: prompt stopped (a fault); the recording continues"]
+    assert [len(sink.messages) for sink in (broken, good, collected)] == [3, 10, 10]
+    assert (broken.has_ended, good.has_ended) == (False, True)
+    with pytest.raises(ZeroDivisionError):
+        sinks.check()
 
 
 def test_video_continues_with_a_keyframe() -> None:

@@ -23,7 +23,7 @@ from websockets.typing import Subprotocol
 from ipsys_log.log.codec import PAYLOADS, encode
 from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo, Tracks
 from ipsys_log.messages.channels import IMAGES
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, is_own_host, listen
 from ipsys_log.sinks.streams.foxglove_client import Client
 from ipsys_log.sinks.streams.foxglove_messages import (
@@ -52,7 +52,7 @@ _LOGGER.addHandler(logging.NullHandler())
 
 
 class FoxgloveStream:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that sends messages to Foxglove. It carries out no command.
+    """A :class:`~ipsys_log.sinks.sink.PromptSink` that sends messages to Foxglove. It carries out no command.
 
     A connection needs the secret in its address, a Host of this machine, and the Origin of Foxglove or none.
 
@@ -94,7 +94,8 @@ class FoxgloveStream:
         self._drops, self._refusals = DropReport(self.name, warn), 0
         self._channels: dict[str, Advertised] = {}
         self._latched: dict[str, tuple[int, bytes]] = {}
-        self._clients: set[Client] = set()
+        # Replaced as a whole: other threads iterate over it.
+        self._clients: frozenset[Client] = frozenset()
         for topic in topics:
             self._advertise(topic, Tracks)
         self._loop = asyncio.new_event_loop()
@@ -123,15 +124,26 @@ class FoxgloveStream:
 
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the messages until they end."""
-        for message in messages:
-            if message is None:
-                continue
-            if isinstance(message.payload, NewSession):
-                self._call(self._begin, message.payload.number, message.publish_time_ns)
-            else:
-                data = encode(message.payload)
-                self._call(self._send, message.topic, type(message.payload), message.publish_time_ns, data)
+        send_all(self, messages)
+
+    def finish(self) -> None:
+        """Report the lost messages."""
         self._drops.finish()
+
+    def send(self, message: Message) -> None:
+        """Send a message to the clients that have subscribed to its topic."""
+        payload, time_ns = message.payload, message.publish_time_ns
+        channel = self._channels.get(message.topic)
+        if isinstance(payload, NewSession):
+            self._call(self._begin, payload.number, time_ns)
+        elif channel is None or isinstance(payload, _LATCHED) or self._is_wanted(channel):
+            self._call(self._send, message.topic, type(payload), time_ns, encode(payload))
+        elif self._is_replayed:
+            self._call(self._send_time, time_ns)
+
+    def _is_wanted(self, channel: Advertised) -> bool:
+        """Return whether a client has subscribed to a channel; any thread may call this."""
+        return any(client.subscriptions.number_of(channel.number) is not None for client in self._clients)
 
     def close(self) -> None:
         """Disconnect the clients and close the socket."""
@@ -184,6 +196,11 @@ class FoxgloveStream:
             return self._refuse(
                 connection, name, "has not the secret; use the full address that ipsys printed"
             )
+        offered = ",".join(headers.get_all("Sec-WebSocket-Protocol")).replace(" ", "").split(",")
+        if not set(SUBPROTOCOLS) & set(offered):
+            return self._refuse(
+                connection, name, f"does not speak {SUBPROTOCOLS[0]}; use a newer version of Foxglove"
+            )
         if len(self._clients) >= _MOST_CLIENTS:
             return self._refuse(connection, name, f"is too much: there are {_MOST_CLIENTS} clients already")
         return None
@@ -198,7 +215,7 @@ class FoxgloveStream:
         client = Client(connection, self._drops)
         client.put(write_server_info("ipsys", self._session, self._is_replayed))
         client.put(write_advertise(list(self._channels.values())))
-        self._clients.add(client)
+        self._clients |= {client}
         sending = asyncio.create_task(client.send())
         try:
             async for text in connection:
@@ -206,7 +223,7 @@ class FoxgloveStream:
         except (ConnectionClosed, ValueError, OSError):
             pass  # a client that vanishes, or sends something else
         finally:
-            self._clients.discard(client)
+            self._clients -= {client}
             sending.cancel()
 
     def _subscribe(self, client: Client, text: str | bytes) -> None:

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.mavlink_messages import encode_odometry, encode_vision
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
@@ -54,7 +54,7 @@ def parse_endpoint(text: str) -> Endpoint:
 
 
 class MavlinkStream:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that sends the pose of a robot to its autopilot.
+    """A :class:`~ipsys_log.sinks.sink.PromptSink` that sends the pose of a robot to its autopilot.
 
     It answers requests of the autopilot for the time (TIMESYNC), and ignores every other message. Stale poses
     and poses outside the calibrated volume are withheld.
@@ -114,12 +114,18 @@ class MavlinkStream:
 
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the poses of the messages until they end."""
-        for message in messages:
-            for pose in () if message is None else self._poses.read(message):
-                heading_rad = pose.track.heading_rad
-                if pose.is_good and heading_rad is not None and pose.time_ns >= 0:
-                    self._send(self._encode(pose, heading_rad, self._north_rad))
+        send_all(self, messages)
+
+    def finish(self) -> None:
+        """Report the lost messages."""
         self._drops.finish()
+
+    def send(self, message: Message) -> None:
+        """Send the poses of a message."""
+        for pose in self._poses.read(message):
+            heading_rad = pose.track.heading_rad
+            if pose.is_good and heading_rad is not None and pose.time_ns >= 0:
+                self._send(self._encode(pose, heading_rad, self._north_rad))
 
     def close(self) -> None:
         """Close the socket."""

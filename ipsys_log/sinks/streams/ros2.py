@@ -12,7 +12,7 @@ import zenoh
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
@@ -31,7 +31,7 @@ _TICK_S, _TICKS_PER_DIAGNOSIS = 0.05, 20
 
 
 class Ros2Stream:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that publishes poses to nodes of ROS 2 with ``rmw_zenoh``.
+    """A :class:`~ipsys_log.sinks.sink.PromptSink` that publishes poses to nodes of ROS 2 with ``rmw_zenoh``.
 
     If a Zenoh router answers on the port, the stream is its client. Else the stream is the router. Stale
     poses, poses outside the calibrated volume and poses without heading are withheld.
@@ -99,10 +99,11 @@ class Ros2Stream:
         return self._drops.count
 
     def consume(self, messages: Iterator[Message | None]) -> None:
-        """Publish the poses of the messages until they end."""
-        for message in messages:
-            if message is not None:
-                self._publish(message)
+        """Send the poses of the messages until they end."""
+        send_all(self, messages)
+
+    def finish(self) -> None:
+        """Report the lost messages."""
         self._drops.finish()
 
     def close(self) -> None:
@@ -141,7 +142,8 @@ class Ros2Stream:
             self._of_robot[robot] = pose, self._declare(f"/{robot}/odom", ros2.ODOMETRY)
         return self._of_robot[robot]
 
-    def _publish(self, message: Message) -> None:
+    def send(self, message: Message) -> None:
+        """Publish the poses of a message."""
         poses = list(self._poses.read(message))
         self._send_clock()
         for pose in poses:

@@ -44,6 +44,7 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 # An unknown variance in m^2, rad^2, (m/s)^2 or (rad/s)^2: filters of ROS read 0 as exact, and refuse NaN.
 _UNKNOWN = 1e6
+_ALL_UNKNOWN = np.eye(6) * _UNKNOWN
 
 
 def optical_frame(camera: str) -> str:
@@ -137,7 +138,7 @@ def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> N
     ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z. All other
     variances are unknown.
     """
-    covariance = np.eye(6) * _UNKNOWN
+    covariance = _ALL_UNKNOWN.copy()
     if known is not None:
         covariance[:3, :3] = known
     if yaw_sigma is not None:

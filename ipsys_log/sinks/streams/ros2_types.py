@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
@@ -46,8 +47,13 @@ def message_class(ros_type: str) -> Any:
 
 def make(name: str, *values: Any) -> Any:
     """Return a message of a type such as ``std_msgs/Header``, with the values of its fields."""
+    return _class_of(name)(*values)
+
+
+@cache
+def _class_of(name: str) -> Any:
     package, _, short = name.partition("/")
-    return message_class(f"{package}/msg/{short}")(*values)
+    return message_class(f"{package}/msg/{short}")
 
 
 def encode(message: Any, ros_type: str) -> bytes:

@@ -13,7 +13,7 @@ from typing import Any
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.messages.message import Mat33
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 
@@ -93,7 +93,7 @@ def read_key(path: Path) -> bytes:
 
 
 class UdpStream:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that sends each pose in a datagram. It never receives.
+    """A :class:`~ipsys_log.sinks.sink.PromptSink` that sends each pose in a datagram. It never receives.
 
     Datagrams for which the system has no room are dropped and counted.
 
@@ -141,10 +141,16 @@ class UdpStream:
 
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the poses of the messages until they end."""
-        for message in messages:
-            for pose in () if message is None else self._poses.read(message):
-                self._send(encode_pose(pose, self._key))
+        send_all(self, messages)
+
+    def finish(self) -> None:
+        """Report the lost messages."""
         self._drops.finish()
+
+    def send(self, message: Message) -> None:
+        """Send the poses of a message."""
+        for pose in self._poses.read(message):
+            self._send(encode_pose(pose, self._key))
 
     def close(self) -> None:
         """Close the socket."""

@@ -12,7 +12,7 @@ from contextlib import suppress
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, refuse_bind
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.vrpn_client import Client
@@ -33,7 +33,7 @@ _MOST_REFUSALS = 10  # events; others could fill the log
 
 
 class VrpnStream:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that is a VRPN server, on TCP and UDP.
+    """A :class:`~ipsys_log.sinks.sink.PromptSink` that is a VRPN server, on TCP and UDP.
 
     A client connects by TCP. Or it asks by UDP for a connection to one of its ports; the server connects only
     to the address that sent this datagram. Positions are sent by TCP. Stale positions and positions outside
@@ -93,10 +93,16 @@ class VrpnStream:
 
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Send the poses of the messages until they end."""
-        for message in messages:
-            for pose in () if message is None else self._poses.read(message):
-                self._send(pose)
+        send_all(self, messages)
+
+    def finish(self) -> None:
+        """Report the lost messages."""
         self._drops.finish()
+
+    def send(self, message: Message) -> None:
+        """Send the poses of a message."""
+        for pose in self._poses.read(message):
+            self._send(pose)
 
     def close(self) -> None:
         """Disconnect the clients and close the sockets."""

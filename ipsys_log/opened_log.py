@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation, LogUrl, find_logs, is_one_of
 from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, Channel
@@ -86,10 +87,10 @@ class Log:
     cameras, runs, channels : the content of the logs, as small tables.
     """
 
-    def __init__(self, *paths: StrPath) -> None:
+    def __init__(self, *paths: StrPath | LogUrl) -> None:
         if not paths:
             raise IpsysError("no log is given; name at least one")
-        self._session = Session([Path(path) for path in paths])
+        self._session = Session(find_logs(paths))
 
     def __enter__(self) -> Log:
         return self
@@ -108,8 +109,8 @@ class Log:
         return f"<Log {self._session}: {len(self._session.images)} cameras, {runs} runs>"
 
     @property
-    def paths(self) -> tuple[Path, ...]:
-        """The paths of the logs."""
+    def paths(self) -> tuple[LogLocation, ...]:
+        """The paths or URLs of the logs."""
         return tuple(self._session.paths)
 
     @property
@@ -224,7 +225,7 @@ class Log:
             logs; the log has no images for a video or a data set.
         """
         file = Path(path)
-        if any(file.exists() and file.samefile(log) for log in self.paths):
+        if is_one_of(file, self.paths):
             raise IpsysError(f"{file}: this is the log itself; name another file")
         found = find_format(file, format)
         options = ExportOptions(table, robot, with_images, rate_hz, size_px)

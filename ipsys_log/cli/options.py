@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -13,12 +13,14 @@ from ipsys_log.cli.console import remarks
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
 if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 
 __all__ = [
     "AsJson",
     "Calibrations",
     "Corners",
+    "FileLogs",
     "Force",
     "Host",
     "Logs",
@@ -37,6 +39,7 @@ __all__ = [
     "load_calibrations",
     "load_lab",
     "load_matching_rig",
+    "log_argument",
     "log_option",
 ]
 
@@ -57,12 +60,20 @@ def annotate(parameter: StageParameter) -> Any:
     return Annotated[kind, build_option(parameter)]
 
 
-Logs = Annotated[
-    list[Path],
-    typer.Argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
-]
+def _locations(texts: list[str]) -> list[Any]:
+    """Return the logs of an argument; a pattern of a URL gives all its objects."""
+    from ipsys_log.log.location import find_logs
 
-ReadLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
+    return find_logs(texts)
+
+
+# An argument for logs, as files or URLs. Its value is a list of `LogLocation`, which typer does not know.
+log_argument = partial(typer.Argument, metavar="LOG", parser=str, callback=_locations)
+Logs = Annotated[
+    list[Any], log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
+]
+ReadLogs = Annotated[list[Any], log_argument(help="Logs, files or URLs, read as one session.")]
+FileLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
 
 # File name extensions of other input and output files: a log with such a name is a mistake.
 _OTHER_FILES = (
@@ -221,7 +232,7 @@ def load_lab(
     return lab, cameras, load_lenses(rig, cameras, lenses, with_lenses)
 
 
-def cameras_of(logs: list[Path]) -> set[str]:
+def cameras_of(logs: Sequence[LogLocation]) -> set[str]:
     """Return the cameras of which logs have frames or derived channels."""
     from ipsys_log.log.contents import camera_of_topic
     from ipsys_log.log.dataset import Session

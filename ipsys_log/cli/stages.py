@@ -29,6 +29,7 @@ from ipsys_log.cli.signals import say_kept
 from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.accuracy import Accuracy
     from ipsys_log.runs.provenance import Outcome
@@ -130,7 +131,7 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
     return command
 
 
-def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
+def _options(logs: Sequence[LogLocation], **given: Any) -> dict[str, Any]:
     """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
     from ipsys_log.rig.file import check_name
     from ipsys_log.runs.options import Request
@@ -153,7 +154,11 @@ def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
 
 @contextmanager
 def derive(
-    logs: list[Path], until: str | None, output: Path | None = None, kept: bool = True, **given: Any
+    logs: Sequence[LogLocation],
+    until: str | None,
+    output: Path | None = None,
+    kept: bool = True,
+    **given: Any,
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
@@ -162,20 +167,24 @@ def derive(
     """
     from ipsys_log import api
     from ipsys_log.log.dataset import Session
+    from ipsys_log.log.known_contents import one_reading
     from ipsys_log.report.accuracy import read_accuracy
+    from ipsys_log.runs.output import choose_target
 
-    options = _options(logs, **given)
-    with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
-        replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
-    outcomes = list(replayed.outcomes)
-    # A new log exists only if there was something to write.
-    written = [output] if output is not None and output.exists() else []
-    with Session([*logs, *written]) as session:
-        yield session, outcomes, read_accuracy(session, outcomes)
+    with one_reading():
+        logs, output = choose_target(logs, output)
+        options = _options(logs, **given)
+        with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
+            replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
+        outcomes = list(replayed.outcomes)
+        # A new log exists only if there was something to write.
+        written = [output] if output is not None and output.exists() else []
+        with Session([*logs, *written]) as session:
+            yield session, outcomes, read_accuracy(session, outcomes)
     _remark(outcomes, [*logs, *written][-1] if kept else None)
 
 
-def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]], str]:
+def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Sequence[str]], str]:
     """Return a function that names the runs that an interrupted command has added."""
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.provenance import complete_runs
@@ -204,7 +213,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
 
 def _derive(
     until: str | None,
-    logs: list[Path],
+    logs: Sequence[LogLocation],
     as_json: bool,
     plot: Path | None = None,
     plots: Path | None = None,
@@ -273,7 +282,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
         remarks.print("--details prints errors by camera, every outlier and models by number of points")
 
 
-def _remark(outcomes: list[Outcome], target: Path | None) -> None:
+def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
     """Print the stages that were done, and the log with the results."""
     print_outcomes(outcomes)
     if target is None:

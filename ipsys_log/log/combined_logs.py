@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import run_of_topic
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import Measurement, Run
 
@@ -47,7 +47,7 @@ def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
     return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])
 
 
-def check_same_parameters(logs: Iterable[tuple[Path, Iterable[Run]]]) -> None:
+def check_same_parameters(logs: Iterable[tuple[LogLocation, Iterable[Run]]]) -> None:
     """Refuse logs in which a stage made a run of the same name in different ways.
 
     Parameters
@@ -59,7 +59,7 @@ def check_same_parameters(logs: Iterable[tuple[Path, Iterable[Run]]]) -> None:
     LogError
         The text names the run and both logs.
     """
-    known: dict[tuple[str, str], tuple[Path, Mapping[str, str]]] = {}
+    known: dict[tuple[str, str], tuple[LogLocation, Mapping[str, str]]] = {}
     for path, runs in logs:
         for run in runs:
             other, parameters = known.setdefault((run.run, run.stage), (path, run.parameters))

@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from copy import copy
 from functools import cached_property
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -31,6 +30,7 @@ from ipsys_log.log.contents import (
     parse_foreign_camera,
     run_of_topic,
 )
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import Cut, Measurement, Merge, MergedLog, Message, Run
 from ipsys_log.messages.channels import (
@@ -57,14 +57,14 @@ class Session:
 
     Parameters
     ----------
-    paths : the logs; at equal times, messages of an earlier log come first.
+    paths : the logs, files or URLs; at equal times, messages of an earlier log come first.
 
     Attributes
     ----------
     images, calibrations : topic by camera.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[LogLocation]) -> None:
         self.paths = list(paths)
         self._stack = ExitStack()
         self._channels: dict[tuple[str, str], Channel | None] = {}

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import NewLog, Overwrite, FileLogs
+from ipsys_log.cli.options import FileLogs, NewLog, Overwrite
 
 __all__ = ["add_commands"]
 

@@ -29,8 +29,8 @@ from ipsys_log.cli.signals import say_kept
 from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.log.dataset import Session
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.report.accuracy import Accuracy
     from ipsys_log.runs.provenance import Outcome
 

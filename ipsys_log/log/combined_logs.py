@@ -43,8 +43,10 @@ def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) 
 
 
 def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
-    first, second = one.times(topic), other.times(topic)
-    return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])
+    first, second = one.first_time(topic), other.first_time(topic)
+    if first is None or second is None:
+        return False
+    return first <= (other.last_time(topic) or 0) and second <= (one.last_time(topic) or 0)
 
 
 def check_same_parameters(logs: Iterable[tuple[LogLocation, Iterable[Run]]]) -> None:

@@ -15,9 +15,6 @@ from functools import cached_property
 from types import TracebackType
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
@@ -125,11 +122,16 @@ class Session:
 
     def last(self, topics: Collection[str]) -> tuple[int, int]:
         """Return log time and publish time of the last message of some topics; the start if there is none."""
-        last_times = [(times[-1], r, t) for r in self.readers for t in topics if len(times := _times(r, t))]
+        last_times = [
+            (time_ns, reader, topic)
+            for reader in self.readers
+            for topic in topics
+            if topic in reader.channels and (time_ns := reader.last_time(topic)) is not None
+        ]
         if not last_times:
             return self.start_ns, self.start_ns
         last_ns, reader, topic = max(last_times, key=lambda item: item[0])
-        *_, message = reader.messages([topic], start_ns=int(last_ns))
+        *_, message = reader.messages([topic], start_ns=last_ns)
         return message.log_time_ns, message.publish_time_ns
 
     def run_names(self) -> set[str]:
@@ -158,9 +160,10 @@ class Session:
 
         With several logs, it is the hash of each log, joined by "+".
         """
-        parts = [r for r in self.readers if len(_times(r, topic))]
-        # The order is that of their times, not that of the command line.
-        return "+".join(r.channel_hash(topic) for r in sorted(parts, key=lambda r: int(_times(r, topic)[0])))
+        parts = [r for r in self.readers if topic in r.channels and r.channels[topic].message_count]
+        if len(parts) > 1:  # the order is that of their times, not that of the command line
+            parts.sort(key=lambda reader: reader.first_time(topic) or 0)
+        return "+".join(reader.channel_hash(topic) for reader in parts)
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
@@ -325,10 +328,11 @@ class Session:
 
     def _find_new_ids(self) -> dict[LogReader, dict[str, str]]:
         """Return the ids of measurements that an earlier log has too, and their new ids."""
-        readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
+        named = [reader for reader in self.readers if MEASUREMENTS_TOPIC in reader.channels]
+        readers = [reader for reader in named if reader.channels[MEASUREMENTS_TOPIC].message_count]
         if len(readers) < 2:
             return {}
-        readers.sort(key=lambda reader: int(_times(reader, MEASUREMENTS_TOPIC)[0]))
+        readers.sort(key=lambda reader: reader.first_time(MEASUREMENTS_TOPIC) or 0)
         new_ids = find_new_ids(
             [
                 message.payload
@@ -435,7 +439,3 @@ def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: PartC
 
 def _too_large(data: bytes | memoryview) -> str:
     return f"a message of {len(data)} bytes is refused: only images may be so large"
-
-
-def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:
-    return reader.times(topic) if topic in reader.channels else np.empty(0, np.int64)

@@ -98,6 +98,7 @@ class LogReader:
     def __init__(self, path: str | os.PathLike[str] | LogUrl) -> None:
         self.path: LogLocation = path if isinstance(path, LogUrl) else Path(path)
         self._view, self._contents = _open(self.path)
+        self._view.plan("chunks", (planned_range(chunk) for chunk in self._contents.chunks))
         self._cache = RangeCache()
         self._stored: dict[str, ChannelHash] | None = None
         self.channels, self.conflicts = group_by_topic(self._contents)
@@ -185,7 +186,6 @@ class LogReader:
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
-        view.plan("chunks", (planned_range(chunk) for chunk in chunks))
         pending = [
             PendingChunk(
                 chunk.start_ns,
@@ -209,12 +209,36 @@ class LogReader:
             for chunk in self._contents.chunks
             if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets)
         ]
-        self._view.plan("chunks", (planned_range(chunk) for chunk in chunks))
         for chunk in chunks:
             entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
             parts += [rows for key, rows in entries.items() if key in wanted]
         times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
         return np.sort(times).astype(np.int64)
+
+    def first_time(self, topic: str) -> int | None:
+        """Return the log time of the first message of a topic in ns; None if it has none."""
+        return self._extreme_time(topic, last=False)
+
+    def last_time(self, topic: str) -> int | None:
+        """Return the log time of the last message of a topic in ns; None if it has none."""
+        return self._extreme_time(topic, last=True)
+
+    def _extreme_time(self, topic: str, last: bool) -> int | None:
+        """Read the indexes from that end of the log, until no other chunk can have a further time."""
+        wanted, sign = set(self._topics_by_id([topic])), -1 if last else 1
+        rows = to_rows(self._contents.unchunked)
+        times = [sign * int(time) for key in wanted & rows.keys() for time in rows[key][:, 0]]
+        chunks = [
+            (sign * (chunk.end_ns if last else chunk.start_ns), chunk) for chunk in self._contents.chunks
+        ]
+        for bound, chunk in sorted(chunks, key=lambda row: row[0]):
+            if times and min(times) <= bound:
+                break
+            if chunk.index_offsets and wanted.isdisjoint(chunk.index_offsets):
+                continue
+            entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
+            times += [sign * int(time) for key in wanted & entries.keys() for time in entries[key][:, 0]]
+        return sign * min(times) if times else None
 
     def channel_hash(self, topic: str) -> str:
         """Return the hash over times and payloads of a channel in log order, in hexadecimal.

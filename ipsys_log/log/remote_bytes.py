@@ -21,8 +21,8 @@ __all__ = ["RemoteBytes", "RemoteRanges", "join_ranges"]
 
 Range = tuple[int, int]  # start and end, in bytes
 
-_TAIL = 128 << 10  # bytes: the summary of most logs, and the hashes before it
-_HEAD = 4096  # bytes: the start of the file, up to the first chunk
+_TAIL = 256 << 10  # bytes: the summary of most logs, and the last runs before it
+_HEAD = 96 << 10  # bytes: the start of the file with its schemas, up to the first chunk
 GAP = 64 << 10  # bytes: to fetch a smaller gap costs less than another request
 _LONGEST_JOINED = 2 << 20  # bytes: only a part of a plan may be needed
 _FIRST_AHEAD = 64 << 10  # bytes
@@ -183,7 +183,7 @@ class RemoteBytes:
     def fault(self, offset: int, reason: str) -> LogError:
         """Return the error for damage at `offset`."""
         return LogError(
-            f"{self.path} is damaged at byte {offset}: {reason}. Download it, and run ipsys repair on the file"
+            f"{self.path} is damaged at byte {offset}: {reason}. Download it, and repair the file: ipsys repair"
         )
 
     def refusal(self, reason: str) -> BoundError:

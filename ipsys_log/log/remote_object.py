@@ -24,7 +24,13 @@ _LONGEST_REASON = 200
 _PASSING_STATUS = (408, 425, 429)
 _CHANGED_STATUS = 412
 _DENIED_STATUS = (401, 403)
-_FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError, NotImplementedError)
+# Errors that a repetition does not change. A file system may raise any other error for a lost connection.
+_FINAL = (
+    *(PermissionError, IsADirectoryError, NotADirectoryError, NotImplementedError, ImportError, LookupError),
+    ValueError,
+)
+_NO_CREDENTIALS = "NoCredentialsError"  # of botocore, which is imported only for its URLs
+_BUGS = (TypeError, AttributeError, NameError, AssertionError)
 # The fields of an entry of fsspec that tell a version; each file system has some of them.
 _VERSION_FIELDS = (
     *("ETag", "etag", "generation", "Last-Modified", "LastModified", "last_modified", "mtime"),
@@ -36,6 +42,10 @@ T = TypeVar("T")
 
 class _ChangedError(Exception):
     """An object that is not the one that was opened."""
+
+
+class _NoRangesError(ValueError):
+    """A server that sends whole objects only."""
 
 
 @dataclass(slots=True)
@@ -71,9 +81,7 @@ class RemoteObject:
         def ask() -> bytes:
             data = self.read_pinned(start, end)
             if len(data) > end - start:
-                raise LogError(
-                    f"{self.url}: the server ignores byte ranges: download the log, and read the file"
-                )
+                raise _NoRangesError
             if len(data) < end - start:
                 raise ConnectionError(f"{len(data)} of {end - start} bytes arrived")
             return data
@@ -99,7 +107,7 @@ def open_object(url: LogUrl) -> RemoteObject:
     if entry.get("type") == "directory":
         raise LogError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
     if size is None or entry.get("partial") is False:
-        raise LogError(f"{url}: the server does not offer byte ranges: download the log, and read the file")
+        raise _failure(url, _NoRangesError())
     return RemoteObject(url, filesystem, path, int(size), _version_of(entry), read)
 
 
@@ -176,7 +184,14 @@ def _open_http(filesystem: Any, path: str) -> Opened:
     is_strong = bool(etag) and not etag.startswith("W/")
     if is_strong:
         headers["If-Match"] = etag
-    read = _reader_of(filesystem.open(path, "rb", cache_type="none", size=entry["size"], headers=headers))
+    file = filesystem.open(path, "rb", cache_type="none", size=entry["size"], headers=headers)
+
+    def read(start: int, end: int) -> bytes:
+        try:
+            return _reader_of(file)(start, end)
+        except ValueError as error:  # the whole object is coming
+            raise _NoRangesError from error
+
     return entry, read if is_strong else _looking_after(read, filesystem, path, entry)
 
 
@@ -230,7 +245,7 @@ def _repeat(url: LogUrl, ask: Callable[[], T]) -> T:
     for pause_s in (*_PAUSES_S, None):
         try:
             return ask()
-        except LogError:
+        except (LogError, *_BUGS):
             raise
         except Exception as error:  # each file system of fsspec has errors of its own
             if pause_s is None or not _may_pass(error):
@@ -265,12 +280,14 @@ def _may_pass(error: BaseException) -> bool:
         return status >= 500 or status in _PASSING_STATUS
     if isinstance(error, FileNotFoundError):
         return error.__cause__ is not None  # HTTP: a HEAD request that was not answered
-    return isinstance(error, OSError | TimeoutError | EOFError) and not isinstance(error, _FINAL)
+    return not isinstance(error, _FINAL) and type(error).__name__ != _NO_CREDENTIALS
 
 
 def _failure(url: LogUrl, error: BaseException) -> LogError:
     if _is_changed(error):
         return LogError(f"{url} changed while it was read: run the command again")
+    if isinstance(error, _NoRangesError):
+        return LogError(f"{url}: the server ignores byte ranges: download the log, and read the file")
     status = _status_of(error)
     if status in _DENIED_STATUS or isinstance(error, PermissionError):
         return LogError(
@@ -278,7 +295,7 @@ def _failure(url: LogUrl, error: BaseException) -> LogError:
         )
     if status == 404 or (isinstance(error, FileNotFoundError) and not _may_pass(error)):
         return LogError(f"{url} does not exist")
-    if type(error).__name__ == "NoCredentialsError":
+    if type(error).__name__ == _NO_CREDENTIALS:
         return LogError(f"{url} cannot be read: there are no credentials for {url.scheme}://; give some")
     tried = f" after {len(_PAUSES_S) + 1} attempts" if _may_pass(error) else ""
     cause = error.__cause__ if isinstance(error, FileNotFoundError) and error.__cause__ else error

@@ -154,11 +154,15 @@ def choose_target(paths: Sequence[LogLocation], output: Path | None) -> tuple[li
 
 
 def _check_source(paths: Sequence[LogLocation], derived: Path) -> None:
-    """Check that a derived log has results of these logs: runs name their inputs by content."""
+    """Check that a derived log has results of these logs: its runs name their inputs by content.
+
+    The largest input decides, such as the markers: two logs of a lab can have equal rigs and intrinsics.
+    """
     with Session([derived]) as results, Session(paths) as session:
-        inputs = {read.topic: read.hash for run in results.runs() for read in run.inputs}
-        known = [topic for topic in inputs if session.count(topic)]
-        if inputs and not any(session.hash(topic) == inputs[topic] for topic in known):
+        inputs = [read for run in results.runs() for read in run.inputs]
+        known = [read for read in inputs if session.count(read.topic)]
+        largest = max(known, key=lambda read: read.messages, default=None)
+        if inputs and (largest is None or session.hash(largest.topic) != largest.hash):
             raise IpsysError(f"{derived}: has results of another log than {session}; give a new log with -o")
 
 

@@ -28,6 +28,7 @@ BENCHMARKS = {
     "log_read": "reading, beside mcap",
     "table": "a channel as a table, beside decoding its messages",
     "handling": "cut, compact, merge and check of whole logs, beside cp; memory",
+    "remote": "requests and bytes for a log in an S3 server, beside mcap through s3fs",
     "startup": "ipsys --help and ipsys info",
     "robot_run": "control error and true error of robots at waypoints, without and with faults",
     "joint": "error over the floor of calibrations, in simulated labs",

@@ -15,6 +15,8 @@ from ipsys_log.analysis.differences import Comparison
 from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogUrl, find_logs, parse_location
 from ipsys_log.messages import CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.models.table import AppliedModel, reads_corners
@@ -23,6 +25,7 @@ from ipsys_log.player import Player
 from ipsys_log.publish.scores import Score
 from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
 from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.output import choose_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sampled_track import SampledTrack
 from ipsys_log.soundness.check import check_logs
@@ -70,8 +73,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 
-def open(*paths: StrPath) -> Log:
-    """Open logs, read as one in log order.
+def open(*paths: StrPath | LogUrl) -> Log:
+    """Open logs, read as one in log order: files, or URLs such as ``s3://bucket/2026-05-*/lab.mcap``.
 
     Raises
     ------
@@ -122,8 +125,9 @@ class ReplayResult:
     evaluations: Mapping[str, ModelEvaluation]
 
 
+@one_reading()
 def replay(
-    *paths: StrPath,
+    *paths: StrPath | LogUrl,
     models: Iterable[str] = (),
     until: str | None = None,
     rig: Rig | StrPath | None = None,
@@ -143,6 +147,9 @@ def replay(
     jobs: int | None = None,
 ) -> ReplayResult:
     """Compute the results that logs lack, and append them to the last log or write them to ``output``.
+
+    Nothing can be appended to a log at a URL: its results come into ``<name>.derived.mcap`` in the current
+    folder, which a later call extends.
 
     Parameters
     ----------
@@ -180,9 +187,8 @@ def replay(
         skip_ambiguous=skip_ambiguous,
         parameters=dict(parameters or {}),
     )
-    logs = [Path(path) for path in paths]
-    target = None if output is None else Path(output)
     count = available_cores() if jobs is None else jobs
+    logs, target = choose_target(find_logs(paths), None if output is None else Path(output))
     outcomes = pipeline.replay(logs, request, until, target, progress, say, count)
     written = [target] if target is not None and target.exists() else []
     with Session([*logs, *written]) as session:
@@ -198,7 +204,9 @@ def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, Mod
     return evaluations
 
 
-def check(*paths: StrPath, progress: Progress = lambda stage, done, total: None) -> tuple[LogCheck, ...]:
+def check(
+    *paths: StrPath | LogUrl, progress: Progress = lambda stage, done, total: None
+) -> tuple[LogCheck, ...]:
     """Read logs completely and check them; no file is changed.
 
     The check covers the file, schemas, times, rates, references and runs. A run may have its inputs in
@@ -213,11 +221,11 @@ def check(*paths: StrPath, progress: Progress = lambda stage, done, total: None)
     >>> for result in check("monday.mcap"):  # doctest: +SKIP
     ...     print(result.state, *(finding.text for finding in result.remarks), sep="\\n")
     """
-    return check_logs([Path(path) for path in paths], progress)
+    return check_logs(find_logs(paths), progress)
 
 
 def verify(
-    *paths: StrPath,
+    *paths: StrPath | LogUrl,
     run: str | None = None,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
@@ -235,7 +243,7 @@ def verify(
     """
     from ipsys_log.runs.verify import verify as verify_runs
 
-    return verify_runs([Path(path) for path in paths], run, progress, say)
+    return verify_runs(find_logs(paths), run, progress, say)
 
 
 def score(
@@ -320,7 +328,7 @@ class FittedModel:
         return self._applied[camera].predict(points, heights)
 
 
-def load_model(path: StrPath, name: str | None = None) -> FittedModel | FittedCornerModel:
+def load_model(path: StrPath | LogUrl, name: str | None = None) -> FittedModel | FittedCornerModel:
     """Load the newest fitted model of a log.
 
     Parameters
@@ -338,7 +346,7 @@ def load_model(path: StrPath, name: str | None = None) -> FittedModel | FittedCo
     """
     from ipsys_log.runs.select import fitted_in
 
-    with Session([Path(path)]) as session:
+    with Session([parse_location(path)]) as session:
         model = fitted_in(session, name)[0]
     if not reads_corners(model.name):
         return FittedModel(model)
@@ -482,7 +490,7 @@ def live(
 
 
 def play(
-    *paths: StrPath,
+    *paths: StrPath | LogUrl,
     rate: float = 1.0,
     loop: bool = False,
     start_paused: bool = False,
@@ -559,4 +567,4 @@ def play(
         foxglove=foxglove,
         images=images,
     )
-    return Player([Path(path) for path in paths], run, topics, options, settings, clock, say)
+    return Player(find_logs(paths), run, topics, options, settings, clock, say)

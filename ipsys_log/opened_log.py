@@ -8,10 +8,11 @@ from html import escape
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation, LogUrl, find_logs, is_one_of
 from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, Channel
@@ -31,7 +32,10 @@ StrPath = str | PathLike[str]
 Time = int | datetime
 
 
-class Listing(tuple[NamedTuple, ...]):
+_Row = TypeVar("_Row", bound=NamedTuple)
+
+
+class Listing(tuple[_Row, ...]):
     """Rows of one kind, such as the runs of a log. It prints as a table, in notebooks too."""
 
     __slots__ = ()
@@ -86,10 +90,10 @@ class Log:
     cameras, runs, channels : the content of the logs, as small tables.
     """
 
-    def __init__(self, *paths: StrPath) -> None:
+    def __init__(self, *paths: StrPath | LogUrl) -> None:
         if not paths:
             raise IpsysError("no log is given; name at least one")
-        self._session = Session([Path(path) for path in paths])
+        self._session = Session(find_logs(paths))
 
     def __enter__(self) -> Log:
         return self
@@ -108,12 +112,12 @@ class Log:
         return f"<Log {self._session}: {len(self._session.images)} cameras, {runs} runs>"
 
     @property
-    def paths(self) -> tuple[Path, ...]:
-        """The paths of the logs."""
+    def paths(self) -> tuple[LogLocation, ...]:
+        """The paths or URLs of the logs."""
         return tuple(self._session.paths)
 
     @property
-    def cameras(self) -> Listing:
+    def cameras(self) -> Listing[_CameraRow]:
         """The cameras: name, number of images, and whether the log has their intrinsics."""
         session = self._session
         names = sorted({*session.images, *session.calibrations})
@@ -123,7 +127,7 @@ class Log:
         )
 
     @property
-    def runs(self) -> Listing:
+    def runs(self) -> Listing[_RunRow]:
         """The recorded stages, oldest first: run, stage, state, and the runs that they read."""
         return Listing(
             _RunRow(recorded.run.run, recorded.run.stage, recorded.state, recorded.run.input_runs)
@@ -131,7 +135,7 @@ class Log:
         )
 
     @property
-    def channels(self) -> Listing:
+    def channels(self) -> Listing[_ChannelRow]:
         """The channels that have messages: name, run, topic, number of messages."""
         session = self._session
         rows = [
@@ -224,7 +228,7 @@ class Log:
             logs; the log has no images for a video or a data set.
         """
         file = Path(path)
-        if any(file.exists() and file.samefile(log) for log in self.paths):
+        if is_one_of(file, self.paths):
             raise IpsysError(f"{file}: this is the log itself; name another file")
         found = find_format(file, format)
         options = ExportOptions(table, robot, with_images, rate_hz, size_px)

@@ -46,6 +46,7 @@ from ipsys_log.errors import FitError, IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
@@ -68,7 +69,7 @@ __all__ = ["live", "measure", "record", "replay"]
 
 @one_reading()
 def replay(
-    paths: Sequence[Path],
+    paths: Sequence[LogLocation],
     request: Request,
     until: str | None = None,
     output: Path | None = None,

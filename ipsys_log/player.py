@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message, Rig
 from ipsys_log.rig.file import check_robots
 from ipsys_log.runs.provenance import Outcome
@@ -46,7 +46,7 @@ class Player:
 
     def __init__(
         self,
-        paths: Sequence[Path],
+        paths: Sequence[LogLocation],
         run: str | None = None,
         topics: Sequence[str] = (),
         options: PlaybackOptions | None = None,

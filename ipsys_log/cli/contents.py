@@ -5,21 +5,21 @@ from __future__ import annotations
 import json
 import os
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import AsJson, ReadLogs
+from ipsys_log.cli.options import AsJson, ReadLogs, log_argument
 from ipsys_log.cli.signals import writes_nothing
 
 if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
+    from ipsys_log.log.location import LogLocation
 
 __all__ = ["add_commands"]
 
-Logs = Annotated[list[Path], typer.Argument(help="Logs; each one is read separately.", metavar="LOG")]
+Logs = Annotated[list[Any], log_argument(help="Logs, files or URLs; each one is read separately.")]
 _Seconds = Optional[float]  # noqa: UP045
 
 
@@ -76,7 +76,7 @@ def du(logs: Logs, as_json: AsJson = False) -> None:
         console.print(sizes_table(result))
 
 
-def _sizes(path: Path) -> dict[str, Any]:
+def _sizes(path: LogLocation) -> dict[str, Any]:
     from ipsys_log.log.reader import LogReader
     from ipsys_log.report.channel_sizes import sizes_json
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -13,6 +13,9 @@ from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, ReadLogs
 from ipsys_log.cli.signals import writes_nothing
 from ipsys_log.cli.stages import MORE, build_command, derive, options_until
+
+if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
 
 __all__ = ["add_commands"]
 
@@ -147,7 +150,7 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
         remarks.print(f"{save} written; to view it: rerun {save}")
 
 
-def _write_layout(logs: list[Path], runs: Sequence[str], path: Path) -> None:
+def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
     from ipsys_log.atomic_files import replacement_of
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
@@ -164,7 +167,7 @@ def _write_layout(logs: list[Path], runs: Sequence[str], path: Path) -> None:
     remarks.print(f"{path} written; in Foxglove: Layouts, Import from file")
 
 
-def _check_save(save: Path, logs: list[Path]) -> None:
+def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
     """Check that a recording can be written, and that Rerun will open it by its name."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.report.files import check_file
@@ -174,12 +177,14 @@ def _check_save(save: Path, logs: list[Path]) -> None:
     check_file(save, "--save", logs)
 
 
-def _report(logs: list[Path], output: Path | None, html: Path | None, **given: Any) -> None:
+def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:
     from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_file, write_files
 
     check_installed("report needs", "matplotlib", "jinja2")
-    target = html or (output or logs[-1]).with_suffix(".html")
+    from ipsys_log.log.location import file_beside
+
+    target = html or file_beside(output or logs[-1], ".html")
     check_file(target, "--html", [*logs, *([output] if output else [])])
     if _report_robots(logs, target):
         return
@@ -190,7 +195,7 @@ def _report(logs: list[Path], output: Path | None, html: Path | None, **given: A
     console.print(f"{target} written: open it in a browser", markup=False)
 
 
-def _report_robots(logs: list[Path], target: Path) -> bool:
+def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
     """Write the page and the figure of a robot run; return False if the logs have none."""
     from ipsys_log.analysis.robot_run import has_robot_run
     from ipsys_log.log.dataset import Session

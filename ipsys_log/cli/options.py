@@ -14,12 +14,14 @@ from ipsys_log.cli.console import remarks
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
 if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 
 __all__ = [
     "AsJson",
     "Calibrations",
     "Corners",
+    "FileLogs",
     "Force",
     "Host",
     "Logs",
@@ -39,6 +41,7 @@ __all__ = [
     "load_calibrations",
     "load_lab",
     "load_matching_rig",
+    "log_argument",
     "log_option",
 ]
 
@@ -59,12 +62,20 @@ def annotate(parameter: StageParameter) -> Any:
     return Annotated[kind, build_option(parameter)]
 
 
-Logs = Annotated[
-    list[Path],
-    typer.Argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
-]
+def _locations(texts: list[str]) -> list[Any]:
+    """Return the logs of an argument; a pattern of a URL gives all its objects."""
+    from ipsys_log.log.location import find_logs
 
-ReadLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
+    return find_logs(texts)
+
+
+# An argument for logs, as files or URLs. Its value is a list of `LogLocation`, which typer does not know.
+log_argument = partial(typer.Argument, metavar="LOG", parser=str, callback=_locations)
+Logs = Annotated[
+    list[Any], log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
+]
+ReadLogs = Annotated[list[Any], log_argument(help="Logs, files or URLs, read as one session.")]
+FileLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
 
 # File name extensions of other input and output files: a log with such a name is a mistake.
 _OTHER_FILES = (
@@ -73,8 +84,8 @@ _OTHER_FILES = (
 )
 
 
-def check_present(logs: Sequence[Path]) -> None:
-    """Check that logs exist, before the imports of the pipeline, which take longer.
+def check_present(logs: Sequence[LogLocation]) -> None:
+    """Check that the files of logs exist, before the imports of the pipeline, which take longer.
 
     Raises
     ------
@@ -82,7 +93,7 @@ def check_present(logs: Sequence[Path]) -> None:
         A log is missing.
     """
     for log in logs:
-        if not log.exists():
+        if isinstance(log, Path) and not log.exists():
             from ipsys_log.log.byte_source import open_for_reading
 
             os.close(open_for_reading(log))
@@ -240,7 +251,7 @@ def load_lab(
     return lab, cameras, load_lenses(rig, cameras, lenses, with_lenses)
 
 
-def cameras_of(logs: list[Path]) -> set[str]:
+def cameras_of(logs: Sequence[LogLocation]) -> set[str]:
     """Return the cameras of which logs have frames or derived channels."""
     from ipsys_log.log.contents import camera_of_topic
     from ipsys_log.log.dataset import Session

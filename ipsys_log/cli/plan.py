@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.options import AsJson, Calibrations, FileLogs, RigFile, cameras_of, load_calibrations
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def plan(
-    logs: Logs,
+    logs: FileLogs,
     places: Places = 5,
     model: Model = "best",
     height_m: Heights = None,

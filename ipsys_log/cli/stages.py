@@ -31,9 +31,8 @@ from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
-    from ipsys_log.messages import CameraCalibration
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.report.accuracy import Accuracy
-    from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
 __all__ = ["MORE", "add_commands", "build_command", "derive", "options_until"]
@@ -146,39 +145,34 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
     return command
 
 
-def _request(
-    logs: list[Path],
-    rig: Path | None,
-    run: str | None,
-    calibration: list[str] | None = None,
-    model: list[str] | None = None,
-    lenses: Mapping[str, CameraCalibration] | None = None,
-    **given: Any,
-) -> Request:
-    """Return the options of a command as a request; options of further stages are its parameters."""
+def _options(logs: Sequence[LogLocation], **given: Any) -> dict[str, Any]:
+    """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
     from ipsys_log.rig.file import check_name
     from ipsys_log.runs.options import Request
 
+    rig, run = given.pop("rig"), given.pop("run")
+    models, calibration = given.pop("model", None) or (), given.pop("calibration", None)
+    lenses, jobs = given.pop("lenses", None) or {}, given.pop("jobs", None)
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
     further = {name: given.pop(name) for name in [*given] if name not in known}
-    return Request(
-        models=tuple(model or ()),
-        rig=load_matching_rig(rig, lambda: cameras_of(logs)),
-        lenses={**load_calibrations(calibration, lambda: cameras_of(logs)), **(lenses or {})},
-        run=check_name(run, "--run") if run else None,
-        parameters={name: str(value) for name, value in further.items() if value not in (None, False)},
+    return {
+        "models": models,
+        "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
+        "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
+        "run": check_name(run, "--run") if run else None,
+        "jobs": jobs,
+        "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,
-    )
+    }
 
 
 @contextmanager
 def derive(
-    logs: list[Path],
+    logs: Sequence[LogLocation],
     until: str | None,
     output: Path | None = None,
     kept: bool = True,
-    jobs: int | None = None,
     **given: Any,
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
@@ -187,23 +181,26 @@ def derive(
     files of ``calibration``.
     """
     check_present(logs)
-    from ipsys_log import pipeline
+    from ipsys_log import api
     from ipsys_log.log.dataset import Session
+    from ipsys_log.log.known_contents import one_reading
     from ipsys_log.report.accuracy import read_accuracy
-    from ipsys_log.runs.workers import available_cores
+    from ipsys_log.runs.output import choose_target
 
-    request = _request(logs, **given)
-    processes = available_cores() if jobs is None else jobs
-    with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
-        outcomes = pipeline.replay(logs, request, until, output, progress, say, processes)
-    # A new log exists only if there was something to write.
-    written = [output] if output is not None and output.exists() else []
-    with Session([*logs, *written]) as session:
-        yield session, outcomes, read_accuracy(session, outcomes)
+    with one_reading():
+        logs, output = choose_target(logs, output)
+        options = _options(logs, **given)
+        with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
+            replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
+        outcomes = list(replayed.outcomes)
+        # A new log exists only if there was something to write.
+        written = [output] if output is not None and output.exists() else []
+        with Session([*logs, *written]) as session:
+            yield session, outcomes, read_accuracy(session, outcomes)
     _remark(outcomes, [*logs, *written][-1] if kept else None)
 
 
-def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]], str]:
+def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Sequence[str]], str]:
     """Return a function that names the runs that an interrupted command has added."""
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.provenance import complete_runs
@@ -232,7 +229,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
 
 def _derive(
     until: str | None,
-    logs: list[Path],
+    logs: Sequence[LogLocation],
     as_json: bool,
     plot: Path | None = None,
     plots: Path | None = None,
@@ -251,7 +248,7 @@ def _derive(
         remarks.print(line)
 
 
-def _check_figures(logs: list[Path], plot: Path | None, plots: Path | None) -> None:
+def _check_figures(logs: Sequence[LogLocation], plot: Path | None, plots: Path | None) -> None:
     from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_figure_file, check_folder
 
@@ -306,7 +303,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
         remarks.print("--details prints errors by camera, every outlier and models by number of points")
 
 
-def _remark(outcomes: list[Outcome], target: Path | None) -> None:
+def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
     """Print the stages that were done, and the log with the results."""
     print_outcomes(outcomes)
     if target is None:

@@ -1,23 +1,61 @@
-"""Reads of a log file by position; an unfinished append takes the old tail from its journal."""
+"""Reads of a log by position; in a file, an unfinished append takes the old tail from its journal."""
 
 import os
 import stat
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, ReadLimits
+from ipsys_log.log.location import LogLocation
 
-__all__ = ["LogBytes", "open_for_reading"]
+__all__ = ["FileBytes", "LogBytes", "file_identity", "open_for_reading"]
 
 _MOST_PER_CALL = 1 << 30
 
 
+class LogBytes(Protocol):
+    """The bytes of a log at the time when it was opened, in a file or in a store.
+
+    Attributes
+    ----------
+    size, bytes_read : bytes of the log, and bytes that its readers have asked for.
+    is_interrupted : True if an append was interrupted, so that these are the bytes before it.
+    """
+
+    bytes_read: int
+    read_limits: ReadLimits
+
+    @property
+    def path(self) -> LogLocation: ...
+    @property
+    def size(self) -> int: ...
+    @property
+    def is_interrupted(self) -> bool: ...
+    def identity(self) -> tuple[object, object]:
+        """Return what identifies the log, and what changes with its content."""
+        ...
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Read exactly `length` bytes at `offset`; check the length before the allocation."""
+        ...
+
+    def plan(self, name: str, ranges: Iterable[tuple[int, int]]) -> None:
+        """Announce ranges (start, end) that are going to be read, instead of those of the same name."""
+        ...
+
+    def fault(self, offset: int, reason: str) -> LogError: ...
+    def refusal(self, reason: str) -> BoundError: ...
+    def check_number(self, number: int, item_name: str) -> None: ...
+    def close(self) -> None: ...
+
+
 @dataclass(slots=True)
-class LogBytes:
-    """The bytes of a log at the time when it was opened.
+class FileBytes:
+    """The bytes of a log file at the time when it was opened.
 
     Bytes from `tail_offset` on come from `tail_fd` (a journal). In the journal they begin at `tail_base`.
     `patches` are pairs (offset, bytes), sorted by offset. A repair is about to write these bytes before
@@ -52,6 +90,18 @@ class LogBytes:
             data = os.pread(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
             return data if len(data) == length else self._pread(self.fd, offset, length)
         return self._unpatched(offset, length)
+
+    @property
+    def is_interrupted(self) -> bool:
+        """True if the old tail comes from a journal."""
+        return self.tail_fd >= 0
+
+    def identity(self) -> tuple[object, object]:
+        """Return the identity of the file, and its size and change time."""
+        return file_identity(self.fd)
+
+    def plan(self, name: str, ranges: Iterable[tuple[int, int]]) -> None:
+        """Do nothing: the operating system reads ahead."""
 
     def _patched(self, offset: int, data: bytes) -> bytes:
         end = offset + len(data)
@@ -108,6 +158,12 @@ class LogBytes:
         if length_read < length:
             raise self.fault(offset + length_read, "the file became shorter while it was read")
         return b"".join(parts)
+
+
+def file_identity(fd: int) -> tuple[object, object]:
+    """Return device and inode of an open file, and its size in bytes and change time in ns."""
+    status = os.fstat(fd)
+    return (status.st_dev, status.st_ino), (status.st_size, status.st_mtime_ns)
 
 
 def open_for_reading(path: Path) -> int:

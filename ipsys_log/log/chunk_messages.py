@@ -40,6 +40,7 @@ __all__ = [
     "chunk_entries",
     "open_chunk",
     "open_unchunked",
+    "planned_range",
     "runs",
     "to_rows",
     "wanted_rows",
@@ -79,6 +80,25 @@ def chunk_entries(
             rows = parse_message_index(view, data, offset - start, channel, offset)
             entries[channel] = np.frombuffer(rows, "<u8").reshape(-1, 2)
     return entries
+
+
+def planned_range(chunk: ChunkRef) -> Run:
+    """Return the range of a chunk that its first reader needs: its message indexes, or all of it.
+
+    A chunk that is small, or that its compression has made smaller, is always read as a whole.
+    """
+    is_whole = chunk.length <= _SMALL or chunk.compressed_size < _PACKED * chunk.uncompressed_size
+    return chunk.offset if is_whole or not chunk.index_length else chunk.offset + chunk.length, chunk.end
+
+
+def _row_ranges(chunk: ChunkRef, entries: Entries, rows: Rows) -> Iterator[Run]:
+    """Yield the range in the file of each wanted row of an uncompressed chunk."""
+    starts = sorted({offset for part in entries.values() for offset in part[:, 1].tolist()})
+    first = chunk.offset + CHUNK_HEAD_SIZE
+    for offset in rows[:, 1].tolist():
+        number = bisect_right(starts, offset)
+        stop = starts[number] if number < len(starts) else chunk.uncompressed_size
+        yield first + offset, min(first + max(stop, offset), chunk.end)
 
 
 def wanted_rows(entries: Entries, topics: Mapping[int, str], span: tuple[int, int]) -> Rows:
@@ -122,6 +142,7 @@ def runs(entries: Entries, wanted: Rows, end: int) -> list[Run]:
 
 _CACHE_BYTES = 64 << 20
 _SMALL = 64 << 10  # bytes: a smaller compressed chunk is unpacked as a whole, without a search for its blocks
+_PACKED = 0.75  # of its size: a chunk that is compressed to less has few raw blocks
 _SPARSE = 4096  # bytes per wanted message: a chunk with fewer is unpacked as a whole too
 _OPCODE = int(Opcode.MESSAGE)
 _SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message record without payload
@@ -258,6 +279,8 @@ def open_chunk(
     entries = chunk_entries(view, chunk, cache.searched)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
+    if not name:
+        view.plan("messages", _row_ranges(chunk, entries, rows))
     if not is_checked and name and packed > _SMALL and packed > len(rows) * _SPARSE:
         records.raw = find_blocks(view, name, offset + CHUNK_HEAD_SIZE + len(name), packed, size)
     if is_checked or (name and records.raw is None):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import run_of_topic
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import Measurement, Run
 
@@ -43,11 +43,13 @@ def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) 
 
 
 def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
-    first, second = one.times(topic), other.times(topic)
-    return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])
+    first, second = one.first_time(topic), other.first_time(topic)
+    if first is None or second is None:
+        return False
+    return first <= (other.last_time(topic) or 0) and second <= (one.last_time(topic) or 0)
 
 
-def check_same_parameters(logs: Iterable[tuple[Path, Iterable[Run]]]) -> None:
+def check_same_parameters(logs: Iterable[tuple[LogLocation, Iterable[Run]]]) -> None:
     """Refuse logs in which a stage made a run of the same name in different ways.
 
     Parameters
@@ -59,7 +61,7 @@ def check_same_parameters(logs: Iterable[tuple[Path, Iterable[Run]]]) -> None:
     LogError
         The text names the run and both logs.
     """
-    known: dict[tuple[str, str], tuple[Path, Mapping[str, str]]] = {}
+    known: dict[tuple[str, str], tuple[LogLocation, Mapping[str, str]]] = {}
     for path, runs in logs:
         for run in runs:
             other, parameters = known.setdefault((run.run, run.stage), (path, run.parameters))

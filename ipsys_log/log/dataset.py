@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from copy import copy
 from functools import cached_property
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -31,6 +30,7 @@ from ipsys_log.log.contents import (
     parse_foreign_camera,
     run_of_topic,
 )
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import Cut, Measurement, Merge, MergedLog, Message, Run
 from ipsys_log.messages.channels import (
@@ -57,14 +57,14 @@ class Session:
 
     Parameters
     ----------
-    paths : the logs; at equal times, messages of an earlier log come first.
+    paths : the logs, files or URLs; at equal times, messages of an earlier log come first.
 
     Attributes
     ----------
     images, calibrations : topic by camera.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[LogLocation]) -> None:
         self.paths = list(paths)
         self._stack = ExitStack()
         self._channels: dict[tuple[str, str], Channel | None] = {}
@@ -125,11 +125,16 @@ class Session:
 
     def last(self, topics: Collection[str]) -> tuple[int, int]:
         """Return log time and publish time of the last message of some topics; the start if there is none."""
-        last_times = [(times[-1], r, t) for r in self.readers for t in topics if len(times := _times(r, t))]
+        last_times = [
+            (time_ns, reader, topic)
+            for reader in self.readers
+            for topic in topics
+            if topic in reader.channels and (time_ns := reader.last_time(topic)) is not None
+        ]
         if not last_times:
             return self.start_ns, self.start_ns
         last_ns, reader, topic = max(last_times, key=lambda item: item[0])
-        *_, message = reader.messages([topic], start_ns=int(last_ns))
+        *_, message = reader.messages([topic], start_ns=last_ns)
         return message.log_time_ns, message.publish_time_ns
 
     def order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -140,7 +145,8 @@ class Session:
 
     def latest(self, topic: str, before_ns: int) -> Message | None:
         """Return the last message of a topic before a log time in ns; the first one if there is none."""
-        before = [times[times < before_ns] for reader in self.readers if len(times := _times(reader, topic))]
+        times_ns = [reader.times(topic) for reader in self.readers if topic in reader.channels]
+        before = [times[times < before_ns] for times in times_ns]
         last_ns = max((int(times[-1]) for times in before if len(times)), default=None)
         if last_ns is None:
             return next(self.messages([topic]), None)
@@ -173,9 +179,10 @@ class Session:
 
         With several logs, it is the hash of each log, joined by "+".
         """
-        parts = [r for r in self.readers if len(_times(r, topic))]
-        # The order is that of their times, not that of the command line.
-        return "+".join(r.channel_hash(topic) for r in sorted(parts, key=lambda r: int(_times(r, topic)[0])))
+        parts = [r for r in self.readers if topic in r.channels and r.channels[topic].message_count]
+        if len(parts) > 1:  # the order is that of their times, not that of the command line
+            parts.sort(key=lambda reader: reader.first_time(topic) or 0)
+        return "+".join(reader.channel_hash(topic) for reader in parts)
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
@@ -344,10 +351,11 @@ class Session:
 
     def _find_new_ids(self) -> dict[LogReader, dict[str, str]]:
         """Return the ids of measurements that an earlier log has too, and their new ids."""
-        readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
+        named = [reader for reader in self.readers if MEASUREMENTS_TOPIC in reader.channels]
+        readers = [reader for reader in named if reader.channels[MEASUREMENTS_TOPIC].message_count]
         if len(readers) < 2:
             return {}
-        readers.sort(key=lambda reader: int(_times(reader, MEASUREMENTS_TOPIC)[0]))
+        readers.sort(key=lambda reader: reader.first_time(MEASUREMENTS_TOPIC) or 0)
         new_ids = find_new_ids(
             [
                 message.payload
@@ -455,7 +463,3 @@ def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: PartC
 
 def _too_large(data: bytes | memoryview) -> str:
     return f"a message of {len(data)} bytes is refused: only images may be so large"
-
-
-def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:
-    return reader.times(topic) if topic in reader.channels else np.empty(0, np.int64)

@@ -51,7 +51,7 @@ def check_file(
         for topic, state in sorted(findings.hashes.items())
         if topic in stored and state.valid and _differs(state, stored[topic])
     ]
-    return FileCheck(faults, contents.cut_short or view.tail_fd >= 0, tuple(changed))
+    return FileCheck(faults, contents.cut_short or view.is_interrupted, tuple(changed))
 
 
 def _faults(view: LogBytes, findings: Survey) -> tuple[str, ...]:

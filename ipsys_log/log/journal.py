@@ -23,7 +23,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import FileBytes
 from ipsys_log.log.records import MAGIC
 
 __all__ = [
@@ -177,7 +177,7 @@ def _is_continued(fd: int, sizes: tuple[int, ...]) -> bool:
     return size not in sizes and os.pread(fd, len(MAGIC), max(0, size - len(MAGIC))) == MAGIC
 
 
-def attach_journal(view: LogBytes) -> bool:
+def attach_journal(view: FileBytes) -> bool:
     """Make `view` show the old log if there is a whole journal beside it; return whether there is one.
 
     The function takes no lock and changes no file.

@@ -2,43 +2,60 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import LogBytes, file_identity
 from ipsys_log.log.contents import Contents
+from ipsys_log.log.location import LogUrl
+from ipsys_log.log.remote_bytes import RemoteBytes, RemoteRanges
 from ipsys_log.log.summary import load_contents
 
-__all__ = ["contents_of", "note_contents", "one_reading"]
+__all__ = ["contents_of", "note_contents", "one_reading", "open_remote"]
 
 
-class _Known(NamedTuple):
-    """A table of contents, with the size in bytes and the change time in ns of its file."""
+@dataclass(slots=True)
+class _Reading:
+    """What is known in one reading: tables of contents by identity, and the cached ranges of URLs."""
 
-    size: int
-    changed_ns: int
-    contents: Contents
+    contents: dict[object, tuple[object, Contents]] = field(default_factory=dict)
+    ranges: dict[LogUrl, RemoteRanges] = field(default_factory=dict)
 
 
-# By device and inode; None outside of :func:`one_reading`.
-_known: ContextVar[dict[tuple[int, int], _Known] | None] = ContextVar("known_contents", default=None)
+# None outside of :func:`one_reading`.
+_reading: ContextVar[_Reading | None] = ContextVar("one_reading", default=None)
 
 
 @contextmanager
 def one_reading() -> Iterator[None]:
     """Parse the summary of each log once within this block, and again only after a change of its file.
 
-    Inode, size and change time show a change. An append checks for a change under the lock.
+    Inode, size and change time show a change. An append checks for a change under the lock. The version of a
+    log at a URL is that of its first opening: a later request of another version fails.
     """
-    outer = _known.get()
-    token = _known.set({} if outer is None else outer)
+    token = _reading.set(_reading.get() or _Reading())
     try:
         yield
     finally:
-        _known.reset(token)
+        _reading.reset(token)
+
+
+def open_remote(url: LogUrl) -> RemoteBytes:
+    """Open a log at a URL; within one reading, all readers share its cache.
+
+    Raises
+    ------
+    LogError
+        The log cannot be found, or its protocol is not known.
+    """
+    reading = _reading.get()
+    if reading is None:
+        return RemoteBytes.open(url)
+    if url not in reading.ranges:
+        reading.ranges[url] = RemoteBytes.open(url).ranges
+    return RemoteBytes(url, reading.ranges[url])
 
 
 def contents_of(view: LogBytes) -> Contents:
@@ -49,29 +66,29 @@ def contents_of(view: LogBytes) -> Contents:
     LogError
         As :func:`~ipsys_log.log.summary.load_contents`.
     """
-    known = _known.get()
-    if known is None or view.tail_fd >= 0:  # with a tail in a journal, the file is not the whole log
+    reading = _reading.get()
+    if reading is None or view.is_interrupted:  # with a tail in a journal, the file is not the whole log
         return load_contents(view)
-    status = os.fstat(view.fd)
-    last = known.get((status.st_dev, status.st_ino))
-    if last is not None and (last.size, last.changed_ns) == (view.size, status.st_mtime_ns):
-        return last.contents.copy()
+    log, content = view.identity()
+    known = reading.contents.get(log)
+    if known is not None and known[0] == content:
+        return known[1].copy()
     contents = load_contents(view)
-    _note(status, contents)
+    _note((log, content), contents)
     return contents
 
 
 def note_contents(fd: int, contents: Contents) -> None:
     """Note the table of contents of a log that this process has just written."""
-    if _known.get() is not None:
-        _note(os.fstat(fd), contents)
+    if _reading.get() is not None:
+        _note(file_identity(fd), contents)
 
 
-def _note(status: os.stat_result, contents: Contents) -> None:
-    known = _known.get()
-    if known is None:
+def _note(identity: tuple[object, object], contents: Contents) -> None:
+    reading = _reading.get()
+    if reading is None:
         return
-    key = status.st_dev, status.st_ino
-    known.pop(key, None)
+    log, content = identity
+    reading.contents.pop(log, None)
     if not contents.unchunked and not contents.cut_short:
-        known[key] = _Known(status.st_size, status.st_mtime_ns, contents.copy())
+        reading.contents[log] = content, contents.copy()

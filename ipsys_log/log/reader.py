@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import ReadLimits
-from ipsys_log.log.byte_source import LogBytes, open_for_reading
+from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
@@ -25,6 +25,7 @@ from ipsys_log.log.chunk_messages import (
     chunk_entries,
     open_chunk,
     open_unchunked,
+    planned_range,
     to_rows,
 )
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
@@ -32,7 +33,8 @@ from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.file_check import FileCheck, check_file
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
-from ipsys_log.log.known_contents import contents_of
+from ipsys_log.log.known_contents import contents_of, open_remote
+from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
 from ipsys_log.log.records import HEADER, parse, walk
@@ -55,7 +57,7 @@ class LogReader:
     Parameters
     ----------
     path
-        The ``.mcap`` file.
+        The ``.mcap`` file, or the URL of one.
 
     Attributes
     ----------
@@ -94,9 +96,10 @@ class LogReader:
     [('/a', 1000)]
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike[str] | LogUrl) -> None:
+        self.path: LogLocation = path if isinstance(path, LogUrl) else Path(path)
         self._view, self._contents = _open(self.path)
+        self._view.plan("chunks", (planned_range(chunk) for chunk in self._contents.chunks))
         self._cache = RangeCache()
         self._stored: dict[str, ChannelHash] | None = None
         self.channels, self.conflicts = group_by_topic(self._contents)
@@ -174,12 +177,8 @@ class LogReader:
         contents, view = self._contents, self._view
         wanted = self._topics_by_id(topics)
         span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
-        pending = [
-            PendingChunk(
-                chunk.start_ns,
-                chunk.offset,
-                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
-            )
+        chunks = [
+            chunk
             for chunk in contents.chunks
             if chunk.start_ns <= span[1]
             and chunk.end_ns >= span[0]
@@ -188,6 +187,14 @@ class LogReader:
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
+        pending = [
+            PendingChunk(
+                chunk.start_ns,
+                chunk.offset,
+                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
+            )
+            for chunk in chunks
+        ]
         if contents.unchunked:
             entries = to_rows(contents.unchunked)
             unchunked = partial(open_unchunked, view, self._cache, entries, wanted, span, contents.data_end)
@@ -198,10 +205,14 @@ class LogReader:
         """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
         wanted = set(self._topics_by_id([topic]))
         parts = [rows for key, rows in to_rows(self._contents.unchunked).items() if key in wanted]
-        for chunk in self._contents.chunks:
-            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets):
-                entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
-                parts += [rows for key, rows in entries.items() if key in wanted]
+        chunks = [
+            chunk
+            for chunk in self._contents.chunks
+            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets)
+        ]
+        for chunk in chunks:
+            entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
+            parts += [rows for key, rows in entries.items() if key in wanted]
         times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
         return np.sort(times).astype(np.int64)
 
@@ -229,6 +240,31 @@ class LogReader:
         rows = np.concatenate(parts) if parts else np.empty((0, 4), np.uint64)
         ordered = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))].astype(np.int64)
         return ordered[:, 0], ordered[:, 3]
+
+    def first_time(self, topic: str) -> int | None:
+        """Return the log time of the first message of a topic in ns; None if it has none."""
+        return self._extreme_time(topic, last=False)
+
+    def last_time(self, topic: str) -> int | None:
+        """Return the log time of the last message of a topic in ns; None if it has none."""
+        return self._extreme_time(topic, last=True)
+
+    def _extreme_time(self, topic: str, last: bool) -> int | None:
+        """Read the indexes from that end of the log, until no other chunk can have a further time."""
+        wanted, sign = set(self._topics_by_id([topic])), -1 if last else 1
+        rows = to_rows(self._contents.unchunked)
+        times = [sign * int(time) for key in wanted & rows.keys() for time in rows[key][:, 0]]
+        chunks = [
+            (sign * (chunk.end_ns if last else chunk.start_ns), chunk) for chunk in self._contents.chunks
+        ]
+        for bound, chunk in sorted(chunks, key=lambda row: row[0]):
+            if times and min(times) <= bound:
+                break
+            if chunk.index_offsets and wanted.isdisjoint(chunk.index_offsets):
+                continue
+            entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
+            times += [sign * int(time) for key in wanted & entries.keys() for time in entries[key][:, 0]]
+        return sign * min(times) if times else None
 
     def channel_hash(self, topic: str) -> str:
         """Return the hash over times and payloads of a channel in log order, in hexadecimal.
@@ -306,13 +342,20 @@ def stored_hashes(view: LogBytes, contents: Contents) -> dict[str, ChannelHash]:
     return hashes
 
 
-def _open(path: Path) -> tuple[LogBytes, Contents]:
+def _open(path: LogLocation) -> tuple[LogBytes, Contents]:
+    if isinstance(path, LogUrl):
+        remote = open_remote(path)
+        return remote, contents_of(remote)
+    return _open_file(path)
+
+
+def _open_file(path: Path) -> tuple[FileBytes, Contents]:
     """Open a log in a consistent state: the old log if its journal is valid, else an unchanging file."""
     fault: LogError | None = None
     for _ in range(_ATTEMPTS):
         fd = open_for_reading(path)
         status_before = os.fstat(fd)
-        view = LogBytes(path, fd, status_before.st_size, status_before.st_size)
+        view = FileBytes(path, fd, status_before.st_size, status_before.st_size)
         has_journal = attach_journal(view)
         fault = None
         try:
@@ -340,9 +383,9 @@ def _open(path: Path) -> tuple[LogBytes, Contents]:
     raise fault
 
 
-def _is_unchanged(view: LogBytes, before: os.stat_result) -> bool:
+def _is_unchanged(view: FileBytes, before: os.stat_result) -> bool:
     now = os.fstat(view.fd)
-    probe = LogBytes(view.path, os.dup(view.fd), now.st_size, now.st_size)
+    probe = FileBytes(view.path, os.dup(view.fd), now.st_size, now.st_size)
     try:
         same = (now.st_size, now.st_mtime_ns) == (before.st_size, before.st_mtime_ns)
         return same and not attach_journal(probe)

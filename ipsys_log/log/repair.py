@@ -13,7 +13,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import FileBytes
 from ipsys_log.log.damage.agreement import count_by_indexes, disagreement
 from ipsys_log.log.damage.findings import Survey
 from ipsys_log.log.damage.kept_bytes import (
@@ -93,7 +93,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         if resumed is not None:
             notes.append("an interrupted repair was completed")
         status = os.fstat(fd)
-        view = LogBytes(target, fd, status.st_size, status.st_size)
+        view = FileBytes(target, fd, status.st_size, status.st_size)
         _check_not_empty(view)
         known = read_intact_summary(view)
         with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
@@ -129,7 +129,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         storage.close(fd)
 
 
-def _check_not_empty(view: LogBytes) -> None:
+def _check_not_empty(view: FileBytes) -> None:
     if not view.size:
         raise LogError(f"{view.path} is empty: it cannot be repaired; delete it")
 
@@ -145,7 +145,7 @@ class _Plan(NamedTuple):
 
 
 def _rebuild(
-    storage: Storage, view: LogBytes, findings: Survey, salvage: Salvage, known: Summary | None
+    storage: Storage, view: FileBytes, findings: Survey, salvage: Salvage, known: Summary | None
 ) -> RepairReport:
     with tempfile.TemporaryFile(dir=view.path.parent) as tail:
         plan = _plan(view, findings, salvage, tail)
@@ -157,7 +157,7 @@ def _rebuild(
     return _report(view, findings, salvage, known, damaged_file, own_end)
 
 
-def _plan(view: LogBytes, findings: Survey, salvage: Salvage, tail: IO[bytes]) -> _Plan:
+def _plan(view: FileBytes, findings: Survey, salvage: Salvage, tail: IO[bytes]) -> _Plan:
     """Plan the new log; the file is not changed yet."""
     contents, start = findings.contents, findings.end
     patches = _patches(findings)
@@ -215,7 +215,7 @@ def _emit_saved(end: _End, findings: Survey, salvage: Salvage) -> None:
         contents.count(channel, number)
 
 
-def _emit_displaced(end: _End, view: LogBytes, findings: Survey) -> None:
+def _emit_displaced(end: _End, view: FileBytes, findings: Survey) -> None:
     """Write messages outside of chunks that cannot stay in place, after the definitions of their channels."""
     contents = findings.contents
     heads = [MESSAGE.unpack(view.read(record_at.offset, MESSAGE.size)) for record_at in findings.displaced]
@@ -240,7 +240,7 @@ def _patches(findings: Survey) -> list[Patch]:
     return sorted([*patches, *findings.wrong_heads])
 
 
-def _crc_with(view: LogBytes, patches: Sequence[Patch], end: int, crc: int) -> int:
+def _crc_with(view: FileBytes, patches: Sequence[Patch], end: int, crc: int) -> int:
     """Return the CRC of the data section up to `end` after `patches`: it is linear in the changed bytes."""
     for offset, new in patches:
         differs = zlib.crc32(view.read(offset, len(new))) ^ zlib.crc32(new)
@@ -248,7 +248,7 @@ def _crc_with(view: LogBytes, patches: Sequence[Patch], end: int, crc: int) -> i
     return crc
 
 
-def _check(view: LogBytes, findings: Survey, plan: _Plan) -> None:
+def _check(view: FileBytes, findings: Survey, plan: _Plan) -> None:
     """Check the new log before it is written: by its indexes, record by record, and by its statistics.
 
     Raises
@@ -257,7 +257,7 @@ def _check(view: LogBytes, findings: Survey, plan: _Plan) -> None:
         The numbers of messages do not agree.
     """
     size = findings.end + plan.tail_size
-    new = LogBytes(view.path, view.fd, size, findings.end, plan.tail.fileno(), 0, patches=plan.patches)
+    new = FileBytes(view.path, view.fd, size, findings.end, plan.tail.fileno(), 0, patches=plan.patches)
     new_findings = survey(new, read_intact_summary(new))
     streamed = sum(new_findings.contents.counts.values())
     difference = disagreement(new, new_findings)
@@ -292,7 +292,7 @@ class _FileBlocks(Sequence[bytes]):
         return os.pread(self._fd, _BLOCK, index * _BLOCK)
 
 
-def _commit(storage: Storage, view: LogBytes, change: Change, plan: _Plan) -> Path | None:
+def _commit(storage: Storage, view: FileBytes, change: Change, plan: _Plan) -> Path | None:
     """Keep the old bytes, then write the new log; a crash at any instant leaves the old or the new log."""
     path, fd = view.path, view.fd
     check_room(path, change)
@@ -307,7 +307,7 @@ def _commit(storage: Storage, view: LogBytes, change: Change, plan: _Plan) -> Pa
     return overwrite(storage, path, fd, change.patches) if has_old_bytes else None
 
 
-def _own_end(view: LogBytes, findings: Survey) -> int:
+def _own_end(view: FileBytes, findings: Survey) -> int:
     """Return the end of a finished log; later bytes are not a part of the log."""
     if findings.finished:
         with suppress(LogError):
@@ -318,7 +318,7 @@ def _own_end(view: LogBytes, findings: Survey) -> int:
 
 
 def _report(
-    view: LogBytes,
+    view: FileBytes,
     findings: Survey,
     salvage: Salvage,
     known: Summary | None,

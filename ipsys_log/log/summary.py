@@ -29,6 +29,7 @@ __all__ = [
 
 # The record before a temporary tail: a private type, with the offset of the end of the old data.
 TEMPORARY_TAIL_MARK = struct.Struct("<BQ8sQ")
+_LARGEST_GAP = 1 << 20  # bytes: the definitions between two chunks
 _MARK_TYPE, _MARK_NAME = 0x80 | Opcode.DATA_END, b"standing"
 
 
@@ -249,7 +250,9 @@ def _gaps_hold_no_messages(view: LogBytes, contents: Contents, data_end: int) ->
     """
     extents = sorted((chunk.offset, chunk.end) for chunk in contents.chunks)
     edges = [(0, len(MAGIC)), *extents, (data_end, data_end)]
-    for (_, start), (end, _) in pairwise(edges):
+    gaps = [(start, end) for (_, start), (end, _) in pairwise(edges)]
+    view.plan("gaps", ((start, end) for start, end in gaps if start < end <= start + _LARGEST_GAP))
+    for start, end in gaps:
         if start > end:
             raise view.fault(end, "two chunks overlap, or one reaches into the summary")
         for record_at in walk(view, start, end):

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.bounds import LARGEST_MESSAGE
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import FileBytes
 from ipsys_log.log.chunk_builder import (
     IMAGE_SCHEMAS,
     IMAGES,
@@ -142,7 +142,7 @@ class LogWriter:
         try:
             roll_back(storage, target, fd)
             size = os.fstat(fd).st_size
-            view = LogBytes(target, fd, size, size)
+            view = FileBytes(target, fd, size, size)
             contents = contents_of(view)
             stored = stored_hashes(view, contents)
         except BaseException:

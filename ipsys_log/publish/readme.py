@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 
 from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.log.dataset import Session
@@ -75,8 +74,8 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def _log_rows(session: Session) -> Iterator[tuple[str, str, str, str]]:
     for reader in session.readers:
         start = "" if reader.start_ns is None else format_time(reader.start_ns)
-        size = format_bytes(Path(reader.path).stat().st_size)
-        yield f"{LOGS}/{Path(reader.path).name}", size, str(reader.message_count), start
+        size = format_bytes(reader.size)
+        yield f"{LOGS}/{reader.path.name}", size, str(reader.message_count), start
 
 
 def _facts(session: Session, rig: Rig, blurred: bool) -> list[str]:

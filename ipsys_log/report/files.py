@@ -12,6 +12,7 @@ from pathlib import Path
 from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.findings import Findings
@@ -106,7 +107,7 @@ def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 
-def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
+def check_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:
     """Check that a file can be written, before any work is done.
 
     Raises
@@ -114,7 +115,7 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     IpsysError
         The file cannot be written, or it is one of the logs.
     """
-    if any(log.exists() and path.exists() and path.samefile(log) for log in logs):
+    if is_one_of(path, logs):
         raise IpsysError(f"{option} {path}: this is the log itself; name another file")
     if (text := describe_broken_link(path)) is not None:
         raise IpsysError(f"{option} {text}")
@@ -125,7 +126,7 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     _check_writable(path.parent, f"{option} {path}")
 
 
-def check_figure_file(path: Path, option: str, logs: Iterable[Path]) -> None:
+def check_figure_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:
     """Check that a figure can be written and has a valid format, before any work is done.
 
     Raises

@@ -14,6 +14,7 @@ from ipsys_log.images.decode import frame_size
 from ipsys_log.images.video import Video
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CompressedVideo
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
@@ -49,7 +50,7 @@ _CHECKED_MESSAGES = 100
 
 
 def check_inputs(
-    paths: Sequence[Path], request: Request, models: Sequence[str], stages: Sequence[Stage]
+    paths: Sequence[LogLocation], request: Request, models: Sequence[str], stages: Sequence[Stage]
 ) -> None:
     """Check the inputs of some stages; the last one is the purpose of the command.
 
@@ -146,7 +147,7 @@ def _current_run(
     )
 
 
-def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:
+def _check_request(paths: Sequence[LogLocation], request: Request, models: Sequence[str]) -> None:
     if request.run is not None and len(models) > 1:
         raise IpsysError(
             f"--run {request.run} is the name of one run, but the command fits {len(models)} models; "
@@ -154,7 +155,7 @@ def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str
         )
     if request.model_from is None:
         return
-    if any(request.model_from.resolve() == path.resolve() for path in paths):
+    if any(isinstance(path, Path) and request.model_from.resolve() == path.resolve() for path in paths):
         raise IpsysError(f"--model-from {request.model_from}: is the same log; leave out --model-from")
     if request.train != "train":
         raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")

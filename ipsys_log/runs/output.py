@@ -16,6 +16,7 @@ from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, journal_path
+from ipsys_log.log.location import LogLocation, file_beside, is_one_of
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
@@ -26,6 +27,7 @@ __all__ = [
     "append_messages",
     "append_run",
     "check_copy",
+    "choose_target",
     "create_copy",
     "open_target",
     "record_message",
@@ -74,7 +76,7 @@ def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
         return write_messages(writer, messages)
 
 
-def check_copy(paths: Sequence[Path], output: Path, overwrite: bool) -> None:
+def check_copy(paths: Sequence[LogLocation], output: Path, overwrite: bool) -> None:
     """Refuse an output that is one of the logs, or that exists, except with ``overwrite``.
 
     Raises
@@ -84,7 +86,7 @@ def check_copy(paths: Sequence[Path], output: Path, overwrite: bool) -> None:
     """
     if not output.exists():
         return
-    if any(path.exists() and path.samefile(output) for path in paths):
+    if is_one_of(output, paths):
         raise IpsysError(f"-o {output}: this is the log itself; choose another name")
     if not overwrite:
         raise IpsysError(f"-o {output}: exists already; choose another name, or give --overwrite")
@@ -137,14 +139,54 @@ def record_message(record: Run, log_time_ns: int) -> Message:
     return Message(f"/runs/{record.run}/record", log_time_ns, record.timestamp, record)
 
 
+def choose_target(paths: Sequence[LogLocation], output: Path | None) -> tuple[list[LogLocation], Path | None]:
+    """Return the logs to read, and the new log for the results; None if they are appended to the last log.
+
+    Nothing can be appended to a log at a URL. Its results come into a derived log in the current folder:
+    ``monday.derived.mcap`` for ``monday.mcap``. A derived log that exists is read, too, and extended.
+
+    Raises
+    ------
+    IpsysError
+        The derived log has results of another log.
+    """
+    source = paths[-1]
+    if output is not None or isinstance(source, Path):
+        return list(paths), output
+    derived = file_beside(source, ".derived.mcap")
+    if not derived.exists():
+        return list(paths), derived
+    _check_source(paths, derived)
+    return [*paths, derived], None
+
+
+def _check_source(paths: Sequence[LogLocation], derived: Path) -> None:
+    """Check that a derived log has results of these logs: its runs name their inputs by content.
+
+    The largest input decides, such as the markers: two logs of a lab can have equal rigs and intrinsics.
+    """
+    with Session([derived]) as results, Session(paths) as session:
+        inputs = [read for run in results.runs() for read in run.inputs]
+        known = [read for read in inputs if session.count(read.topic)]
+        largest = max(known, key=lambda read: read.messages, default=None)
+        if inputs and (largest is None or session.hash(largest.topic) != largest.hash):
+            raise IpsysError(f"{derived}: has results of another log than {session}; give a new log with -o")
+
+
 @contextmanager
-def open_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
+def open_target(
+    paths: Sequence[LogLocation], output: Path | None
+) -> Iterator[tuple[list[LogLocation], Path]]:
     """Yield the logs to read, and the log to append to: the last log of ``paths``, or a new log.
 
     A new log gets its name only when all work is done. If there was no work, or after an error, no new log
     remains.
     """
     if output is None:
+        if not isinstance(paths[-1], Path):
+            raise IpsysError(
+                f"{paths[-1]}: nothing can be appended to a log at a URL; give a new log with -o"
+            )
         yield list(paths), paths[-1]
         return
     _check_free(output)

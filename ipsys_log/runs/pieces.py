@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import (
     RIG_TOPIC,
     CameraCalibration,
@@ -66,7 +66,7 @@ class PieceRun:
     skipped : log times in ns of the frames that the run leaves out.
     """
 
-    paths: tuple[Path, ...]
+    paths: tuple[LogLocation, ...]
     stage: str
     parameters: Mapping[str, str]
     topics: tuple[str, ...]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from ipsys_log.analysis.calibration_points import has_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Model, Rig
 from ipsys_log.messages.channels import MARKERS, MODEL, RIG
 from ipsys_log.models.table import CORNER_MODELS, MODELS, check_name
@@ -36,7 +36,7 @@ MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 
 
 def wanted_models(
-    request: Request, paths: Sequence[Path] = (), usual: Sequence[str] = ("poly",)
+    request: Request, paths: Sequence[LogLocation] = (), usual: Sequence[str] = ("poly",)
 ) -> tuple[str, ...]:
     """Return the names of the models to fit or apply.
 
@@ -73,7 +73,7 @@ def has_corners(session: Session) -> bool:
     return bool(session.images) or newest_run(session, MARKERS) is not None
 
 
-def evaluated_models(paths: Sequence[Path]) -> tuple[str, ...]:
+def evaluated_models(paths: Sequence[LogLocation]) -> tuple[str, ...]:
     """Return all models that the logs of ``paths`` can have: those of corners only if they have corners."""
     with Session(paths) as session:
         return (*MODELS, *(CORNER_MODELS if has_corners(session) else ()))

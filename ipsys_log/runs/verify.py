@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import IMPORTED, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.runs.blas import one_blas_thread
@@ -42,7 +42,10 @@ _MOVING = (MARKERS, CAMERA_POINTS, POSITIONS, TRACKS)
 
 @one_reading()
 def verify(
-    paths: Sequence[Path], run: str | None, progress: Progress, say: Callable[[str], None] = lambda text: None
+    paths: Sequence[LogLocation],
+    run: str | None,
+    progress: Progress,
+    say: Callable[[str], None] = lambda text: None,
 ) -> list[Comparison]:
     """Repeat every run from its recorded input, and compare.
 
@@ -157,7 +160,7 @@ def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
     ]
 
 
-def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[Comparison]:
+def diff(left: LogLocation, right: LogLocation, runs: tuple[str | None, str | None]) -> list[Comparison]:
     """Compare the derived channels of two logs, or of two runs.
 
     Parameters
@@ -175,7 +178,7 @@ def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[C
         return compare_channels(ours, theirs)
 
 
-def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> str | None:
+def explain_diff(left: LogLocation, right: LogLocation, runs: tuple[str | None, str | None]) -> str | None:
     """Return the reason why two logs or two runs cannot be compared; None if they can.
 
     The parameters are those of `diff`.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.runs.options import Progress
 from ipsys_log.soundness.channels import (
@@ -30,8 +31,9 @@ __all__ = ["check_logs"]
 _BYTES_PER_MB = 1_000_000
 
 
+@one_reading()
 def check_logs(
-    paths: Sequence[Path], progress: Progress = lambda stage, done, total: None
+    paths: Sequence[LogLocation], progress: Progress = lambda stage, done, total: None
 ) -> tuple[LogCheck, ...]:
     """Read logs completely, and check each of them; no file is changed.
 
@@ -43,6 +45,7 @@ def check_logs(
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> from ipsys_log.log.writer import LogWriter
     >>> with TemporaryDirectory() as folder:
@@ -55,7 +58,7 @@ def check_logs(
     return tuple(_check_log(path, [other for other in paths if other != path], progress) for path in paths)
 
 
-def _check_log(path: Path, others: Sequence[Path], progress: Progress) -> LogCheck:
+def _check_log(path: LogLocation, others: Sequence[LogLocation], progress: Progress) -> LogCheck:
     findings: list[LogFinding] = []
     try:
         findings += _check_file(path, progress)
@@ -67,7 +70,7 @@ def _check_log(path: Path, others: Sequence[Path], progress: Progress) -> LogChe
     return LogCheck(path, tuple(findings))
 
 
-def _check_file(path: Path, progress: Progress) -> Iterator[LogFinding]:
+def _check_file(path: LogLocation, progress: Progress) -> Iterator[LogFinding]:
     advice = f"run: ipsys repair {path}"
     with LogReader(path) as reader:
         times = MessageTimes(
@@ -96,7 +99,9 @@ def _check_file(path: Path, progress: Progress) -> Iterator[LogFinding]:
     yield from times.findings()
 
 
-def _check_contents(path: Path, others: Sequence[Path], progress: Progress) -> Iterator[LogFinding]:
+def _check_contents(
+    path: LogLocation, others: Sequence[LogLocation], progress: Progress
+) -> Iterator[LogFinding]:
     with ExitStack() as stack:
         session = stack.enter_context(Session([path]))
         total = sum(session.count(topic) for topic in decoded_topics(session))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
+
+from ipsys_log.log.location import LogLocation
 
 __all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "LogCheck", "LogFinding"]
 
@@ -40,7 +41,7 @@ class LogFinding:
 class LogCheck:
     """The result of the check of a log: its path and its findings, in the order of the checks."""
 
-    path: Path
+    path: LogLocation
     findings: tuple[LogFinding, ...] = ()
 
     @property

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import IMPORTED
 from ipsys_log.messages.channels import IMAGES, MODEL, RECORD
 from ipsys_log.runs.graph import writes
@@ -21,7 +21,7 @@ __all__ = ["check_runs", "find_input_logs"]
 _IMAGE = IMAGES.topic.rpartition("/")[2]
 
 
-def find_input_logs(session: Session, others: Sequence[Path]) -> list[Path]:
+def find_input_logs(session: Session, others: Sequence[LogLocation]) -> list[LogLocation]:
     """Return the logs among ``others`` with inputs of runs that the log of ``session`` lacks in part."""
     needed = {
         read.topic: read.hash
@@ -32,7 +32,7 @@ def find_input_logs(session: Session, others: Sequence[Path]) -> list[Path]:
     return [path for path in others if needed and _has_input(path, needed)]
 
 
-def _has_input(path: Path, needed: dict[str, str]) -> bool:
+def _has_input(path: LogLocation, needed: dict[str, str]) -> bool:
     with suppress(IpsysError), Session([path]) as other:
         # An input from several logs has the hash of each of them, joined by "+".
         return any(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.log import summary
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import FileBytes
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.reader import LogReader
@@ -29,7 +29,7 @@ class Parses:
 def parses(monkeypatch: pytest.MonkeyPatch) -> Parses:
     counter, parse = Parses(), summary._from_summary
 
-    def counted(view: LogBytes, start: int, end: int) -> object:
+    def counted(view: FileBytes, start: int, end: int) -> object:
         counter.count += 1
         return parse(view, start, end)
 
@@ -66,7 +66,7 @@ def test_contents_of_an_append_are_those_of_the_file(log: Path, parses: Parses) 
         with LogReader(log) as known:
             contents = known._contents
     fd = os.open(log, os.O_RDONLY)
-    view = LogBytes(log, fd, log.stat().st_size, log.stat().st_size)
+    view = FileBytes(log, fd, log.stat().st_size, log.stat().st_size)
     assert load_contents(view) == contents
     view.close()
 

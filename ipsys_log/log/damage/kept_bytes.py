@@ -23,7 +23,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import LogBytes, open_for_reading
+from ipsys_log.log.byte_source import FileBytes, open_for_reading
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.resync import crc_of
 from ipsys_log.log.journal import Storage, write_all
@@ -82,7 +82,7 @@ def check_room(path: Path, change: Change) -> None:
         )
 
 
-def keep_old_bytes(storage: Storage, view: LogBytes, change: Change, time_ns: int) -> bool:
+def keep_old_bytes(storage: Storage, view: FileBytes, change: Change, time_ns: int) -> bool:
     """Write ``<log>.damaged.partial`` and sync it; return False if no bytes are taken out."""
     if not change.old_pieces:
         return False
@@ -151,7 +151,7 @@ def _committed_patches(partial: Path, path: Path, fd: int) -> list[Patch] | None
     except (LogError, KeyError, ValueError):  # the file is incomplete: so the log was not changed
         return None
     size = os.fstat(fd).st_size
-    log = LogBytes(path, fd, size, size)
+    log = FileBytes(path, fd, size, size)
     if size < new_size or crc_of(log, new_size - start, start) != crc:
         return None
     return patches
@@ -161,7 +161,7 @@ def _read_metadata(partial: Path) -> dict[str, str]:
     fd = open_for_reading(partial)
     try:
         size = os.fstat(fd).st_size
-        view = LogBytes(partial, fd, size, size)
+        view = FileBytes(partial, fd, size, size)
         summary = read_summary(view)
         if summary is None:
             return {}
@@ -174,7 +174,7 @@ def _read_metadata(partial: Path) -> dict[str, str]:
         os.close(fd)
 
 
-def _write(storage: Storage, fd: int, view: LogBytes, change: Change, time_ns: int) -> None:
+def _write(storage: Storage, fd: int, view: FileBytes, change: Change, time_ns: int) -> None:
     contents, crc, offset = Contents(), 0, 0
 
     def emit(data: bytes) -> None:
@@ -201,7 +201,7 @@ def _write(storage: Storage, fd: int, view: LogBytes, change: Change, time_ns: i
     emit(tail_bytes(contents))
 
 
-def _attachment(view: LogBytes, name: str, start: int, end: int, time_ns: int) -> Iterator[bytes]:
+def _attachment(view: FileBytes, name: str, start: int, end: int, time_ns: int) -> Iterator[bytes]:
     """Yield an Attachment record, block by block."""
     text = name.encode()
     fields = struct.pack("<QQI", time_ns, time_ns, len(text)) + text + struct.pack("<IQ", 0, end - start)

@@ -1,0 +1,127 @@
+"""Locations of logs: a file, or the URL of an object in a store or on a server."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+from ipsys_log.plain_text import plain_text
+from ipsys_log.rig.file import hide_password
+
+__all__ = ["LogLocation", "LogUrl", "file_beside", "find_logs", "is_one_of", "parse_location"]
+
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)")
+_LOCAL = ("file", "local")
+_GLOB = re.compile(r"[*\[]")
+
+
+@dataclass(frozen=True, slots=True)
+class LogUrl:
+    """The URL of a log. Its texts have neither the password nor the query, which may be a secret.
+
+    Attributes
+    ----------
+    url : the address as the user wrote it, with credentials.
+    key : the object in its file system, if `url` is a pattern that it matches; "" otherwise.
+
+    Examples
+    --------
+    >>> log = LogUrl("https://ada:secret@example.org/logs/monday.mcap?token=abc")
+    >>> str(log), log.name, log.stem, log.suffix
+    ('https://ada:***@example.org/logs/monday.mcap', 'monday.mcap', 'monday', '.mcap')
+    """
+
+    url: str = field(repr=False)
+    key: str = ""
+
+    def __str__(self) -> str:
+        text = hide_password(self.url)
+        if self.key:
+            scheme, _, rest = text.partition("://")
+            host = rest.partition("/")[0] if self.key.startswith("/") else ""
+            text = self.key if "://" in self.key else f"{scheme}://{host}{self.key}"
+        return plain_text(text.partition("?")[0], longest=500)
+
+    @property
+    def name(self) -> str:
+        """The last part of the path."""
+        return unquote(str(self).rstrip("/").rpartition("/")[2])
+
+    @property
+    def stem(self) -> str:
+        """The name without its suffix."""
+        return PurePosixPath(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The suffix of the name, such as ``.mcap``."""
+        return PurePosixPath(self.name).suffix
+
+    @property
+    def scheme(self) -> str:
+        """The protocol, such as ``s3``."""
+        match = _URL.match(self.url)
+        return match[1].lower() if match else ""
+
+    @property
+    def is_pattern(self) -> bool:
+        """True if the URL may match several objects."""
+        path = self.url.partition("://")[2].partition("?")[0]
+        return not self.key and bool(_GLOB.search(path.partition("/")[2]))
+
+
+LogLocation = Path | LogUrl
+
+
+def parse_location(text: str | os.PathLike[str] | LogUrl) -> LogLocation:
+    """Return the location of a log: a `LogUrl` for a URL, except ``file://``, and a path otherwise.
+
+    Examples
+    --------
+    >>> parse_location("file:///data/monday.mcap"), parse_location("monday.mcap")
+    (PosixPath('/data/monday.mcap'), PosixPath('monday.mcap'))
+    """
+    if isinstance(text, LogUrl):
+        return text
+    match = _URL.match(text) if isinstance(text, str) else None
+    if match is None:
+        return Path(text)
+    text = str(text)
+    if match[2] == "://" and match[1].lower() in _LOCAL:
+        return Path(unquote(text[match.end() :]))
+    return LogUrl(text)
+
+
+def find_logs(texts: Iterable[str | os.PathLike[str] | LogUrl]) -> list[LogLocation]:
+    """Return the locations of logs; a URL with ``*`` or ``[`` gives all objects that match, by name.
+
+    Raises
+    ------
+    IpsysError
+        A pattern matches nothing, or its store cannot be listed.
+    """
+    found: list[LogLocation] = []
+    for location in map(parse_location, texts):
+        if isinstance(location, LogUrl) and location.is_pattern:
+            from ipsys_log.log.remote_object import list_objects
+
+            found += list_objects(location)
+        else:
+            found.append(location)
+    return found
+
+
+def is_one_of(path: Path, logs: Sequence[LogLocation]) -> bool:
+    """Return whether a file is one of some logs, perhaps under another name."""
+    return any(
+        isinstance(log, Path) and log.exists() and path.exists() and path.samefile(log) for log in logs
+    )
+
+
+def file_beside(log: LogLocation, suffix: str) -> Path:
+    """Return the file with the name of a log and another suffix; for a URL, it is in the current folder."""
+    return log.with_suffix(suffix) if isinstance(log, Path) else Path(f"{log.stem}{suffix}")

@@ -1,0 +1,311 @@
+"""Objects in stores and on servers: exact byte ranges of one version, with fsspec.
+
+Each request asks for the version that was opened: by its ETag where the protocol can do this (S3, HTTP), else
+by a look at size and time after the request. A request that fails for a reason that may pass is repeated.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from ipsys_log.errors import LogError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogUrl
+from ipsys_log.plain_text import plain_text
+
+__all__ = ["RemoteObject", "list_objects", "open_object"]
+
+_PAUSES_S = (0.1, 0.4, 1.6, 4.0)
+_LONGEST_REASON = 200
+# HTTP status codes of requests that may succeed when they are repeated.
+_PASSING_STATUS = (408, 425, 429)
+_CHANGED_STATUS = 412
+_DENIED_STATUS = (401, 403)
+# Errors that a repetition does not change. A file system may raise any other error for a lost connection.
+_FINAL = (
+    *(PermissionError, IsADirectoryError, NotADirectoryError, NotImplementedError, ImportError, LookupError),
+    ValueError,
+)
+_NO_CREDENTIALS = "NoCredentialsError"  # of botocore, which is imported only for its URLs
+_BUGS = (TypeError, AttributeError, NameError, AssertionError)
+# The fields of an entry of fsspec that tell a version; each file system has some of them.
+_VERSION_FIELDS = (
+    *("ETag", "etag", "generation", "Last-Modified", "LastModified", "last_modified", "mtime"),
+    *("modified", "created", "md5Hash", "content_md5"),
+)
+
+T = TypeVar("T")
+
+
+class _ChangedError(Exception):
+    """An object that is not the one that was opened."""
+
+
+class _NoRangesError(ValueError):
+    """A server that sends whole objects only."""
+
+
+@dataclass(slots=True)
+class RemoteObject:
+    """One version of an object.
+
+    Attributes
+    ----------
+    filesystem, path : the file system of fsspec, and the object in it.
+    size : in bytes.
+    version : identifies the content, as far as the store tells.
+    requests, bytes_fetched : the number of successful requests for bytes, and of these bytes.
+    """
+
+    url: LogUrl
+    filesystem: Any
+    path: str
+    size: int
+    version: tuple[str, ...]
+    read_pinned: Callable[[int, int], bytes]
+    requests: int = 0
+    bytes_fetched: int = 0
+
+    def fetch(self, start: int, end: int) -> bytes:
+        """Return the bytes from `start` to before `end`, in one request.
+
+        Raises
+        ------
+        LogError
+            The object has changed since it was opened, or cannot be read.
+        """
+
+        def ask() -> bytes:
+            data = self.read_pinned(start, end)
+            if len(data) > end - start:
+                raise _NoRangesError
+            if len(data) < end - start:
+                raise ConnectionError(f"{len(data)} of {end - start} bytes arrived")
+            return data
+
+        data = _repeat(self.url, ask)
+        self.requests += 1
+        self.bytes_fetched += len(data)
+        return data
+
+
+def open_object(url: LogUrl) -> RemoteObject:
+    """Look up an object: one request for its size and version.
+
+    Raises
+    ------
+    LogError
+        The protocol is not known, its package is missing, or the object cannot be found.
+    """
+    filesystem, path = _filesystem(url)
+    open_pinned = _OPENERS.get(url.scheme, _open_and_look)
+    entry, read = _repeat(url, lambda: open_pinned(filesystem, path))
+    size = entry.get("size")
+    if entry.get("type") == "directory":
+        raise LogError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
+    if size is None or entry.get("partial") is False:
+        raise _failure(url, _NoRangesError())
+    return RemoteObject(url, filesystem, path, int(size), _version_of(entry), read)
+
+
+def list_objects(pattern: LogUrl) -> list[LogUrl]:
+    """Return the objects that match a pattern, by name.
+
+    Raises
+    ------
+    LogError
+        Nothing matches, or the store cannot be listed.
+    """
+    filesystem, path = _filesystem(pattern)
+    matches = _repeat(pattern, lambda: filesystem.glob(path, detail=False))
+    if not matches:
+        raise LogError(f"{pattern}: no object matches; check the pattern and the permission to list")
+    return [LogUrl(pattern.url, str(match)) for match in sorted(matches)]
+
+
+def _filesystem(url: LogUrl) -> tuple[Any, str]:
+    check_installed(f"{url}: a log at a URL needs", "fsspec")
+    from fsspec.core import url_to_fs
+    from fsspec.registry import known_implementations
+
+    known = known_implementations.get(url.scheme, {})
+    try:
+        filesystem, path = url_to_fs(url.url, use_listings_cache=False)
+    except ImportError:
+        reason = plain_text(str(known.get("err", "its package is missing")), longest=_LONGEST_REASON)
+        package = _PACKAGES.get(url.scheme)
+        advice = f"pip install {package}" if package else reason
+        raise LogError(f"{url}: logs at {url.scheme}:// need another package: {advice}") from None
+    except ValueError as error:
+        if not known:
+            raise LogError(
+                f"{url}: the protocol {url.scheme}:// is not known; use a path, or a URL such as "
+                "s3://bucket/log.mcap or https://host/log.mcap"
+            ) from None
+        raise LogError(f"{url} cannot be opened: {_reason(url, error)}") from None
+    return filesystem, url.key or path
+
+
+# The package of a protocol, for the advice; other protocols get the advice of fsspec.
+_PACKAGES = {
+    **dict.fromkeys(("s3", "s3a"), "s3fs"),
+    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
+    **dict.fromkeys(("az", "abfs", "abfss", "adl"), "adlfs"),
+    **dict.fromkeys(("ssh", "sftp"), "paramiko"),
+    **dict.fromkeys(("http", "https"), "aiohttp"),
+}
+
+
+def _version_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
+    fields = [f"{name}={entry[name]}" for name in _VERSION_FIELDS if entry.get(name)]
+    return (f"size={entry.get('size')}", *fields)
+
+
+Read = Callable[[int, int], bytes]
+Opened = tuple[Mapping[str, Any], Read]  # the entry of an object, and the function that reads its version
+
+
+def _open_s3(filesystem: Any, path: str) -> Opened:
+    """Open with If-Match: the file object of s3fs sends it, and without a cache it reads exact ranges."""
+    file = filesystem.open(path, "rb", cache_type="none")
+    return file.details, _reader_of(file)
+
+
+def _open_http(filesystem: Any, path: str) -> Opened:
+    """Open with If-Match if the server gives a strong ETag; it never compares a weak one as equal."""
+    entry = filesystem.info(path)
+    if not entry.get("size"):
+        return entry, lambda start, end: b""
+    etag = str(entry.get("ETag") or "")
+    headers = {**filesystem.kwargs.get("headers", {}), "Accept-Encoding": "identity"}
+    is_strong = bool(etag) and not etag.startswith("W/")
+    if is_strong:
+        headers["If-Match"] = etag
+    file = filesystem.open(path, "rb", cache_type="none", size=entry["size"], headers=headers)
+
+    def read(start: int, end: int) -> bytes:
+        try:
+            return _reader_of(file)(start, end)
+        except ValueError as error:  # the whole object is coming
+            raise _NoRangesError from error
+
+    return entry, read if is_strong else _looking_after(read, filesystem, path, entry)
+
+
+def _open_and_look(filesystem: Any, path: str) -> Opened:
+    """Open without If-Match: the protocol has none, or its file system does not send it."""
+    entry = filesystem.info(path)
+
+    def read(start: int, end: int) -> bytes:
+        data: bytes = filesystem.cat_file(path, start=start, end=end)
+        return data
+
+    return entry, _looking_after(read, filesystem, path, entry)
+
+
+def _reader_of(file: Any) -> Read:
+    def read(start: int, end: int) -> bytes:
+        file.seek(start)
+        data: bytes = file.read(end - start)
+        return data
+
+    return read
+
+
+def _looking_after(read: Read, filesystem: Any, path: str, entry: Mapping[str, Any]) -> Read:
+    """Return a function that compares the version of the object after each request."""
+    version = _version_of(entry)
+
+    def read_and_look(start: int, end: int) -> bytes:
+        data = read(start, end)
+        if _version_of(filesystem.info(path)) != version:
+            raise _ChangedError
+        return data
+
+    return read_and_look
+
+
+_OPENERS: dict[str, Callable[[Any, str], Opened]] = {
+    **dict.fromkeys(("s3", "s3a"), _open_s3),
+    **dict.fromkeys(("http", "https"), _open_http),
+}
+
+
+def _repeat(url: LogUrl, ask: Callable[[], T]) -> T:
+    """Return the answer to a request; repeat it some times if its failure may pass.
+
+    Raises
+    ------
+    LogError
+        One line: the failure, and what to do.
+    """
+    for pause_s in (*_PAUSES_S, None):
+        try:
+            return ask()
+        except (LogError, *_BUGS):
+            raise
+        except Exception as error:  # each file system of fsspec has errors of its own
+            if pause_s is None or not _may_pass(error):
+                raise _failure(url, error) from error
+        time.sleep(pause_s)
+    raise AssertionError("the last attempt returns or raises")
+
+
+def _status_of(error: BaseException) -> int | None:
+    """Return the HTTP status of an error, or of its cause; None without one."""
+    for one in (error, error.__cause__):
+        status = getattr(one, "status", None)
+        if isinstance(status, int):
+            return status
+        response = getattr(one, "response", None)
+        if isinstance(response, dict):
+            code = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+            return code if isinstance(code, int) else None
+    return None
+
+
+def _is_changed(error: BaseException) -> bool:
+    expired = type(error).__name__ == "FileExpired"  # s3fs, which is imported only for its URLs
+    return expired or isinstance(error, _ChangedError) or _status_of(error) == _CHANGED_STATUS
+
+
+def _may_pass(error: BaseException) -> bool:
+    if _is_changed(error):
+        return False
+    status = _status_of(error)
+    if status is not None:
+        return status >= 500 or status in _PASSING_STATUS
+    if isinstance(error, FileNotFoundError):
+        return error.__cause__ is not None  # HTTP: a HEAD request that was not answered
+    return not isinstance(error, _FINAL) and type(error).__name__ != _NO_CREDENTIALS
+
+
+def _failure(url: LogUrl, error: BaseException) -> LogError:
+    if _is_changed(error):
+        return LogError(f"{url} changed while it was read: run the command again")
+    if isinstance(error, _NoRangesError):
+        return LogError(f"{url}: the server ignores byte ranges: download the log, and read the file")
+    status = _status_of(error)
+    if status in _DENIED_STATUS or isinstance(error, PermissionError):
+        return LogError(
+            f"{url} cannot be read: the store denies access; check the credentials of {url.scheme}://"
+        )
+    if status == 404 or (isinstance(error, FileNotFoundError) and not _may_pass(error)):
+        return LogError(f"{url} does not exist")
+    if type(error).__name__ == _NO_CREDENTIALS:
+        return LogError(f"{url} cannot be read: there are no credentials for {url.scheme}://; give some")
+    tried = f" after {len(_PAUSES_S) + 1} attempts" if _may_pass(error) else ""
+    cause = error.__cause__ if isinstance(error, FileNotFoundError) and error.__cause__ else error
+    return LogError(
+        f"{url} cannot be read{tried}: {_reason(url, cause)}; check the address and the connection"
+    )
+
+
+def _reason(url: LogUrl, error: BaseException) -> str:
+    """Return the text of an error on one line, without the secrets of the URL."""
+    text = " ".join((str(error) or type(error).__name__).split()).replace(url.url, str(url))
+    query = url.url.partition("?")[2]
+    return plain_text(text.replace(query, "...") if query else text, longest=_LONGEST_REASON)

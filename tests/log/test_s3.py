@@ -1,0 +1,128 @@
+"""Logs in an S3 server on loopback: the same results as from a file, versions, and lists of many pages."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ipsys_log
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import find_logs
+from ipsys_log.log.remote_object import open_object
+from tests.conftest import ROOT, Ipsys
+
+GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
+# The import of the server takes seconds; s3fs closes its connections after the test.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Serve S3 on loopback."""
+    from moto.server import ThreadedMotoServer
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def bucket(address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Return a bucket ``logs``; the environment names its server, as a user does."""
+    import boto3
+    import s3fs
+
+    s3fs.S3FileSystem.clear_instance_cache()
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", address)
+    bucket = boto3.resource("s3").create_bucket(Bucket="logs")
+    yield bucket
+    bucket.objects.all().delete()
+    bucket.delete()
+
+
+def put(bucket: Any, key: str, data: bytes) -> str:
+    bucket.put_object(Key=key, Body=data)
+    return f"s3://logs/{key}"
+
+
+def test_results_from_s3_are_those_of_the_file(
+    bucket: Any, ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    local = tmp_path / "lab.mcap"
+    local.write_bytes(GOLDEN.read_bytes())
+    assert ipsys("evaluate", local, "--model", "rigid").code == 0
+    url = put(bucket, "2026/lab.mcap", local.read_bytes())
+    for words in (("info", "{}", "--json"), ("evaluate", "{}", "--model", "rigid", "--json")):
+        one, other = (ipsys(*(word.format(log) for word in words)) for log in (url, local))
+        assert one.code == 0, one.err
+        assert one.out == other.out.replace(str(local), url)
+    with ipsys_log.open(url) as remote, ipsys_log.open(local) as log:
+        for name in ("markers", "camera_points", "measurements"):
+            assert remote.table(name).equals(log.table(name))
+    assert [path.name for path in tmp_path.iterdir()] == ["lab.mcap"]  # all results were in the log
+
+
+def test_changed_object_in_s3_is_noticed(bucket: Any) -> None:
+    source = open_object(find_logs([put(bucket, "lab.mcap", GOLDEN.read_bytes())])[0])  # type: ignore[arg-type]
+    assert source.fetch(1000, 2000) == GOLDEN.read_bytes()[1000:2000]
+    put(bucket, "lab.mcap", bytes(GOLDEN.stat().st_size))
+    with pytest.raises(
+        IpsysError, match=r"^s3://logs/lab.mcap changed while it was read: run the command again$"
+    ):
+        source.fetch(1000, 2000)
+
+
+def test_pattern_matches_more_objects_than_one_page_has(bucket: Any, ipsys: Ipsys) -> None:
+    from moto.backends import get_backend
+
+    keys = [f"2026-{number:04}/lab.mcap" for number in range(1100)]
+    (store,) = get_backend("s3")["123456789012"].values()
+    for key in (*keys, "2027-0001/lab.mcap"):  # without a request for each
+        store.put_object("logs", key, b"")
+    logs = find_logs(["s3://logs/2026-*/lab.mcap"])
+    assert [str(log) for log in logs] == [f"s3://logs/{key}" for key in keys]
+    done = ipsys("du", "s3://logs/2028-*/lab.mcap")
+    assert done.code == 1
+    assert done.err == (
+        "ipsys: s3://logs/2028-*/lab.mcap: no object matches; check the pattern and the permission to list\n"
+    )
+
+
+def test_logs_of_a_pattern_are_read_as_one(bucket: Any) -> None:
+    for key, name in (("a/paper.mcap", "paper_lab"), ("b/small.mcap", "small_lab")):
+        put(bucket, key, (ROOT / "sample_logs" / f"{name}.mcap").read_bytes())
+    with ipsys_log.open("s3://logs/[ab]/*.mcap") as log:
+        assert [str(path) for path in log.paths] == ["s3://logs/a/paper.mcap", "s3://logs/b/small.mcap"]
+        assert len(log.table("measurements")) == 114 + 96
+
+
+@pytest.mark.parametrize(
+    ("environment", "text"),
+    [
+        ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "cannot be read after 5 attempts: "),
+        ({}, "does not exist"),
+    ],
+)
+def test_faults_of_s3_are_one_line(
+    bucket: Any, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], text: str
+) -> None:
+    import s3fs
+
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    done = ipsys("info", "s3://logs/x.mcap")
+    assert done.code == 1
+    assert done.err.startswith(f"ipsys: s3://logs/x.mcap {text}"), done.err
+    assert len(done.err.splitlines()) == 1

@@ -1,0 +1,84 @@
+"""Parquet files of rows, with nested columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.atomic_files import replacement_of
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+
+__all__ = ["Columns", "read_rows", "write_rows"]
+
+# The type of each column by its name: a plain type, or the columns of the items of a list.
+Columns = Mapping[str, "str | Columns"]
+_LIST = re.compile(r"list<(\w+)>")
+
+
+def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, mark: str = "") -> None:
+    """Write rows as a Parquet file; the file is replaced when it is complete.
+
+    Parameters
+    ----------
+    rows : by row, the value of each column; a missing one is null.
+    columns : the type of each column, such as ``int64``, ``list<string>`` or ``time``; the columns of the
+        items for a list of rows.
+    mark : a text that :func:`read_rows` asks for.
+
+    Raises
+    ------
+    IpsysError
+        PyArrow is not installed.
+    """
+    check_installed("Parquet files need", "pyarrow")
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    schema = pa.schema(_fields(columns)).with_metadata({"ipsys": mark})
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
+    with replacement_of(path) as file:
+        parquet.write_table(table, file, compression="zstd")
+
+
+def read_rows(path: Path, mark: str) -> list[dict[str, Any]]:
+    """Return the rows of a file that :func:`write_rows` wrote with a mark; none of a file with another mark.
+
+    Times are integers in ns.
+
+    Raises
+    ------
+    IpsysError
+        The file is no Parquet file, or PyArrow is not installed.
+    """
+    check_installed("Parquet files need", "pyarrow")
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        table = parquet.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        cause = str(error).partition("\n")[0]
+        raise IpsysError(f"{path}: cannot be read as a Parquet file ({cause}); choose another name") from None
+    if (table.schema.metadata or {}).get(b"ipsys", b"").decode() != mark:
+        return []
+    for number, field in enumerate(table.schema):
+        if pa.types.is_timestamp(field.type):
+            table = table.set_column(number, field.name, table.column(number).cast("int64"))
+    rows: list[dict[str, Any]] = table.to_pylist()
+    return rows
+
+
+def _fields(columns: Columns) -> list[Any]:
+    import pyarrow as pa
+
+    def kind(text: str | Columns) -> Any:
+        if not isinstance(text, str):
+            return pa.list_(pa.struct(_fields(text)))
+        if items := _LIST.fullmatch(text):
+            return pa.list_(pa.type_for_alias(items[1]))
+        return pa.timestamp("ns", tz="UTC") if text == "time" else pa.type_for_alias(text)
+
+    return [pa.field(name, kind(text)) for name, text in columns.items()]

@@ -14,7 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
-from ipsys_log.batch.tasks import FAILED, BatchTask, LogResult, perform
+from ipsys_log.batch.tasks import FAILED, BatchTask, LogResult, VersionError, perform
 from ipsys_log.batch.workers import Workers
 from ipsys_log.errors import IpsysError
 
@@ -51,7 +51,7 @@ def run_batch(workers: Workers, task: BatchTask, paths: Sequence[Path]) -> Itera
     Raises
     ------
     IpsysError
-        The scheduler was lost.
+        The scheduler was lost, or a worker has another version of ipsys.
     """
     batch = _Batch(workers, task, paths)
     while batch.submit():
@@ -127,6 +127,8 @@ class _Batch:
             return self._after_end(attempt, error.allowed_failures + 1)
         except CancelledError:
             return self._after_loss(attempt)
+        except VersionError:
+            raise
         except Exception as error:  # the task itself turns its errors into results: this is one of Dask
             text = str(error).partition("\n")[0]
             return LogResult(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log import __version__
-from ipsys_log.errors import IpsysError, disk_advice, is_full
+from ipsys_log.errors import IpsysError, os_error_text, reason_without
 from ipsys_log.log.dataset import Session
 from ipsys_log.runs.graph import VERSIONS
 from ipsys_log.runs.superseded import outdated_runs
@@ -24,6 +24,7 @@ __all__ = [
     "UP_TO_DATE",
     "BatchTask",
     "LogResult",
+    "VersionError",
     "Work",
     "check_log",
     "perform",
@@ -36,6 +37,10 @@ COMPUTED, UP_TO_DATE, NOT_OUTDATED = "computed", "up to date", "not outdated"
 IDENTICAL, DIFFERENT, FAILED = "identical", "different", "failed"
 # Remarks of a log in its result; the rest is counted.
 _MOST_REMARKS = 3
+
+
+class VersionError(IpsysError):
+    """A worker of another version of ipsys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,16 +88,20 @@ class BatchTask:
 
 
 def perform(task: BatchTask, path: Path) -> LogResult:
-    """Do the work on a log; every fault becomes a result, so that the other logs are not affected."""
+    """Do the work on a log; every fault becomes a result, so that the other logs are not affected.
+
+    Raises
+    ------
+    VersionError
+        The worker has another version than the batch: it would compute other results.
+    """
+    _check_versions(task)
     try:
-        _check_versions(task)
         return task.work(path, **task.options)
     except IpsysError as error:
-        return _failure(path, str(error))
+        return _failure(path, reason_without(path, error))
     except OSError as error:
-        cause = f"the disk is full; {disk_advice(error)}" if is_full(error) else error.strerror or str(error)
-        where = f"{error.filename}: " if error.filename and str(error.filename) != str(path) else ""
-        return _failure(path, f"{where}{cause}")
+        return _failure(path, os_error_text(error).removeprefix(f"{path}: "))
     except MemoryError:
         return _failure(
             path, "the memory of the worker is full; use fewer workers, or a larger --memory-limit"
@@ -103,20 +112,19 @@ def perform(task: BatchTask, path: Path) -> LogResult:
 
 
 def _failure(path: Path, text: str, trace: str = "") -> LogResult:
-    """Return the result of a log that failed; its reason is one line, without the path of the log."""
-    line = text.partition("\n")[0].removeprefix(f"{path}: ").removeprefix(f"{path} ")
-    return LogResult(str(path), FAILED, False, line, trace=trace)
+    """Return the result of a log that failed; its reason is one line."""
+    return LogResult(str(path), FAILED, False, text.partition("\n")[0], trace=trace)
 
 
 def _check_versions(task: BatchTask) -> None:
     if task.version != __version__:
-        raise IpsysError(
-            f"the worker has ipsys {__version__}, but the batch is of ipsys {task.version}; install one "
+        raise VersionError(
+            f"a worker has ipsys {__version__}, but the batch is of ipsys {task.version}; install one "
             "version everywhere"
         )
     if task.stage_versions != VERSIONS:
-        raise IpsysError(
-            f"the worker has the stages {_differences(VERSIONS, task.stage_versions)}, but the batch has "
+        raise VersionError(
+            f"a worker has the stages {_differences(VERSIONS, task.stage_versions)}, but the batch has "
             f"{_differences(task.stage_versions, VERSIONS)}; install one version of ipsys everywhere"
         )
 

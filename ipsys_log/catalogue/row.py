@@ -9,7 +9,7 @@ from typing import Any
 
 from ipsys_log.analysis.frame_gaps import find_gaps
 from ipsys_log.api import ModelEvaluation
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import IpsysError, os_error_text, reason_without
 from ipsys_log.exchange.parquet_rows import Columns
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import EVALUATION, EVENTS, MEASUREMENTS
@@ -83,9 +83,9 @@ def read_row(path: Path, name: str, baseline: Path | None) -> dict[str, Any]:
         with Session([path]) as session:
             row |= _contents(session)
     except IpsysError as error:
-        return row | {"error": str(error).partition("\n")[0].removeprefix(f"{path}: ")}
+        return row | {"error": reason_without(path, error).partition("\n")[0]}
     except OSError as error:
-        return row | {"error": error.strerror or str(error)}
+        return row | {"error": os_error_text(error).removeprefix(f"{path}: ")}
     return row | (_drift(path, baseline) if baseline is not None else {})
 
 
@@ -162,7 +162,7 @@ def _drift(path: Path, baseline: Path) -> dict[str, Any]:
     try:
         reading = read_drift([path], baseline, baseline)
     except IpsysError as error:
-        return {"drift_error": str(error).partition("\n")[0].removeprefix(f"{path}: ")}
+        return {"drift_error": reason_without(path, error).partition("\n")[0]}
     name = reading.names[-1]
     rows = []
     for camera in sorted(reading.drift.baselines):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.catalogue.row import COLUMNS, file_state, read_row
+from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.parquet_rows import read_rows, write_rows
 from ipsys_log.log.log_files import logs_below
 from ipsys_log.runs.graph import VERSIONS
@@ -18,6 +19,7 @@ __all__ = ["CatalogueUpdate", "update_catalogue"]
 
 # Raised when a row gets another content for the same log.
 _VERSION = 1
+_KIND = "catalogue "
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +65,7 @@ def update_catalogue(
     """
     paths = {str(path.relative_to(folder)): path for path in logs_below(folder)}
     mark = _mark(baseline)
-    before = {row["log"]: row for row in (read_rows(target, mark) if target.exists() else [])}
+    before = _earlier_rows(target, mark) if target.exists() else {}
     rows: list[dict[str, Any]] = []
     read = 0
     for number, (name, path) in enumerate(paths.items()):
@@ -78,8 +80,16 @@ def update_catalogue(
     return CatalogueUpdate(len(rows), read, len(before.keys() - paths.keys()), errors)
 
 
+def _earlier_rows(target: Path, mark: str) -> dict[str, dict[str, Any]]:
+    """Return the rows of a catalogue by log; none of a catalogue with another mark."""
+    found, rows = read_rows(target)
+    if not (found or "").startswith(_KIND):
+        raise IpsysError(f"{target}: is not a catalogue, so it is not replaced; choose another name")
+    return {row["log"]: row for row in rows} if found == mark else {}
+
+
 def _mark(baseline: Path | None) -> str:
     """Return the identity of all on which a row depends besides its log."""
     state = None if baseline is None else [str(baseline.resolve()), file_state(baseline)]
     parts = json.dumps([_VERSION, VERSIONS, state], sort_keys=True)
-    return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
+    return _KIND + hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()

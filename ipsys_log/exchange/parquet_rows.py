@@ -15,6 +15,7 @@ __all__ = ["Columns", "read_rows", "write_rows"]
 
 # The type of each column by its name: a plain type, or the columns of the items of a list.
 Columns = Mapping[str, "str | Columns"]
+_MARK = b"ipsys"
 _LIST = re.compile(r"list<(\w+)>")
 
 
@@ -26,7 +27,7 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
     rows : by row, the value of each column; a missing one is null.
     columns : the type of each column, such as ``int64``, ``list<string>`` or ``time``; the columns of the
         items for a list of rows.
-    mark : a text that :func:`read_rows` asks for.
+    mark : a text that :func:`read_rows` returns.
 
     Raises
     ------
@@ -37,14 +38,14 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
     import pyarrow as pa
     from pyarrow import parquet
 
-    schema = pa.schema(_fields(columns)).with_metadata({"ipsys": mark})
+    schema = pa.schema(_fields(columns)).with_metadata({_MARK: mark})
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
     with replacement_of(path) as file:
         parquet.write_table(table, file, compression="zstd")
 
 
-def read_rows(path: Path, mark: str) -> list[dict[str, Any]]:
-    """Return the rows of a file that :func:`write_rows` wrote with a mark; none of a file with another mark.
+def read_rows(path: Path) -> tuple[str | None, list[dict[str, Any]]]:
+    """Return the mark and the rows of a file of :func:`write_rows`; None and no rows of any other file.
 
     Times are integers in ns.
 
@@ -62,13 +63,14 @@ def read_rows(path: Path, mark: str) -> list[dict[str, Any]]:
     except (pa.ArrowException, OSError) as error:
         cause = str(error).partition("\n")[0]
         raise IpsysError(f"{path}: cannot be read as a Parquet file ({cause}); choose another name") from None
-    if (table.schema.metadata or {}).get(b"ipsys", b"").decode() != mark:
-        return []
+    mark = (table.schema.metadata or {}).get(_MARK)
+    if mark is None:
+        return None, []
     for number, field in enumerate(table.schema):
         if pa.types.is_timestamp(field.type):
             table = table.set_column(number, field.name, table.column(number).cast("int64"))
     rows: list[dict[str, Any]] = table.to_pylist()
-    return rows
+    return mark.decode(), rows
 
 
 def _fields(columns: Columns) -> list[Any]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import IpsysError, reason_without
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.dataset import Session
@@ -62,8 +62,7 @@ def _check_log(path: Path, others: Sequence[Path], progress: Progress) -> LogChe
         if not any(finding.level == BROKEN for finding in findings):
             findings += _check_contents(path, others, progress)
     except IpsysError as error:
-        text = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
-        findings.append(LogFinding("file", BROKEN, text))
+        findings.append(LogFinding("file", BROKEN, reason_without(path, error)))
     return LogCheck(path, tuple(findings))
 
 

@@ -26,6 +26,7 @@ BENCHMARKS = {
     "log_write": "recording and small messages, beside mcap and foxglove-sdk",
     "log_read": "reading, beside mcap",
     "table": "a channel as a table, beside decoding its messages",
+    "batch": "many logs by one worker and by two, overhead for each log, memory of the driver",
     "handling": "cut, compact, merge and check of whole logs, beside cp; memory",
     "startup": "ipsys --help and ipsys info",
     "robot_run": "control error and true error of robots at waypoints, without and with faults",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["COLUMNS", "file_state", "read_row"]
+__all__ = ["COLUMNS", "Baseline", "file_state", "read_row"]
 
 COLUMNS: Columns = {
     "log": "string",
@@ -70,13 +71,21 @@ COLUMNS: Columns = {
 }
 
 
-def read_row(path: Path, name: str, baseline: Path | None) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """The log before all moves of cameras, and the log with the fitted model of the cameras."""
+
+    log: Path
+    model_from: Path
+
+
+def read_row(path: Path, name: str, baseline: Baseline | None) -> dict[str, Any]:
     """Return the row of a log; the row of a log that cannot be read has its error instead of contents.
 
     Parameters
     ----------
     name : of the log in the catalogue.
-    baseline : a log with a model; the drift of the cameras since this log is read. None: no drift.
+    baseline : for the drift of the cameras since then; None: no drift.
     """
     row: dict[str, Any] = {"log": name, **file_state(path)}
     try:
@@ -155,12 +164,12 @@ def _evaluations(session: Session) -> Iterator[dict[str, Any]]:
                 yield {"run": run, "model": evaluation.model, **{name: row[name] for name in kept}}
 
 
-def _drift(path: Path, baseline: Path) -> dict[str, Any]:
+def _drift(path: Path, baseline: Baseline) -> dict[str, Any]:
     """Return the shift of each camera's floor map since the baseline, at the end of the log."""
     from ipsys_log.survey.drift_reading import read_drift
 
     try:
-        reading = read_drift([path], baseline, baseline)
+        reading = read_drift([path], baseline.log, baseline.model_from)
     except IpsysError as error:
         return {"drift_error": reason_without(path, error).partition("\n")[0]}
     name = reading.names[-1]

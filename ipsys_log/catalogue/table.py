@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.catalogue.row import COLUMNS, file_state, read_row
+from ipsys_log.catalogue.row import COLUMNS, Baseline, file_state, read_row
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.parquet_rows import read_rows, write_rows
 from ipsys_log.log.log_files import logs_below
@@ -43,7 +43,7 @@ class CatalogueUpdate:
 def update_catalogue(
     folder: Path,
     target: Path,
-    baseline: Path | None = None,
+    baseline: Baseline | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> CatalogueUpdate:
     """Write the catalogue of all logs below a folder; only new or changed logs are read.
@@ -55,7 +55,7 @@ def update_catalogue(
     ----------
     folder : logs are named by their path below it.
     target : the Parquet file. The rows of an earlier catalogue in it are used again.
-    baseline : a log with a model, for the drift of the cameras since then; None: no drift.
+    baseline : for the drift of the cameras since then; None: no drift.
     progress : called with the number of logs done, and of all logs.
 
     Raises
@@ -88,8 +88,9 @@ def _earlier_rows(target: Path, mark: str) -> dict[str, dict[str, Any]]:
     return {row["log"]: row for row in rows} if found == mark else {}
 
 
-def _mark(baseline: Path | None) -> str:
+def _mark(baseline: Baseline | None) -> str:
     """Return the identity of all on which a row depends besides its log."""
-    state = None if baseline is None else [str(baseline.resolve()), file_state(baseline)]
-    parts = json.dumps([_VERSION, VERSIONS, state], sort_keys=True)
+    logs = [] if baseline is None else [baseline.log, baseline.model_from]
+    states = [[str(log.resolve()), file_state(log)] for log in logs]
+    parts = json.dumps([_VERSION, VERSIONS, states], sort_keys=True)
     return _KIND + hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()

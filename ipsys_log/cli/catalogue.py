@@ -34,7 +34,13 @@ def catalogue(
         typer.Option(
             "--baseline",
             metavar="LOG",
-            help="A log with a model: also record the drift of the cameras since this log.",
+            help="Also record the drift of the cameras since this log, by their reference markers.",
+        ),
+    ] = None,
+    model_from: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
         ),
     ] = None,
     as_json: AsJson = False,
@@ -44,6 +50,7 @@ def catalogue(
     The command reads only logs that are new or have changed since the last call. A log that cannot be read
     has a row with its error, and the command still succeeds. pandas and DuckDB read the file.
     """
+    from ipsys_log.catalogue.row import Baseline
     from ipsys_log.catalogue.table import update_catalogue
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
@@ -54,10 +61,14 @@ def catalogue(
     if output.suffix != ".parquet":
         raise IpsysError(f"-o {output}: a catalogue ends in .parquet; use {output.stem}.parquet")
     check_file(output, "-o", [])
-    if baseline is not None and not baseline.is_file():
-        raise IpsysError(f"--baseline {baseline}: is not a file; name a log with a model")
+    for name, log in (("--baseline", baseline), ("--model-from", model_from)):
+        if log is not None and not log.is_file():
+            raise IpsysError(f"{name} {log}: is not a file; name a log")
+    if model_from is not None and baseline is None:
+        raise IpsysError("--model-from: has an effect only with --baseline; give the log before all moves")
+    since = None if baseline is None else Baseline(baseline, model_from or baseline)
     with progress_bar(()) as progress:
-        update = update_catalogue(folder, output, baseline, lambda done, total: progress("logs", done, total))
+        update = update_catalogue(folder, output, since, lambda done, total: progress("logs", done, total))
     if as_json:
         print(json.dumps(asdict(update), indent=2))  # noqa: T201
         return

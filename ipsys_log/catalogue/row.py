@@ -25,8 +25,8 @@ COLUMNS: Columns = {
     "bytes": "int64",
     "changed_ns": "int64",
     "error": "string",
-    "start": "time",
-    "end": "time",
+    "start_utc": "time",
+    "end_utc": "time",
     "duration_s": "float64",
     "cameras": {
         "camera": "string",
@@ -108,7 +108,7 @@ def _contents(session: Session) -> dict[str, Any]:
     is_empty = not any(reader.message_count for reader in session.readers)
     start_ns, end_ns = session.start_ns, session.end_ns
     evaluations = [*_evaluations(session)]
-    times = {} if is_empty else {"start": start_ns, "end": end_ns}
+    times = {} if is_empty else {"start_utc": start_ns, "end_utc": end_ns}
     return {
         **times,
         "duration_s": (end_ns - start_ns) / NS_PER_S,

@@ -24,7 +24,8 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
 
     Parameters
     ----------
-    rows : by row, the value of each column; a missing one is null.
+    rows : by row, the value of each column; a missing one is null. Times are integers in ns; the file has
+        them in us and without a time zone, because DuckDB has few functions for any others.
     columns : the type of each column, such as ``int64``, ``list<string>`` or ``time``; the columns of the
         items for a list of rows.
     mark : a text that :func:`read_rows` returns.
@@ -40,6 +41,7 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
 
     schema = pa.schema(_fields(columns)).with_metadata({_MARK: mark})
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
+    table = _with_times(table, pa.timestamp("us"))
     with replacement_of(path) as file:
         parquet.write_table(table, file, compression="zstd")
 
@@ -47,7 +49,7 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
 def read_rows(path: Path) -> tuple[str | None, list[dict[str, Any]]]:
     """Return the mark and the rows of a file of :func:`write_rows`; None and no rows of any other file.
 
-    Times are integers in ns.
+    Times are integers in ns, rounded down to us.
 
     Raises
     ------
@@ -66,11 +68,19 @@ def read_rows(path: Path) -> tuple[str | None, list[dict[str, Any]]]:
     mark = (table.schema.metadata or {}).get(_MARK)
     if mark is None:
         return None, []
-    for number, field in enumerate(table.schema):
-        if pa.types.is_timestamp(field.type):
-            table = table.set_column(number, field.name, table.column(number).cast("int64"))
+    table = _with_times(_with_times(table, pa.timestamp("ns")), pa.int64())
     rows: list[dict[str, Any]] = table.to_pylist()
     return mark.decode(), rows
+
+
+def _with_times(table: Any, kind: Any) -> Any:
+    """Return a table whose columns of times have another type."""
+    import pyarrow as pa
+
+    for number, field in enumerate(table.schema):
+        if pa.types.is_timestamp(field.type):
+            table = table.set_column(number, field.name, table.column(number).cast(kind, safe=False))
+    return table
 
 
 def _fields(columns: Columns) -> list[Any]:
@@ -81,6 +91,6 @@ def _fields(columns: Columns) -> list[Any]:
             return pa.list_(pa.struct(_fields(text)))
         if items := _LIST.fullmatch(text):
             return pa.list_(pa.type_for_alias(items[1]))
-        return pa.timestamp("ns", tz="UTC") if text == "time" else pa.type_for_alias(text)
+        return pa.timestamp("ns") if text == "time" else pa.type_for_alias(text)
 
     return [pa.field(name, kind(text)) for name, text in columns.items()]

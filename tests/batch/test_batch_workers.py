@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -21,6 +21,7 @@ from ipsys_log.batch.execution import MOST_ENDED_WORKERS, run_batch
 from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import BatchTask, replay_log
 from ipsys_log.batch.workers import open_workers
+from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.soundness.finding import BROKEN
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, replay_and_note, wait_for
@@ -136,6 +137,7 @@ def program(*arguments: object, **environment: str) -> Iterator[subprocess.Popen
     """Run a program of Dask until the end of the block."""
     process = subprocess.Popen(
         [sys.executable, "-m", *map(str, arguments)],
+        cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env={**os.environ, **environment},
@@ -164,9 +166,17 @@ def certificates(folder: Path) -> list[object]:
     return options
 
 
+class Cluster(NamedTuple):
+    """A scheduler with a worker: its address, the options of a command for it, and its process."""
+
+    address: str
+    options: list[object]
+    scheduler: subprocess.Popen[bytes]
+
+
 @contextmanager
-def cluster(folder: Path, **environment: str) -> Iterator[tuple[str, list[object]]]:
-    """Run a scheduler with certificates and a worker; yield its address and the options for it."""
+def cluster(folder: Path, **environment: str) -> Iterator[Cluster]:
+    """Run a scheduler with certificates and a worker."""
     from distributed import Client, Security
 
     options = certificates(folder)
@@ -174,7 +184,9 @@ def cluster(folder: Path, **environment: str) -> Iterator[tuple[str, list[object
     state = folder / "scheduler.json"
     listen = ("--host", "tls://127.0.0.1", "--no-dashboard")
     with (
-        program("distributed.cli.dask_scheduler", *listen, "--port", 0, "--scheduler-file", state, *programs),
+        program(
+            "distributed.cli.dask_scheduler", *listen, "--port", 0, "--scheduler-file", state, *programs
+        ) as scheduler,
         program(
             *("distributed.cli.dask_worker", "--scheduler-file", state, "--nthreads", 1, "--no-nanny"),
             *("--no-dashboard", "--host", "127.0.0.1", "--protocol", "tls", *programs),
@@ -187,12 +199,12 @@ def cluster(folder: Path, **environment: str) -> Iterator[tuple[str, list[object
         security = Security(tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key, require_encryption=True)
         with Client(address, security=security) as client:
             client.wait_for_workers(1, timeout=PATIENCE_S)
-        yield address, options
+        yield Cluster(address, options, scheduler)
 
 
 def test_workers_of_a_scheduler_with_certificates_are_used(tmp_path: Path, replayed: bytes) -> None:
     copies(tmp_path, "a.mcap", "b.mcap")
-    with cluster(tmp_path / "cluster") as (address, options):
+    with cluster(tmp_path / "cluster") as (address, options, _):
         logs = (tmp_path / "a.mcap", tmp_path / "b.mcap")
         code, result, _ = batch(
             tmp_path, "replay", *logs, "--model", "rigid", "--scheduler", address, *options
@@ -212,9 +224,34 @@ def test_worker_of_another_version_is_refused_before_any_work(tmp_path: Path) ->
     old = tmp_path / "old" / "ipsys_log-0.0.9.dist-info"
     old.mkdir(parents=True)
     (old / "METADATA").write_text("Metadata-Version: 2.1\nName: ipsys_log\nVersion: 0.0.9\n")
-    with cluster(tmp_path / "cluster", PYTHONPATH=f"{tmp_path / 'old'}:{ROOT}") as (address, options):
+    with cluster(tmp_path / "cluster", PYTHONPATH=f"{tmp_path / 'old'}:{ROOT}") as (address, options, _):
         code, result, errors = batch(tmp_path, "replay", log, "--scheduler", address, *options)
     assert (code, result) == (1, None)
     assert "has ipsys 0.0.9, but this is ipsys 0." in errors
     assert "install one version everywhere" in errors
     assert log.read_bytes() == PAPER_LAB.read_bytes()
+
+
+def test_scheduler_that_stops_ends_the_batch_and_keeps_results(tmp_path: Path, replayed: bytes) -> None:
+    logs = copies(tmp_path / "logs", "0.mcap", HELD, "1.mcap")
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    with cluster(tmp_path / "cluster") as (address, options, scheduler):
+        settings = WorkerSettings(address, None, None, *(Path(str(file)) for file in options[1::2]))
+
+        def stop() -> None:
+            wait_for(notes / "pid")
+            scheduler.kill()
+
+        stopper = threading.Thread(target=stop)
+        stopper.start()
+        with (
+            pytest.raises(IpsysError, match=r"was lost after 1 of 3 logs; .* repeat the command"),
+            open_workers(settings, len(logs)) as workers,
+        ):
+            list(run_batch(workers, BatchTask(replay_and_note, {"notes": notes}), logs))
+        stopper.join()
+    assert logs[0].read_bytes() == replayed
+    # The next call does what is missing.
+    assert [replay_log(log, models=("rigid",)).state for log in logs] == ["up to date", *["computed"] * 2]
+    assert [log.read_bytes() == replayed for log in logs] == [True] * 3

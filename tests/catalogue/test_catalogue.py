@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def test_row_has_the_contents_of_its_log(folder: Path, tmp_path: Path, ipsys: Ip
     row = rows_of(target)["2026/golden.mcap"]
     info = json.loads(ipsys("info", GOLDEN, "--json").out)
     assert row["duration_s"] == info["duration_s"]
-    assert row["start"].isoformat(" ").startswith(info["start"])
+    assert row["start_utc"].isoformat(" ").startswith(info["start"])
     cameras = {camera["camera"]: camera for camera in row["cameras"]}
     for name, camera in info["cameras"].items():
         channel = info["channels"][camera["images"]]
@@ -80,7 +81,7 @@ def test_broken_log_is_a_row_with_its_error(folder: Path, tmp_path: Path, ipsys:
     row = rows_of(tmp_path / "c.parquet")["broken.mcap"]
     assert row["error"].startswith("has no end")
     assert f"broken.mcap: {row['error']}" in done.out
-    assert pd.isna(row["start"])
+    assert pd.isna(row["start_utc"])
     assert row["bytes"] == 50_000
 
 
@@ -106,6 +107,7 @@ def test_only_new_and_changed_logs_are_read(folder: Path, tmp_path: Path) -> Non
     assert target.read_bytes() == (tmp_path / "again.parquet").read_bytes()
 
 
+@pytest.mark.slow
 def test_newer_stages_change_the_states_in_a_catalogue(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,6 +124,7 @@ def test_newer_stages_change_the_states_in_a_catalogue(
     assert "this is rigid 99" in outdated()[1]
 
 
+@pytest.mark.slow
 def test_duckdb_and_pandas_answer_the_same_question(folder: Path, tmp_path: Path) -> None:
     """Compare the errors of models over all logs, as the page about the catalogue does."""
     import duckdb  # late: it complains at the end about objects that the garbage collection has exempted
@@ -138,6 +141,23 @@ def test_duckdb_and_pandas_answer_the_same_question(folder: Path, tmp_path: Path
     assert [name for name, _ in found] == [*wanted.index]
     assert len(found) >= 2
     np.testing.assert_allclose([mean for _, mean in found], wanted)
+
+
+def test_questions_of_the_documentation_have_answers(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import duckdb
+
+    monkeypatch.chdir(tmp_path)
+    update_catalogue(folder, tmp_path / "catalogue.parquet")
+    page = (ROOT / "docs" / "batch.md").read_text(encoding="utf-8")
+    questions = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
+    errors, drift, outdated, _ = [duckdb.sql(question).fetchall() for question in questions]
+    assert {model for _, model, *_ in errors} == {"rigid", "poly", "best"}
+    assert drift == []  # no baseline
+    assert [(log, made_by) for log, _, made_by in outdated] == [("2026/golden.mcap", ["0.1.0"])]
+    pandas = page.rpartition("```python\n")[2].partition("```")[0]
+    exec(pandas, {})
 
 
 def test_file_of_another_kind_is_not_overwritten(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
@@ -165,7 +185,7 @@ def test_rows_of_parquet_come_back(tmp_path: Path) -> None:
         "tags": "list<string>",
     }
     rows = [
-        {"name": "a", "at": 1_700_000_000_000_000_001, "sizes": [{"n": 1, "share": 0.5}], "tags": ["x", "y"]},
+        {"name": "a", "at": 1_700_000_000_000_001_000, "sizes": [{"n": 1, "share": 0.5}], "tags": ["x", "y"]},
         {"name": None, "at": None, "sizes": None, "tags": []},
     ]
     write_rows(tmp_path / "rows.parquet", rows, columns, "mark")

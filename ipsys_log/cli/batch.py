@@ -216,7 +216,7 @@ def _export(
     from ipsys_log.batch.exports import check_exports, export_log
     from ipsys_log.log.log_files import find_logs
 
-    wishes = {"table": channel, "run": run, "robot": robot, "format": format_}
+    wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
     suffix = check_exports(find_logs(logs), output, **wishes)
     options = {"folder": output, "suffix": suffix, "overwrite": overwrite, **wishes}
     _run(export_log, options, logs=logs, **batch)
@@ -267,7 +267,11 @@ def _run(
     if table is not None:
         check_installed("--table needs", "pyarrow")
         check_file(table, "--table", logs)
-    results = _collect(BatchTask(work, options), find_logs(logs), WorkerSettings(**settings))
+    workers, paths = WorkerSettings(**settings), find_logs(logs)
+    if workers.scheduler is not None:  # its workers have other working directories
+        paths = [path.absolute() for path in paths]
+        options = {k: value.absolute() if isinstance(value, Path) else value for k, value in options.items()}
+    results = _collect(BatchTask(work, options), paths, workers)
     _print(results, table, as_json)
     if not all(result.good for result in results):
         raise typer.Exit(1)

@@ -81,7 +81,7 @@ class Scheduler:
 def run(
     scheduler: Scheduler, paths: list[Path], window: int, monkeypatch: pytest.MonkeyPatch
 ) -> dict[str, Any]:
-    workers = Workers(scheduler, "tls://here", "", window)  # type: ignore[arg-type]
+    workers = Workers(scheduler, "tls://here", "", window)
 
     class Queue(list[Future]):
         put = list.append
@@ -204,7 +204,7 @@ def test_logs_are_named_once_and_folders_searched(tmp_path: Path) -> None:
 
 
 def test_exports_that_would_have_one_file_are_refused(tmp_path: Path) -> None:
-    wishes = {"table": "tracks", "run": None, "robot": None}
+    wishes: dict[str, Any] = {"table": "tracks", "run": None, "robot": None}
     logs = [Path("a/monday.mcap"), Path("b/monday.mcap")]
     with pytest.raises(IpsysError, match=r"a/monday.mcap and b/monday.mcap have the same name"):
         check_exports(logs, tmp_path, format="csv", **wishes)

@@ -15,7 +15,7 @@ import pytest
 from ipsys_log import api
 from ipsys_log.catalogue.table import update_catalogue
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.parquet_rows import read_rows, write_rows
+from ipsys_log.exchange.parquet_rows import Columns, read_rows, write_rows
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, Message
 from ipsys_log.messages.channels import EVALUATION, EVENTS_TOPIC
@@ -39,7 +39,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def rows_of(path: Path) -> dict[str, dict[str, Any]]:
-    return {row["log"]: row for row in pd.read_parquet(path).to_dict("records")}
+    rows: list[Any] = pd.read_parquet(path).to_dict("records")
+    return {row["log"]: row for row in rows}
 
 
 def test_row_has_the_contents_of_its_log(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
@@ -131,7 +132,8 @@ def test_duckdb_and_pandas_answer_the_same_question(folder: Path, tmp_path: Path
 
     target = tmp_path / "catalogue.parquet"
     update_catalogue(folder, target)
-    found = duckdb.sql(
+    ask: Any = duckdb.sql
+    found = ask(
         "SELECT e.model, avg(e.mean_m) FROM (SELECT unnest(evaluations) AS e FROM read_parquet("
         f"'{target}')) WHERE e.dimensions = '2d' AND e.scheme = 'held_out' GROUP BY e.model ORDER BY e.model"
     ).fetchall()
@@ -148,11 +150,12 @@ def test_questions_of_the_documentation_have_answers(
 ) -> None:
     import duckdb
 
+    ask: Any = duckdb.sql
     monkeypatch.chdir(tmp_path)
     update_catalogue(folder, tmp_path / "catalogue.parquet")
     page = (ROOT / "docs" / "batch.md").read_text(encoding="utf-8")
     questions = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
-    errors, drift, outdated, _ = [duckdb.sql(question).fetchall() for question in questions]
+    errors, drift, outdated, _ = [ask(question).fetchall() for question in questions]
     assert {model for _, model, *_ in errors} == {"rigid", "poly", "best"}
     assert drift == []  # no baseline
     assert [(log, made_by) for log, _, made_by in outdated] == [("2026/golden.mcap", ["0.1.0"])]
@@ -178,13 +181,13 @@ def test_file_of_another_kind_is_not_overwritten(folder: Path, tmp_path: Path, i
 
 
 def test_rows_of_parquet_come_back(tmp_path: Path) -> None:
-    columns = {
+    columns: Columns = {
         "name": "string",
         "at": "time",
         "sizes": {"n": "int64", "share": "float64"},
         "tags": "list<string>",
     }
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"name": "a", "at": 1_700_000_000_000_001_000, "sizes": [{"n": 1, "share": 0.5}], "tags": ["x", "y"]},
         {"name": None, "at": None, "sizes": None, "tags": []},
     ]
@@ -197,7 +200,7 @@ def test_outdated_runs_are_replayed_once(tmp_path: Path, monkeypatch: pytest.Mon
     from ipsys_log.batch.tasks import replay_log
 
     log = Path(shutil.copy(PAPER_LAB, tmp_path / "log.mcap"))
-    options = {"outdated": True, "models": ("rigid",)}
+    options: dict[str, Any] = {"outdated": True, "models": ("rigid",)}
     api.replay(log, models=("rigid",))
     before = log.read_bytes()
     assert replay_log(log, **options).state == "not outdated"

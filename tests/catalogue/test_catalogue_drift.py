@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -35,7 +36,7 @@ def test_camera_that_was_knocked_has_moved_in_later_logs(tmp_path: Path) -> None
     assert update_catalogue(folder, target, baseline).read == 4
     rows = pd.read_parquet(target).set_index("log")
     for week in (1, 2, 3, 4):
-        row = rows.loc[f"week{week}.mcap"]
+        row: Any = rows.loc[f"week{week}.mcap"]
         assert pd.isna(row["drift_error"])
         moved = {camera["camera"] for camera in row["drift"] if camera["moved"]}
         assert moved == ({"white"} if week >= 3 else set())

@@ -32,7 +32,7 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage
 
-__all__ = ["measure"]
+__all__ = ["Memory", "measure"]
 
 IMAGE_BYTES = 300_000
 PERIOD_NS = 33_333_333
@@ -115,7 +115,7 @@ def _turn(name: str, logs: Sequence[Path], output: Path) -> Turn:
         for log in logs:
             with log.open("rb") as file:
                 os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-        with _Memory() as memory:
+        with Memory() as memory:
             verb(logs, output)
         size = output.stat().st_size if output.exists() else logs[0].stat().st_size
         output.unlink(missing_ok=True)
@@ -124,14 +124,14 @@ def _turn(name: str, logs: Sequence[Path], output: Path) -> Turn:
     return turn
 
 
-class _Memory:
+class Memory:
     """The anonymous memory of this process at most, in MB, while the block runs."""
 
     def __init__(self) -> None:
         self.most_mb, self._ended = 0.0, Event()
         self._thread = Thread(target=self._watch, daemon=True)
 
-    def __enter__(self) -> _Memory:
+    def __enter__(self) -> Memory:
         self._thread.start()
         return self
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,7 +101,12 @@ class ModelEvaluation:
         """Return the errors as a table: a row for each camera ("" for all), scheme and dimension."""
         from ipsys_log.exchange.data_frames import import_pandas
 
-        rows = [
+        table: pd.DataFrame = import_pandas().DataFrame(self.rows())
+        return table
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the rows of :meth:`to_frame` as plain data."""
+        return [
             {
                 "camera": errors_of_camera.camera,
                 "scheme": errors_of_camera.scheme or "held_out",
@@ -113,8 +118,6 @@ class ModelEvaluation:
             for name, errors in (("3d", errors_of_camera.error_3d), ("2d", errors_of_camera.error_2d))
             if errors is not None
         ]
-        table: pd.DataFrame = import_pandas().DataFrame(rows)
-        return table
 
 
 @dataclass(frozen=True, slots=True)

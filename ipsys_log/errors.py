@@ -11,6 +11,8 @@ __all__ = [
     "WriteError",
     "disk_advice",
     "is_full",
+    "os_error_text",
+    "reason_without",
 ]
 
 
@@ -44,6 +46,23 @@ class FrameError(IpsysError, ValueError):
 
 class SizeError(IpsysError):
     """A frame of another size than its lens."""
+
+
+def os_error_text(error: OSError) -> str:
+    """Return an error of the operating system in one line, with the name of its file."""
+    cause = f"the disk is full; {disk_advice(error)}" if is_full(error) else str(error.strerror or error)
+    return f"{error.filename}: {cause}" if error.filename else cause
+
+
+def reason_without(path: object, error: Exception) -> str:
+    """Return the text of an error without the path of its log, for a text that names the log itself.
+
+    Examples
+    --------
+    >>> reason_without("a.mcap", IpsysError("a.mcap: has no rig"))
+    'has no rig'
+    """
+    return str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
 
 
 def is_full(error: OSError) -> bool:

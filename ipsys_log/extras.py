@@ -32,6 +32,10 @@ LIBRARIES = {
     "xxhash": Library("xxhash", "ros2"),
     "websockets": Library("websockets", "foxglove"),
     "fsspec": Library("fsspec", "remote"),
+    "dask": Library("Dask", "batch"),
+    "distributed": Library("Dask distributed", "batch"),
+    "bokeh": Library("Bokeh", "batch"),
+    "cryptography": Library("cryptography", "batch"),
 }
 
 

@@ -131,6 +131,9 @@ REFUSED = {
             *("calibrate lab.mcap --board 6x4", "calibrate --rig lab.toml --board 6x4"),
         )
     },
+    "catalogue . -o x.parquet": "catalogue needs PyArrow: pip install 'ipsys_log[table]'",
+    "batch check lab.mcap": "batch needs Dask and Dask distributed and Bokeh and cryptography: pip install "
+    "'ipsys_log[batch]'",
     "score https://example.org/x.zip": "the address of a dataset needs fsspec: pip install "
     "'ipsys_log[remote]'",
     "record --measure -o x.mcap": "--measure needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",

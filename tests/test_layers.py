@@ -37,6 +37,7 @@ LAYERS = (
     ("log_export", "sampled_track"),
     ("opened_log",),
     ("api",),
+    ("batch", "catalogue"),
     ("report",),
     ("first_day",),
     ("web",),

@@ -18,7 +18,7 @@ def main() -> None:
     hold_signals()
     from ipsys_log.cli.app import app
     from ipsys_log.cli.console import print_warnings
-    from ipsys_log.errors import IpsysError, disk_advice, is_full
+    from ipsys_log.errors import IpsysError, is_full, os_error_text
 
     try:
         with print_warnings():
@@ -29,11 +29,9 @@ def main() -> None:
         sys.stderr.close()  # the reader of the pipe, such as head, has ended
         sys.exit(0)
     except OSError as error:
-        full = is_full(error)
-        if error.filename is None and not full:
+        if error.filename is None and not is_full(error):
             raise
-        cause = f"the disk is full; {disk_advice(error)}" if full else error.strerror
-        sys.exit(_complain(f"{error.filename}: {cause}" if error.filename else str(cause)))
+        sys.exit(_complain(os_error_text(error)))
     except InterruptError as interrupt:
         _complain(interrupt.text)
         sys.exit(interrupt.exit_code)

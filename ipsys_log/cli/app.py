@@ -11,9 +11,11 @@ import typer
 
 from ipsys_log.cli import (
     align,
+    batch,
     calibrate,
     calibrate_lab,
     cameras,
+    catalogue,
     compact,
     compare,
     contents,
@@ -52,6 +54,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
         *("info", "runs", "check", "du", "cat", "view", "export", "stream"),
         *("cut", "compact", "merge", "verify", "diff", "latency", "repair"),
     ),
+    "Many logs": ("batch", "catalogue"),
     "Publish a dataset": ("pack", "score"),
     _STAGES: (),
     "Without cameras": ("simulate", "drive", "import"),
@@ -199,6 +202,10 @@ ipsys latency monday.mcap --plot latency.pdf
     "repair": """
 ipsys repair monday.mcap
 """,
+    "catalogue": """
+ipsys catalogue logs -o catalogue.parquet
+ipsys catalogue logs -o catalogue.parquet --baseline logs/first.mcap
+""",
     "pack": """
 ipsys pack --card-form card.toml                   # write the empty form
 ipsys pack calibration.mcap -o dataset/ --card card.toml
@@ -270,6 +277,7 @@ _MODULES = (
     *(first_day, setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
     *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, merge, compare, publish, drive),
+    *(batch, catalogue),
 )
 for module in _MODULES:
     module.add_commands(app)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ipsys_log.report.accuracy import Accuracy
     from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["MORE", "add_commands", "build_command", "derive", "options_until"]
+__all__ = ["MORE", "add_commands", "build_command", "derive", "options_until", "replay_options"]
 
 _Path = Optional[Path]  # noqa: UP045
 
@@ -147,21 +147,28 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
 
 def _options(logs: Sequence[LogLocation], **given: Any) -> dict[str, Any]:
     """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
+    rig, calibration = given.pop("rig"), given.pop("calibration", None)
+    lenses, jobs = given.pop("lenses", None) or {}, given.pop("jobs", None)
+    return {
+        "jobs": jobs,
+        "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
+        "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
+        **replay_options(**given),
+    }
+
+
+def replay_options(**given: Any) -> dict[str, Any]:
+    """Return the options of a command without rig and intrinsics as those of :func:`ipsys_log.api.replay`."""
     from ipsys_log.rig.file import check_name
     from ipsys_log.runs.options import Request
 
-    rig, run = given.pop("rig"), given.pop("run")
-    models, calibration = given.pop("model", None) or (), given.pop("calibration", None)
-    lenses, jobs = given.pop("lenses", None) or {}, given.pop("jobs", None)
+    run, models = given.pop("run"), given.pop("model", None) or ()
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
     further = {name: given.pop(name) for name in [*given] if name not in known}
     return {
         "models": models,
-        "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
-        "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
         "run": check_name(run, "--run") if run else None,
-        "jobs": jobs,
         "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,
     }

@@ -15,7 +15,7 @@ from ipsys_log.runs.origins import own_inputs
 from ipsys_log.runs.provenance import is_complete, recorded_version, with_inputs
 from ipsys_log.runs.states import CURRENT, Recorded, recorded_stages
 
-__all__ = ["SupersededRun", "superseded_runs"]
+__all__ = ["SupersededRun", "outdated_runs", "superseded_runs"]
 
 # The number that a new run gets if the name of its branch is taken: poly, poly_2, poly_3.
 _NUMBER = re.compile(r"_[0-9]+$")
@@ -71,6 +71,17 @@ def superseded_runs(session: Session) -> list[SupersededRun]:
         )
         for name in sorted(candidates - kept)
     ]
+
+
+def outdated_runs(session: Session) -> list[str]:
+    """Return the runs of a log with a stage that is out of date, by name, without the superseded ones.
+
+    A replay with the same options computes these runs again.
+    """
+    outdated = {stage.run.run for stage in recorded_stages(session) if stage.out_of_date}
+    if not outdated:
+        return []
+    return sorted(outdated - {run.run for run in superseded_runs(session)})
 
 
 def _newer_stages(session: Session, stages: Sequence[Recorded]) -> dict[int, str]:

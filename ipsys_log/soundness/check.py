@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import IpsysError, reason_without
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.dataset import Session
@@ -65,8 +65,7 @@ def _check_log(path: LogLocation, others: Sequence[LogLocation], progress: Progr
         if not any(finding.level == BROKEN for finding in findings):
             findings += _check_contents(path, others, progress)
     except IpsysError as error:
-        text = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
-        findings.append(LogFinding("file", BROKEN, text))
+        findings.append(LogFinding("file", BROKEN, reason_without(path, error)))
     return LogCheck(path, tuple(findings))
 
 

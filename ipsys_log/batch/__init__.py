@@ -1,0 +1,1 @@
+"""Work on many logs by many processes, with Dask: one task for each log."""

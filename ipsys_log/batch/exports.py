@@ -1,0 +1,58 @@
+"""Export of many logs: a file of the log's name in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.batch.tasks import UP_TO_DATE, LogResult
+from ipsys_log.errors import IpsysError
+from ipsys_log.log_export import EXPORT_FORMATS, ExportOptions, channel_of_table, find_format
+
+__all__ = ["check_exports", "export_log"]
+
+_EXPORTED = "exported"
+
+
+def check_exports(
+    logs: Sequence[Path], folder: Path, table: str, run: str | None, robot: str | None, format: str
+) -> str:
+    """Check the options of an export, and the names of its files; return the suffix of the files.
+
+    Raises
+    ------
+    IpsysError
+        There is no such format or table, a library is missing, or two logs have the same name.
+    """
+    suffix = (EXPORT_FORMATS[format].suffix or "") if format in EXPORT_FORMATS else ""
+    target = folder / f"log{suffix}"
+    find_format(target, format).check(target, ExportOptions(table, robot), [run])
+    channel_of_table(table)
+    by_name: dict[str, Path] = {}
+    for log in logs:
+        other = by_name.setdefault(log.stem, log)
+        if other != log:
+            raise IpsysError(
+                f"{other} and {log} have the same name, so their files in {folder} would be the same; rename "
+                "one, or export them into two folders"
+            )
+    if folder.exists() and not folder.is_dir():
+        raise IpsysError(f"-o {folder}: is not a folder; name a folder for the files")
+    return suffix
+
+
+def export_log(path: Path, folder: Path, suffix: str, overwrite: bool = False, **wishes: Any) -> LogResult:
+    """Export a log to a file of its name, as :meth:`ipsys_log.opened_log.Log.export` does.
+
+    A file that is newer than its log is up to date.
+    """
+    from ipsys_log import api
+
+    target = folder / f"{path.stem}{suffix}"
+    if not overwrite and target.exists() and target.stat().st_mtime_ns >= path.stat().st_mtime_ns:
+        return LogResult(str(path), UP_TO_DATE)
+    folder.mkdir(parents=True, exist_ok=True)
+    with api.open(path) as log:
+        exported = log.export(target, **wishes)
+    return LogResult(str(path), _EXPORTED, runs=exported.runs, messages=exported.rows)

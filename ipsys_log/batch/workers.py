@@ -1,0 +1,186 @@
+"""Workers of a batch: processes on this machine, or those of an existing Dask scheduler."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ipsys_log import __version__
+from ipsys_log.batch.settings import WorkerSettings
+from ipsys_log.errors import IpsysError
+
+if TYPE_CHECKING:
+    from distributed import Client, Security
+
+__all__ = ["Workers", "open_workers"]
+
+_LOOPBACK = "127.0.0.1"
+_CONNECT_TIMEOUT_S = 15.0
+_DISTRIBUTION = "ipsys_log"
+# An existing cluster can grow, and it grows only if tasks wait.
+_LEAST_WAITING = 8
+# Dask's settings of the workers on this machine.
+_CONFIG: Mapping[str, Any] = {
+    # The batch itself counts how often a log has ended its worker.
+    "distributed.scheduler.allowed-failures": 0,
+    "distributed.scheduler.worker-saturation": 1.0,
+    # A task needs its memory until it ends: a paused worker would wait forever. Above the limit, it ends.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+}
+
+
+@dataclass(slots=True)
+class Workers:
+    """Connected workers.
+
+    Attributes
+    ----------
+    client : the connection to their scheduler.
+    address : of the scheduler.
+    dashboard : address of the page that shows the work.
+    local : the number of worker processes on this machine; 0 with an existing scheduler.
+    """
+
+    client: Client
+    address: str
+    dashboard: str
+    local: int = 0
+
+    def window(self) -> int:
+        """Return the number of tasks to submit at once: it does not depend on the number of logs.
+
+        On this machine, each worker has one task, so that the end of a worker affects one log.
+        """
+        return self.local or max(_LEAST_WAITING, 2 * sum(self.client.nthreads().values()))
+
+
+@contextmanager
+def open_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
+    """Start worker processes on this machine, or connect to an existing scheduler.
+
+    Parameters
+    ----------
+    logs : the number of logs: more worker processes would have no work.
+
+    Raises
+    ------
+    IpsysError
+        The settings do not fit, the scheduler cannot be reached, or a worker has another version.
+    """
+    settings.check()
+    with ExitStack() as stack:
+        if settings.scheduler is None:
+            workers = stack.enter_context(_local_workers(settings, logs))
+        else:
+            workers = stack.enter_context(_connected_workers(settings.scheduler, settings))
+        _check_versions(workers.client)
+        yield workers
+
+
+@contextmanager
+def _local_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
+    import dask
+    from dask.system import CPU_COUNT
+    from distributed import Client, LocalCluster, Security
+
+    count = min(settings.workers or CPU_COUNT, max(logs, 1))
+    limit = _parse_limit(settings.memory_limit)
+    with (
+        dask.config.set(_CONFIG),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host=_LOOPBACK,
+            dashboard_address=f"{_LOOPBACK}:0",
+            # On loopback, too: other users of this machine could run code as this user.
+            security=Security.temporary(),
+            silence_logs=logging.CRITICAL,
+            **({} if limit is None else {"memory_limit": limit}),
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield Workers(client, cluster.scheduler_address, client.dashboard_link, count)
+
+
+def _parse_limit(text: str | None) -> int | None:
+    from dask.utils import parse_bytes
+
+    if text is None:
+        return None
+    try:
+        size = int(parse_bytes(text))
+    except ValueError:
+        size = 0
+    if size <= 0:
+        raise IpsysError(f"--memory-limit {text}: is not a size; write a number with its unit, such as 2GB")
+    return size
+
+
+@contextmanager
+def _connected_workers(address: str, settings: WorkerSettings) -> Iterator[Workers]:
+    from distributed import Client
+
+    _silence()
+    try:
+        client = Client(address, security=_security(address, settings), timeout=_CONNECT_TIMEOUT_S)
+    except (OSError, ValueError, TypeError) as error:
+        cause = str(error).partition("\n")[0]
+        raise IpsysError(
+            f"--scheduler {address}: cannot be reached; start the scheduler, or check the address and the "
+            f"certificates ({cause})"
+        ) from None
+    with client:
+        yield Workers(client, address, client.dashboard_link)
+
+
+def _silence() -> None:
+    """Switch off Dask's log messages on the terminal: the batch reports each failure itself."""
+    for name in ("distributed", "distributed.client", "distributed.comm", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _security(address: str, settings: WorkerSettings) -> Security | None:
+    from distributed import Security
+
+    if not address.startswith("tls://"):
+        return None
+    files = {
+        "tls_ca_file": settings.tls_ca,
+        "tls_client_cert": settings.tls_cert,
+        "tls_client_key": settings.tls_key,
+    }
+    given = {name: str(file) for name, file in files.items() if file is not None}
+    security = Security(require_encryption=True, **given)
+    if any(getattr(security, name) is None for name in files):
+        raise IpsysError(
+            f"--scheduler {address}: needs certificates; give --tls-ca, --tls-cert and --tls-key, or set "
+            "them in Dask's configuration (distributed.comm.tls)"
+        )
+    return security
+
+
+def _check_versions(client: Client) -> None:
+    """Check that all workers have this version of ipsys. Each task checks the worker that does it, too.
+
+    Raises
+    ------
+    IpsysError
+        A worker has another version, or none.
+    """
+    ask: Callable[[str], str] = importlib.metadata.version
+    versions = client.run(ask, _DISTRIBUTION, on_error="return")
+    for worker, version in sorted(versions.items()):
+        if version != __version__:
+            found = f"ipsys {version}" if isinstance(version, str) else "no ipsys"
+            raise IpsysError(
+                f"worker {worker} has {found}, but this is ipsys {__version__}; install one version "
+                "everywhere"
+            )

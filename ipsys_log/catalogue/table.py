@@ -1,0 +1,96 @@
+"""The table of a catalogue: a Parquet file that is brought up to date, log by log."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.catalogue.row import COLUMNS, Baseline, file_state, read_row
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.parquet_rows import read_rows, write_rows
+from ipsys_log.log.log_files import logs_below
+from ipsys_log.runs.graph import VERSIONS
+
+__all__ = ["CatalogueUpdate", "update_catalogue"]
+
+# Raised when a row gets another content for the same log.
+_VERSION = 1
+_KIND = "catalogue "
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueUpdate:
+    """The update of a catalogue.
+
+    Attributes
+    ----------
+    logs : the number of logs in the catalogue.
+    read : the number of logs that were read, because they are new or have changed.
+    removed : the number of logs that do not exist any more.
+    errors : the reason by log, for logs that cannot be read.
+    """
+
+    logs: int
+    read: int
+    removed: int
+    errors: Mapping[str, str]
+
+
+def update_catalogue(
+    folder: Path,
+    target: Path,
+    baseline: Baseline | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> CatalogueUpdate:
+    """Write the catalogue of all logs below a folder; only new or changed logs are read.
+
+    A log is read again if its size or change time differs. All logs are read again if the stages of this
+    ipsys have other versions, or the baseline differs: states and drift depend on these.
+
+    Parameters
+    ----------
+    folder : logs are named by their path below it.
+    target : the Parquet file. The rows of an earlier catalogue in it are used again.
+    baseline : for the drift of the cameras since then; None: no drift.
+    progress : called with the number of logs done, and of all logs.
+
+    Raises
+    ------
+    IpsysError
+        There is no such folder, PyArrow is not installed, or the target is another file.
+    """
+    paths = {str(path.relative_to(folder)): path for path in logs_below(folder)}
+    mark = _mark(baseline)
+    before = _earlier_rows(target, mark) if target.exists() else {}
+    rows: list[dict[str, Any]] = []
+    read = 0
+    for number, (name, path) in enumerate(paths.items()):
+        progress(number, len(paths))
+        row = before.get(name)
+        if row is None or {key: row[key] for key in ("bytes", "changed_ns")} != file_state(path):
+            row, read = read_row(path, name, baseline), read + 1
+        rows.append(row)
+    progress(len(paths), len(paths))
+    write_rows(target, rows, COLUMNS, mark)
+    errors = {row["log"]: row["error"] for row in rows if row.get("error")}
+    return CatalogueUpdate(len(rows), read, len(before.keys() - paths.keys()), errors)
+
+
+def _earlier_rows(target: Path, mark: str) -> dict[str, dict[str, Any]]:
+    """Return the rows of a catalogue by log; none of a catalogue with another mark."""
+    found, rows = read_rows(target)
+    if not (found or "").startswith(_KIND):
+        raise IpsysError(f"{target}: is not a catalogue, so it is not replaced; choose another name")
+    return {row["log"]: row for row in rows} if found == mark else {}
+
+
+def _mark(baseline: Baseline | None) -> str:
+    """Return the identity of all on which a row depends besides its log."""
+    logs = [] if baseline is None else [baseline.log, baseline.model_from]
+    states = [[str(log.resolve()), file_state(log)] for log in logs]
+    parts = json.dumps([_VERSION, VERSIONS, states], sort_keys=True)
+    return _KIND + hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()

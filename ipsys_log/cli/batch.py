@@ -1,0 +1,336 @@
+"""Commands for many logs on many workers: ``ipsys batch replay``, ``evaluate``, ``verify`` and others."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from ipsys_log.cli.console import console, remarks, say
+from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.stages import build_command, options_until, replay_options
+
+if TYPE_CHECKING:
+    from ipsys_log.batch.settings import WorkerSettings
+    from ipsys_log.batch.tasks import BatchTask, LogResult, Work
+
+__all__ = ["add_commands"]
+
+_Path = Optional[Path]  # noqa: UP045
+_Text = Optional[str]  # noqa: UP045
+# A task can take minutes: the rate is that of the last half hour.
+_RATE_PERIOD_S = 1800.0
+
+_LOGS = (
+    Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG", help="Logs, each one on its own. A folder stands for all logs below it."
+        ),
+    ],
+    inspect.Parameter.empty,
+)
+# The options of the workers and of the result, which all commands of the group have.
+_WORKERS: dict[str, tuple[Any, Any]] = {
+    "scheduler": (
+        Annotated[
+            _Text,
+            typer.Option(
+                metavar="ADDRESS",
+                help="Use the workers of this Dask scheduler, such as tls://head:8786. Access to a scheduler "
+                "means code execution on its workers, so it must use certificates. Default: processes on "
+                "this machine.",
+            ),
+        ],
+        None,
+    ),
+    "workers": (
+        Annotated[
+            Optional[int],  # noqa: UP045
+            typer.Option(
+                min=1, metavar="N", help="Worker processes on this machine. Default: one for each core."
+            ),
+        ],
+        None,
+    ),
+    "memory_limit": (
+        Annotated[
+            _Text,
+            typer.Option(
+                metavar="SIZE", help="Memory of each worker process, such as 2GB. Default: an equal share."
+            ),
+        ],
+        None,
+    ),
+    "tls_ca": (
+        Annotated[_Path, typer.Option(metavar="FILE", help="Certificate of the authority, for --scheduler.")],
+        None,
+    ),
+    "tls_cert": (
+        Annotated[_Path, typer.Option(metavar="FILE", help="Your certificate, for --scheduler.")],
+        None,
+    ),
+    "tls_key": (
+        Annotated[_Path, typer.Option(metavar="FILE", help="The key of your certificate, for --scheduler.")],
+        None,
+    ),
+    "insecure": (
+        Annotated[
+            bool,
+            typer.Option(
+                "--insecure",
+                help="Permit a scheduler without certificates: each program that reaches it can run code.",
+            ),
+        ],
+        False,
+    ),
+    "table": (
+        Annotated[
+            _Path,
+            typer.Option(metavar="FILE", help="Write the results to a Parquet file: a row for each log."),
+        ],
+        None,
+    ),
+    "as_json": (AsJson, False),
+}
+_OUTDATED = (
+    Annotated[bool, typer.Option("--outdated", help="Replay only logs that hold outdated runs.")],
+    False,
+)
+_RUN = (Annotated[_Text, typer.Option("--run", metavar="NAME", help="Use only this run.")], None)
+_EXPORT: dict[str, tuple[Any, Any]] = {
+    "output": (
+        Annotated[
+            Path,
+            typer.Option(
+                "--output", "-o", metavar="FOLDER", help="The folder for the files, named as the logs."
+            ),
+        ],
+        inspect.Parameter.empty,
+    ),
+    "format_": (
+        Annotated[
+            str,
+            typer.Option("--format", metavar="NAME", help="csv, parquet, tum, kitti, ros2, mp4 or coco."),
+        ],
+        "csv",
+    ),
+    "channel": (
+        Annotated[
+            str,
+            typer.Option(
+                metavar="NAME",
+                help="The table to export: tracks, positions, markers, camera_points, measurements, events, "
+                "latency or truth.",
+            ),
+        ],
+        "tracks",
+    ),
+    "run": (
+        Annotated[
+            _Text, typer.Option("--run", metavar="NAME", help="Export this run instead of the newest.")
+        ],
+        None,
+    ),
+    "robot": (Annotated[_Text, typer.Option(metavar="NAME", help="Export only this robot.")], None),
+    "overwrite": (
+        Annotated[bool, typer.Option("--overwrite", help="Export all logs, also those with a newer file.")],
+        False,
+    ),
+}
+_MORE = (
+    "\n\nThe command does only what is missing; after a failure or an interrupt, repeat it. A log that fails "
+    "does not affect the others. The exit code is 1 if a log failed."
+)
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the group with its commands: the single commands on many logs."""
+    group = typer.Typer(
+        help="Do a command on many logs, with many processes or the workers of a Dask scheduler.",
+        no_args_is_help=True,
+    )
+
+    def add(name: str, text: str, work: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> None:
+        options = {"logs": _LOGS, **options, **_WORKERS}
+        group.command(name, help=text + _MORE)(build_command(options, work))
+
+    text = "Run the missing stages of each log, and append their results to it."
+    add("replay", text, _replay, {**_stage_options(None), "outdated": _OUTDATED})
+    text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
+    add("evaluate", text, _evaluate, _stage_options("evaluate"))
+    add(
+        "verify", "Compute every run of each log again, and compare it byte for byte.", _verify, {"run": _RUN}
+    )
+    add("check", "Read each log completely and check it.", _check, {})
+    add("export", "Export each log to a file of its name in a folder.", _export, _EXPORT)
+    app.add_typer(group, name="batch")
+
+
+def _stage_options(until: str | None) -> dict[str, tuple[Any, Any]]:
+    left_out = ("logs", "output", "jobs", "as_json")
+    return {name: option for name, option in options_until(until).items() if name not in left_out}
+
+
+def _replay(outdated: bool, **given: Any) -> None:
+    from ipsys_log.batch.tasks import replay_log
+
+    options, batch = _divide(given)
+    _run(replay_log, {"outdated": outdated, **_replay_options(options)}, **batch)
+
+
+def _evaluate(**given: Any) -> None:
+    from ipsys_log.batch.tasks import replay_log
+
+    options, batch = _divide(given)
+    _run(replay_log, {"until": "evaluate", **_replay_options(options)}, **batch)
+
+
+def _verify(run: str | None, **batch: Any) -> None:
+    from ipsys_log.batch.tasks import verify_log
+
+    _run(verify_log, {"run": run}, **batch)
+
+
+def _check(**batch: Any) -> None:
+    from ipsys_log.batch.tasks import check_log
+
+    _run(check_log, {}, **batch)
+
+
+def _export(
+    logs: list[Path],
+    output: Path,
+    format_: str,
+    channel: str,
+    run: str | None,
+    robot: str | None,
+    overwrite: bool,
+    **batch: Any,
+) -> None:
+    from ipsys_log.batch.exports import check_exports, export_log
+    from ipsys_log.log.log_files import expand_folders
+
+    wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
+    suffix = check_exports(expand_folders(logs), output, **wishes)
+    options = {"folder": output, "suffix": suffix, "overwrite": overwrite, **wishes}
+    _run(export_log, options, logs=logs, **batch)
+
+
+def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the options of the work, and those of the batch."""
+    of_batch = {"logs", *_WORKERS}
+    return (
+        {name: value for name, value in given.items() if name not in of_batch},
+        {name: value for name, value in given.items() if name in of_batch},
+    )
+
+
+def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options as those of :func:`ipsys_log.api.replay`; rig and intrinsics are read once."""
+    from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.rig.file import load_rig
+
+    rig, calibration = options.pop("rig"), options.pop("calibration") or []
+    for text in calibration:
+        if "=" not in text:
+            raise IpsysError(f"--calibration {text}: has no camera name; in a batch, write camera=file.yaml")
+    return {
+        "rig": None if rig is None else load_rig(rig),
+        "calibrations": load_calibrations(calibration, tuple),
+        **replay_options(**options),
+    }
+
+
+def _run(
+    work: Work,
+    options: dict[str, Any],
+    logs: list[Path],
+    table: Path | None,
+    as_json: bool,
+    **settings: Any,
+) -> None:
+    """Do the work on each log, and print the results in the order of the logs."""
+    from ipsys_log.batch.settings import WorkerSettings
+    from ipsys_log.batch.tasks import BatchTask
+    from ipsys_log.extras import check_installed
+    from ipsys_log.log.log_files import expand_folders
+    from ipsys_log.report.files import check_file
+
+    check_installed("batch needs", "dask", "distributed", "bokeh", "cryptography")
+    if table is not None:
+        check_installed("--table needs", "pyarrow")
+        check_file(table, "--table", logs)
+    workers, paths = WorkerSettings(**settings), expand_folders(logs)
+    if workers.scheduler is not None:  # its workers have other working directories
+        paths = [path.absolute() for path in paths]
+        options = {k: value.absolute() if isinstance(value, Path) else value for k, value in options.items()}
+    results = _collect(BatchTask(work, options), paths, workers)
+    _print(results, table, as_json)
+    if not all(result.good for result in results):
+        raise typer.Exit(1)
+
+
+def _collect(task: BatchTask, paths: Sequence[Path], settings: WorkerSettings) -> list[LogResult]:
+    from ipsys_log.batch.execution import run_batch
+    from ipsys_log.batch.workers import open_workers
+
+    by_log: dict[str, LogResult] = {}
+    with open_workers(settings, len(paths)) as workers:
+        say(f"dashboard: {workers.dashboard}")
+        with _batch_bar(len(paths)) as show:
+            for result in run_batch(workers, task, paths):
+                by_log[result.log] = result
+                show(result)
+    return [by_log[str(path)] for path in paths]
+
+
+def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> None:
+    from ipsys_log.report.batch import batch_json, batch_table, failure_lines, write_results
+
+    if as_json:
+        print(json.dumps(batch_json(results), indent=2))  # noqa: T201
+    else:
+        console.print(batch_table(results))
+        for line in failure_lines(results):
+            console.print(line, style="red")
+    for trace in {result.trace for result in results if result.trace}:
+        remarks.print(trace)
+    if table is not None:
+        write_results(table, results)
+        say(f"{table} written: a row for each log")
+
+
+@contextmanager
+def _batch_bar(count: int) -> Iterator[Callable[[LogResult], None]]:
+    """Yield a function that shows a result: a bar with rate, failures and remaining time, on a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    if not remarks.is_terminal:
+        yield lambda result: None
+        return
+    columns = (
+        TextColumn("logs"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}", justify="right"),
+        TextColumn("{task.fields[failures]} failed", justify="right"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=remarks, transient=True, speed_estimate_period=_RATE_PERIOD_S) as bar:
+        task, failures = bar.add_task("logs", total=count, rate="", failures=0), 0
+
+        def show(result: LogResult) -> None:
+            nonlocal failures
+            failures += not result.good
+            speed = bar.tasks[task].speed
+            rate = f"{60 * speed:,.1f} logs/min" if speed else ""
+            bar.update(task, advance=1, rate=rate, failures=failures)
+
+        yield show

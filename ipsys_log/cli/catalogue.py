@@ -1,0 +1,81 @@
+"""The catalogue of a folder with logs: ``ipsys catalogue``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from ipsys_log.cli.console import console, progress_bar
+from ipsys_log.cli.options import AsJson
+
+__all__ = ["add_commands"]
+
+_MOST_LINES = 30
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(catalogue)
+
+
+def catalogue(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="The folder; all logs below it are in the catalogue.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help="The catalogue: a Parquet file (.parquet)."),
+    ],
+    baseline: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--baseline",
+            metavar="LOG",
+            help="Also record the drift of the cameras since this log, by their reference markers.",
+        ),
+    ] = None,
+    model_from: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a table with a row for each log: cameras, times, runs, versions, errors of models, gaps, drift.
+
+    The command reads only logs that are new or have changed since the last call. A log that cannot be read
+    has a row with its error, and the command still succeeds. pandas and DuckDB read the file.
+    """
+    from ipsys_log.catalogue.row import Baseline
+    from ipsys_log.catalogue.table import update_catalogue
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.extras import check_installed
+    from ipsys_log.plain_text import plain_text
+    from ipsys_log.report.files import check_file
+
+    check_installed("catalogue needs", "pyarrow")
+    if output.suffix != ".parquet":
+        raise IpsysError(f"-o {output}: a catalogue ends in .parquet; use {output.stem}.parquet")
+    check_file(output, "-o", [])
+    for name, log in (("--baseline", baseline), ("--model-from", model_from)):
+        if log is not None and not log.is_file():
+            raise IpsysError(f"{name} {log}: is not a file; name a log")
+    if model_from is not None and baseline is None:
+        raise IpsysError("--model-from: has an effect only with --baseline; give the log before all moves")
+    since = None if baseline is None else Baseline(baseline, model_from or baseline)
+    with progress_bar(()) as progress:
+        update = update_catalogue(folder, output, since, lambda done, total: progress("logs", done, total))
+    if as_json:
+        print(json.dumps(asdict(update), indent=2))  # noqa: T201
+        return
+    removed = f", {update.removed} removed" if update.removed else ""
+    console.print(f"{output} written: {update.logs} logs, {update.read} read{removed}")
+    errors = [f"{log}: {text}" for log, text in update.errors.items()]
+    for line in errors[:_MOST_LINES]:
+        console.print(plain_text(line), style="yellow")
+    if len(errors) > _MOST_LINES:
+        console.print(f"and {len(errors) - _MOST_LINES} more logs with errors: --json lists all")

@@ -1,0 +1,81 @@
+"""The result of a batch: a table and lines for the terminal, plain data, and a Parquet file."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from ipsys_log.batch.tasks import LogResult
+from ipsys_log.exchange.parquet_rows import write_rows
+from ipsys_log.plain_text import plain_text
+from ipsys_log.report.tables import name_cell, plain_table
+
+__all__ = ["batch_json", "batch_table", "failure_lines", "write_results"]
+
+# A longer list is counted by state.
+_MOST_LISTED = 20
+_MOST_LINES = 30
+
+
+def batch_table(results: Sequence[LogResult]) -> Table:
+    """Return a table with a row for each log; for many logs, with a row for each state."""
+    if len(results) > _MOST_LISTED:
+        table = plain_table(f"{len(results)} logs", ("state",), ("logs", "messages"))
+        for state, count in Counter(result.state for result in results).most_common():
+            messages = sum(result.messages for result in results if result.state == state)
+            table.add_row(state, str(count), str(messages))
+        return table
+    table = plain_table(f"{len(results)} logs" if len(results) != 1 else "1 log", ("log", "state", "runs"))
+    table.add_column("messages", justify="right", no_wrap=True)
+    for result in results:
+        style = None if result.good else "red"
+        runs = name_cell(", ".join(result.runs) or "-")
+        table.add_row(name_cell(result.log), result.state, runs, str(result.messages), style=style)
+    return table
+
+
+def failure_lines(results: Sequence[LogResult]) -> Iterator[str]:
+    """Yield a line for each log that the user must look at: its path and the reason."""
+    failures = [result for result in results if not result.good]
+    for result in failures[:_MOST_LINES]:
+        yield plain_text(f"{result.log}: {result.text or result.state}")
+    if len(failures) > _MOST_LINES:
+        yield f"and {len(failures) - _MOST_LINES} more: --json or --table FILE lists all"
+
+
+def batch_json(results: Sequence[LogResult]) -> dict[str, Any]:
+    """Return the results as plain data: the number of logs by state, and a row for each log."""
+    return {
+        "logs": len(results),
+        "states": dict(Counter(result.state for result in results).most_common()),
+        "results": [
+            {key: value for key, value in asdict(result).items() if value not in ("", ())}
+            for result in results
+        ],
+    }
+
+
+def write_results(path: Path, results: Sequence[LogResult]) -> None:
+    """Write a Parquet file with a row for each log.
+
+    Raises
+    ------
+    IpsysError
+        PyArrow is not installed.
+    """
+    columns = {
+        "log": "string",
+        "state": "string",
+        "good": "bool",
+        "text": "string",
+        "runs": "list<string>",
+        "messages": "int64",
+        "trace": "string",
+    }
+    rows = ({name: None if value == "" else value for name, value in asdict(one).items()} for one in results)
+    write_rows(path, rows, columns)

@@ -1,0 +1,213 @@
+"""The policy of a batch, with a simulated scheduler: window, ended workers, losses; and results of tasks."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ipsys_log.batch.execution import MOST_ENDED_WORKERS, run_batch
+from ipsys_log.batch.exports import check_exports
+from ipsys_log.batch.settings import WorkerSettings
+from ipsys_log.batch.tasks import BatchTask, LogResult, VersionError, perform
+from ipsys_log.batch.workers import Workers
+from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.log.log_files import expand_folders
+
+distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
+
+
+class Future:
+    """A future that is done when its scheduler says so."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.error: Exception | None = None
+        self.callback: Callable[[Future], None] = lambda future: None
+
+    def add_done_callback(self, callback: Callable[[Future], None]) -> None:
+        self.callback = callback
+
+    def result(self) -> LogResult:
+        if self.error is not None:
+            raise self.error
+        return LogResult(str(self.path), "computed")
+
+    def release(self) -> None:
+        """Do nothing: the scheduler has forgotten the future already."""
+
+
+class Scheduler:
+    """A scheduler whose workers end in the tasks of some logs, with all other tasks that run meanwhile."""
+
+    def __init__(self, deadly: set[str], order: list[int], losses: int = 0) -> None:
+        self.deadly, self.order, self.losses = deadly, order, losses
+        self.status, self.most = "running", 0
+        self.running: list[Future] = []
+        self.starts: Counter[str] = Counter()
+
+    def submit(self, _perform: Any, _task: BatchTask, path: Path, **_: Any) -> Future:
+        future = Future(path)
+        self.starts[path.name] += 1
+        self.running.append(future)
+        self.most = max(self.most, len(self.running))
+        return future
+
+    def advance(self) -> None:
+        """End one task, or all of them if their worker ends."""
+        place = self.order.pop() if self.order else 0
+        future = self.running[place % len(self.running)]
+        ended = [future]
+        if future.path.name in self.deadly:
+            ended = [*self.running]
+            for one in ended:
+                one.error = distributed.KilledWorker("task", SimpleNamespace(address="here"), 0)
+        elif self.losses:
+            self.losses -= 1
+            future.error = distributed.CancelledError("lost")
+        for one in ended:
+            self.running.remove(one)
+            one.callback(one)
+
+
+def run(
+    scheduler: Scheduler, paths: list[Path], window: int, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, Any]:
+    workers = Workers(scheduler, "tls://here", "", window)
+
+    class Queue(list[Future]):
+        put = list.append
+
+        def get(self, timeout: float) -> Future:  # noqa: ARG002
+            while not self:
+                scheduler.advance()
+            return self.pop(0)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ipsys_log.batch.execution.SimpleQueue", Queue)
+        results = list(run_batch(workers, BatchTask(lambda path: LogResult("", "")), paths))
+    assert sorted(result.log for result in results) == sorted(map(str, paths))
+    return {Path(result.log).name: result for result in results}
+
+
+@given(
+    count=st.integers(1, 30),
+    window=st.integers(1, 6),
+    deadly=st.sets(st.integers(0, 29), max_size=3),
+    order=st.lists(st.integers(0, 5), max_size=60),
+)
+def test_only_logs_that_end_their_workers_fail(
+    count: int, window: int, deadly: set[int], order: list[int]
+) -> None:
+    """Other logs that lose their worker at the same time are done, whatever the order."""
+    names = {f"{number}.mcap" for number in deadly if number < count}
+    scheduler = Scheduler(names, order)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        results = run(scheduler, [Path(f"{number}.mcap") for number in range(count)], window, monkeypatch)
+    assert {name for name, result in results.items() if not result.good} == names
+    assert all(scheduler.starts[name] >= MOST_ENDED_WORKERS for name in names)
+    assert scheduler.most <= window
+
+
+def test_log_that_ends_four_workers_alone_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    scheduler = Scheduler({"bad.mcap"}, [])
+    results = run(scheduler, [Path("bad.mcap"), Path("good.mcap")], 1, monkeypatch)
+    assert results["good.mcap"].state == "computed"
+    assert "its worker ended 4 times" in results["bad.mcap"].text
+    assert scheduler.starts == {"bad.mcap": 4, "good.mcap": 1}
+
+
+def test_tasks_that_the_scheduler_loses_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = run(Scheduler(set(), [], losses=2), [Path("a.mcap"), Path("b.mcap")], 2, monkeypatch)
+    assert all(result.good for result in results.values())
+    results = run(Scheduler(set(), [], losses=99), [Path("a.mcap")], 1, monkeypatch)
+    assert "the scheduler lost its task 3 times" in results["a.mcap"].text
+
+
+def test_lost_scheduler_ends_the_batch_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    scheduler = Scheduler(set(), [], losses=1)
+    scheduler.status = "closed"
+    with pytest.raises(IpsysError, match=r"tls://here was lost after 0 of 2 logs; .* repeat the command"):
+        run(scheduler, [Path("a.mcap"), Path("b.mcap")], 1, monkeypatch)
+
+
+def fail(path: Path, error: Exception) -> LogResult:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (IpsysError("a.mcap: has no rig\nsecond line"), "has no rig"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "the disk is full; free some space and try again"),
+        (WriteError("a.mcap: the disk is full", OSError()), "the disk is full"),
+        (PermissionError(errno.EACCES, "Permission denied", "b.csv"), "b.csv: Permission denied"),
+        (MemoryError(), "the memory of the worker is full; use fewer workers, or a larger --memory-limit"),
+    ],
+)
+def test_error_in_a_task_is_a_result_of_one_line(error: Exception, text: str) -> None:
+    result = perform(BatchTask(fail, {"error": error}), Path("a.mcap"))
+    assert (result.log, result.state, result.good, result.text) == ("a.mcap", "failed", False, text)
+    assert result.trace == ""
+
+
+def test_fault_of_the_program_keeps_its_traceback() -> None:
+    result = perform(BatchTask(fail, {"error": ZeroDivisionError("by zero")}), Path("a.mcap"))
+    assert result.text == "fault of ipsys: ZeroDivisionError: by zero"
+    assert "in fail" in result.trace
+
+
+def test_worker_of_another_version_refuses_with_both() -> None:
+    with pytest.raises(VersionError, match=r"has ipsys 0.* the batch is of ipsys 9.8.7"):
+        perform(BatchTask(fail, version="9.8.7"), Path("a.mcap"))
+    versions = {**BatchTask(fail).stage_versions, "poly": 99}
+    with pytest.raises(VersionError, match=r"has the stages poly 1, but the batch has poly 99"):
+        perform(BatchTask(fail, stage_versions=versions), Path("a.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        (WorkerSettings("tcp://10.0.0.1:8786"), "can run code on its workers; use tls:// with certificates"),
+        (WorkerSettings("10.0.0.1:8786"), "is not encrypted"),
+        (WorkerSettings("tls://head:1", workers=2), "--workers: the scheduler has its own workers"),
+        (WorkerSettings("tls://head:1", tls_ca=Path("none.pem")), "--tls-ca none.pem: is not a file"),
+        (WorkerSettings(insecure=True), "--insecure: has an effect only with --scheduler"),
+        (WorkerSettings(tls_key=Path("key.pem")), "--tls-key: has an effect only with --scheduler"),
+    ],
+)
+def test_settings_without_effect_or_protection_are_refused(settings: WorkerSettings, text: str) -> None:
+    with pytest.raises(IpsysError) as caught:
+        settings.check()
+    assert text in str(caught.value)
+
+
+def test_logs_are_named_once_and_folders_searched(tmp_path: Path) -> None:
+    (tmp_path / "week" / "monday").mkdir(parents=True)
+    for name in ("b.mcap", "week/monday/a.mcap", "week/c.mcap", "week/notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "b.mcap")
+    given_names = ("b.mcap", "week", "link.mcap", "none.mcap")
+    found = expand_folders(tmp_path / name for name in given_names)
+    assert [path.name for path in found] == ["b.mcap", "c.mcap", "a.mcap", "none.mcap"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(IpsysError, match="has no file that ends in"):
+        expand_folders([tmp_path / "empty"])
+
+
+def test_exports_that_would_have_one_file_are_refused(tmp_path: Path) -> None:
+    wishes: dict[str, Any] = {"table": "tracks", "run": None, "robot": None}
+    logs = [Path("a/monday.mcap"), Path("b/monday.mcap")]
+    with pytest.raises(IpsysError, match=r"a/monday.mcap and b/monday.mcap have the same name"):
+        check_exports(logs, tmp_path, format="csv", **wishes)
+    assert check_exports(logs[:1], tmp_path, format="tum", **wishes) == ".tum"
+    with pytest.raises(IpsysError, match="--format xlsx: is not known"):
+        check_exports(logs, tmp_path, format="xlsx", **wishes)

@@ -1,0 +1,259 @@
+"""Batches with real workers: the bytes of the single command, killed workers, a full disk, a scheduler."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from ipsys_log import api
+from ipsys_log.batch.execution import MOST_ENDED_WORKERS, run_batch
+from ipsys_log.batch.settings import WorkerSettings
+from ipsys_log.batch.tasks import BatchTask, replay_log
+from ipsys_log.batch.workers import open_workers
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.parquet_rows import read_rows
+from ipsys_log.soundness.finding import BROKEN
+from tests.batch.works import DEADLY, HELD, PATIENCE_S, replay_and_note, wait_for
+from tests.conftest import ROOT, small_disk
+
+pytestmark = pytest.mark.slow
+pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
+
+PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
+
+
+def copies(folder: Path, *names: str) -> list[Path]:
+    """Return copies of a sample log with markers, in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return [Path(shutil.copy(PAPER_LAB, folder / name)) for name in names]
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Return the bytes of the log after the single command."""
+    (log,) = copies(tmp_path_factory.mktemp("single"), "log.mcap")
+    api.replay(log, models=("rigid",))
+    return log.read_bytes()
+
+
+def batch(folder: Path, *arguments: object) -> tuple[int, Any, str]:
+    """Run a command of the group as a program; return its exit code, its JSON and its errors."""
+    done = subprocess.run(
+        [sys.executable, "-m", "ipsys_log", "batch", *map(str, arguments), "--json"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr
+    return done.returncode, json.loads(done.stdout) if done.stdout else None, done.stderr
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_logs_have_the_bytes_of_the_single_command(tmp_path: Path, replayed: bytes, workers: int) -> None:
+    logs = copies(tmp_path / "logs", *(f"{number}.mcap" for number in range(4)))
+    broken = tmp_path / "logs" / "broken.mcap"
+    broken.write_bytes(PAPER_LAB.read_bytes()[:100_000])
+    command = ("replay", "logs", "--model", "rigid", "--workers", workers, "--table", "results.parquet")
+    code, result, errors = batch(tmp_path, *command)
+    assert code == 1
+    assert "dashboard: http://127.0.0.1:" in errors
+    assert [log.read_bytes() == replayed for log in logs] == [True] * 4
+    assert result["states"] == {"computed": 4, "failed": 1}
+    (failure,) = (row for row in result["results"] if not row["good"])
+    assert failure["log"] == "logs/broken.mcap"
+    assert "has no end" in failure["text"]
+    assert broken.read_bytes() == PAPER_LAB.read_bytes()[:100_000]
+    rows = {row["log"]: row["state"] for row in read_rows(tmp_path / "results.parquet")[1]}
+    assert rows == {row["log"]: row["state"] for row in result["results"]}
+    # The next call does only what is missing.
+    broken.unlink()
+    (new,) = copies(tmp_path / "logs", "new.mcap")
+    code, result, _ = batch(tmp_path, *command)
+    assert (code, result["states"]) == (0, {"up to date": 4, "computed": 1})
+    assert new.read_bytes() == replayed
+
+
+def test_killed_workers_cost_only_the_log_that_ends_them(tmp_path: Path, replayed: bytes) -> None:
+    """A kill -9 in the middle of a log is repeated; a log that ends four workers is named."""
+    names = ("0.mcap", DEADLY, HELD, "1.mcap", "2.mcap", "3.mcap")
+    logs = copies(tmp_path / "logs", *names)
+    notes = tmp_path / "notes"
+    notes.mkdir()
+
+    def kill() -> None:
+        wait_for(notes / "pid")
+        os.kill(int((notes / "pid").read_text()), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with open_workers(WorkerSettings(workers=2), len(logs)) as workers:
+        results = {
+            Path(result.log).name: result
+            for result in run_batch(workers, BatchTask(replay_and_note, {"notes": notes}), logs)
+        }
+    killer.join()
+    assert {name for name, result in results.items() if not result.good} == {DEADLY}
+    assert f"its worker ended {MOST_ENDED_WORKERS} times" in results[DEADLY].text
+    assert len((notes / "deadly.starts").read_text()) == MOST_ENDED_WORKERS
+    for log in logs:
+        expected = PAPER_LAB.read_bytes() if log.name == DEADLY else replayed
+        assert log.read_bytes() == expected, log.name
+
+
+def test_full_disk_on_one_worker_leaves_its_log_whole(tmp_path: Path, replayed: bytes) -> None:
+    with small_disk(tmp_path / "small", 1) as small:
+        (full,) = copies(small, "full.mcap")
+        room = shutil.disk_usage(small).free
+        (small / "filler").write_bytes(bytes(max(room - 100_000, 0)))
+        logs = [full, *copies(tmp_path / "logs", "a.mcap", "b.mcap")]
+        with open_workers(WorkerSettings(workers=2), len(logs)) as workers:
+            task = BatchTask(replay_log, {"models": ("rigid",)})
+            results = {result.log: result for result in run_batch(workers, task, logs)}
+        failed = results.pop(str(full))
+        assert (failed.state, "No space left" in failed.text) == ("failed", True), failed
+        assert api.check(full)[0].state != BROKEN
+        assert all(result.good for result in results.values())
+        assert [log.read_bytes() == replayed for log in logs[1:]] == [True, True]
+        # With room, the next call completes it.
+        (small / "filler").unlink()
+        assert replay_log(full, models=("rigid",)).good
+
+
+@contextmanager
+def program(*arguments: object, **environment: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a program of Dask until the end of the block."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, **environment},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def certificates(folder: Path) -> list[object]:
+    """Write the certificates of a new authority into a new folder; return the options that name them."""
+    from distributed import Security
+
+    folder.mkdir()
+    security = Security.temporary()
+    options: list[object] = []
+    for name, text in (
+        ("ca", security.tls_ca_file),
+        ("cert", security.tls_client_cert),
+        ("key", security.tls_client_key),
+    ):
+        (folder / f"{name}.pem").write_text(str(text))
+        options += [f"--tls-{name}", folder / f"{name}.pem"]
+    return options
+
+
+class Cluster(NamedTuple):
+    """A scheduler with a worker: its address, the options of a command for it, and its process."""
+
+    address: str
+    options: list[object]
+    scheduler: subprocess.Popen[bytes]
+
+
+@contextmanager
+def cluster(folder: Path, **environment: str) -> Iterator[Cluster]:
+    """Run a scheduler with certificates and a worker."""
+    from distributed import Client, Security
+
+    options = certificates(folder)
+    programs = ["--tls-ca-file", *options[1:]]
+    state = folder / "scheduler.json"
+    listen = ("--host", "tls://127.0.0.1", "--no-dashboard")
+    with (
+        program(
+            "distributed.cli.dask_scheduler", *listen, "--port", 0, "--scheduler-file", state, *programs
+        ) as scheduler,
+        program(
+            *("distributed.cli.dask_worker", "--scheduler-file", state, "--nthreads", 1, "--no-nanny"),
+            *("--no-dashboard", "--host", "127.0.0.1", "--protocol", "tls", *programs),
+            **environment,
+        ),
+    ):
+        wait_for(state)
+        address = json.loads(state.read_text())["address"]
+        ca, cert, key = map(str, options[1::2])
+        security = Security(tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key, require_encryption=True)
+        with Client(address, security=security) as client:
+            client.wait_for_workers(1, timeout=PATIENCE_S)
+        yield Cluster(address, options, scheduler)
+
+
+def test_workers_of_a_scheduler_with_certificates_are_used(tmp_path: Path, replayed: bytes) -> None:
+    copies(tmp_path, "a.mcap", "b.mcap")
+    with cluster(tmp_path / "cluster") as (address, options, _):
+        logs = (tmp_path / "a.mcap", tmp_path / "b.mcap")
+        # The working directory of the worker is another one.
+        code, result, _ = batch(
+            tmp_path, "replay", "a.mcap", "b.mcap", "--model", "rigid", "--scheduler", address, *options
+        )
+        assert (code, result["states"]) == (0, {"computed": 2})
+        assert [log.read_bytes() == replayed for log in logs] == [True, True]
+        # Other certificates are refused in one line.
+        others = certificates(tmp_path / "strangers")
+        code, result, errors = batch(tmp_path, "check", *logs, "--scheduler", address, *others)
+        assert (code, result) == (1, None)
+        assert errors.startswith(f"ipsys: --scheduler {address}: cannot be reached")
+        assert len(errors.splitlines()) == 1
+
+
+def test_worker_of_another_version_is_refused_before_any_work(tmp_path: Path) -> None:
+    (log,) = copies(tmp_path, "a.mcap")
+    old = tmp_path / "old" / "ipsys_log-0.0.9.dist-info"
+    old.mkdir(parents=True)
+    (old / "METADATA").write_text("Metadata-Version: 2.1\nName: ipsys_log\nVersion: 0.0.9\n")
+    with cluster(tmp_path / "cluster", PYTHONPATH=f"{tmp_path / 'old'}:{ROOT}") as (address, options, _):
+        code, result, errors = batch(tmp_path, "replay", log, "--scheduler", address, *options)
+    assert (code, result) == (1, None)
+    assert "has ipsys 0.0.9, but this is ipsys 0." in errors
+    assert "install one version everywhere" in errors
+    assert log.read_bytes() == PAPER_LAB.read_bytes()
+
+
+def test_scheduler_that_stops_ends_the_batch_and_keeps_results(tmp_path: Path, replayed: bytes) -> None:
+    logs = copies(tmp_path / "logs", "0.mcap", HELD, "1.mcap")
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    with cluster(tmp_path / "cluster") as (address, options, scheduler):
+        ca, cert, key = (Path(str(file)) for file in options[1::2])
+        settings = WorkerSettings(address, tls_ca=ca, tls_cert=cert, tls_key=key)
+
+        def stop() -> None:
+            wait_for(notes / "pid")
+            scheduler.kill()
+
+        stopper = threading.Thread(target=stop)
+        stopper.start()
+        with (
+            pytest.raises(IpsysError, match=r"was lost after [01] of 3 logs; .* repeat the command"),
+            open_workers(settings, len(logs)) as workers,
+        ):
+            list(run_batch(workers, BatchTask(replay_and_note, {"notes": notes}), logs))
+        stopper.join()
+    assert logs[0].read_bytes() == replayed
+    # The next call does what is missing.
+    assert [replay_log(log, models=("rigid",)).state for log in logs] == ["up to date", *["computed"] * 2]
+    assert [log.read_bytes() == replayed for log in logs] == [True] * 3

@@ -1,0 +1,213 @@
+"""The catalogue of a folder: its rows by another way, its updates, and its readers."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ipsys_log import api
+from ipsys_log.catalogue.table import update_catalogue
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.parquet_rows import Columns, read_rows, write_rows
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Event, Message
+from ipsys_log.messages.channels import EVALUATION, EVENTS_TOPIC
+from ipsys_log.runs.graph import VERSIONS
+from ipsys_log.runs.output import append_messages
+from tests.conftest import ROOT, Ipsys
+
+GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
+PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with an evaluated log, a log without runs of models, and a broken one."""
+    logs = tmp_path / "logs"
+    (logs / "2026").mkdir(parents=True)
+    shutil.copy(GOLDEN, logs / "2026" / "golden.mcap")
+    shutil.copy(PAPER_LAB, logs / "paper.mcap")
+    (logs / "broken.mcap").write_bytes(GOLDEN.read_bytes()[:50_000])
+    return logs
+
+
+def rows_of(path: Path) -> dict[str, dict[str, Any]]:
+    rows: list[Any] = pd.read_parquet(path).to_dict("records")
+    return {row["log"]: row for row in rows}
+
+
+def test_row_has_the_contents_of_its_log(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
+    target = tmp_path / "catalogue.parquet"
+    update = update_catalogue(folder, target)
+    assert (update.logs, update.read, set(update.errors)) == (3, 3, {"broken.mcap"})
+    row = rows_of(target)["2026/golden.mcap"]
+    info = json.loads(ipsys("info", GOLDEN, "--json").out)
+    assert row["duration_s"] == info["duration_s"]
+    assert row["start_utc"].isoformat(" ").startswith(info["start"])
+    cameras = {camera["camera"]: camera for camera in row["cameras"]}
+    for name, camera in info["cameras"].items():
+        channel = info["channels"][camera["images"]]
+        found = [cameras[name][key] for key in ("images", "gaps", "calibrated")]
+        assert found == [channel["messages"], channel["gaps"], camera["calibration"] is not None]
+    states = [
+        (one["run"], one["stage"], one["state"]) for one in json.loads(ipsys("runs", GOLDEN, "--json").out)
+    ]
+    assert [(one["run"], one["stage"], one["state"]) for one in row["runs"]] == states
+    assert {one["ipsys"] for one in row["runs"]} == {"0.1.0"}
+    means = {
+        (one["model"], one["camera"], one["scheme"], one["dimensions"]): one["mean_m"]
+        for one in row["evaluations"]
+        if one["against"] == "tape"
+    }
+    with Session([GOLDEN]) as session:
+        for run in session.run_names():
+            for evaluation in session.payloads(session.topics(EVALUATION, run)):
+                assert evaluation.model in row["models"]
+                for one in evaluation.cameras:
+                    key = evaluation.model, one.camera, one.scheme or "held_out", "2d"
+                    assert one.against != "tape" or means[key] == one.error_2d.mean_m
+
+
+def test_broken_log_is_a_row_with_its_error(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
+    done = ipsys("catalogue", folder, "-o", tmp_path / "c.parquet")
+    assert done.code == 0
+    assert "3 logs, 3 read" in done.out
+    row = rows_of(tmp_path / "c.parquet")["broken.mcap"]
+    assert row["error"].startswith("has no end")
+    assert f"broken.mcap: {row['error']}" in done.out
+    assert pd.isna(row["start_utc"])
+    assert row["bytes"] == 50_000
+
+
+def test_only_new_and_changed_logs_are_read(folder: Path, tmp_path: Path) -> None:
+    target = tmp_path / "catalogue.parquet"
+    update_catalogue(folder, target)
+    first = target.read_bytes()
+    assert update_catalogue(folder, target).read == 0
+    assert target.read_bytes() == first
+    # A log with another event, a new log, and a deleted one.
+    with Session([folder / "paper.mcap"]) as session:
+        end_ns = session.end_ns + 1
+    event = Event(end_ns, "camera_moved", "camera red has moved", "red")
+    append_messages(folder / "paper.mcap", [Message(EVENTS_TOPIC, end_ns, end_ns, event)])
+    shutil.copy(GOLDEN, folder / "new.mcap")
+    (folder / "broken.mcap").unlink()
+    update = update_catalogue(folder, target)
+    assert (update.logs, update.read, update.removed, dict(update.errors)) == (3, 2, 1, {})
+    rows = rows_of(target)
+    assert {"kind": "camera_moved", "camera": "red", "count": 1} in [*rows["paper.mcap"]["events"]]
+    # An update gives the same rows as a new catalogue.
+    update_catalogue(folder, tmp_path / "again.parquet")
+    assert target.read_bytes() == (tmp_path / "again.parquet").read_bytes()
+
+
+@pytest.mark.slow
+def test_newer_stages_change_the_states_in_a_catalogue(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def outdated() -> tuple[list[str], str]:
+        row = rows_of(tmp_path / "catalogue.parquet")["2026/golden.mcap"]
+        return list(row["outdated_runs"]), ", ".join(one["state"] for one in row["runs"])
+
+    update_catalogue(folder, tmp_path / "catalogue.parquet")
+    # The golden log is of an earlier version.
+    assert outdated()[0] == ["best", "poly", "rigid"]
+    assert "this is rigid 99" not in outdated()[1]
+    monkeypatch.setitem(VERSIONS, "rigid", 99)
+    assert update_catalogue(folder, tmp_path / "catalogue.parquet").read == 3
+    assert "this is rigid 99" in outdated()[1]
+
+
+@pytest.mark.slow
+def test_duckdb_and_pandas_answer_the_same_question(folder: Path, tmp_path: Path) -> None:
+    """Compare the errors of models over all logs, as the page about the catalogue does."""
+    import duckdb  # late: it complains at the end about objects that the garbage collection has exempted
+
+    target = tmp_path / "catalogue.parquet"
+    update_catalogue(folder, target)
+    ask: Any = duckdb.sql
+    found = ask(
+        "SELECT e.model, avg(e.mean_m) FROM (SELECT unnest(evaluations) AS e FROM read_parquet("
+        f"'{target}')) WHERE e.dimensions = '2d' AND e.scheme = 'held_out' GROUP BY e.model ORDER BY e.model"
+    ).fetchall()
+    table = pd.read_parquet(target).explode("evaluations").dropna(subset="evaluations")
+    rows = pd.DataFrame(table["evaluations"].tolist())
+    wanted = rows[(rows.dimensions == "2d") & (rows.scheme == "held_out")].groupby("model").mean_m.mean()
+    assert [name for name, _ in found] == [*wanted.index]
+    assert len(found) >= 2
+    np.testing.assert_allclose([mean for _, mean in found], wanted)
+
+
+def test_questions_of_the_documentation_have_answers(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import duckdb
+
+    ask: Any = duckdb.sql
+    monkeypatch.chdir(tmp_path)
+    update_catalogue(folder, tmp_path / "catalogue.parquet")
+    page = (ROOT / "docs" / "batch.md").read_text(encoding="utf-8")
+    questions = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
+    errors, drift, outdated, _ = [ask(question).fetchall() for question in questions]
+    assert {model for _, model, *_ in errors} == {"rigid", "poly", "best"}
+    assert drift == []  # no baseline
+    assert [(log, made_by) for log, _, made_by in outdated] == [("2026/golden.mcap", ["0.1.0"])]
+    pandas = page.rpartition("```python\n")[2].partition("```")[0]
+    exec(pandas, {})
+
+
+def test_file_of_another_kind_is_not_overwritten(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
+    target = tmp_path / "notes.parquet"
+    target.write_text("notes of a year")
+    done = ipsys("catalogue", folder, "-o", target)
+    assert done.code == 1
+    assert f"{target}: cannot be read as a Parquet file" in done.err
+    assert target.read_text() == "notes of a year"
+    write_rows(target, [{"robot": "ada"}], {"robot": "string"})
+    done = ipsys("catalogue", folder, "-o", target)
+    assert (done.code, "is not a catalogue" in done.err) == (1, True)
+    assert pd.read_parquet(target)["robot"].tolist() == ["ada"]
+    done = ipsys("catalogue", folder, "-o", tmp_path / "c.csv")
+    assert (done.code, "a catalogue ends in .parquet" in done.err) == (1, True)
+    with pytest.raises(IpsysError, match="is not a folder"):
+        update_catalogue(GOLDEN, tmp_path / "c.parquet")
+
+
+def test_rows_of_parquet_come_back(tmp_path: Path) -> None:
+    columns: Columns = {
+        "name": "string",
+        "at": "time",
+        "sizes": {"n": "int64", "share": "float64"},
+        "tags": "list<string>",
+    }
+    rows: list[dict[str, Any]] = [
+        {"name": "a", "at": 1_700_000_000_000_001_000, "sizes": [{"n": 1, "share": 0.5}], "tags": ["x", "y"]},
+        {"name": None, "at": None, "sizes": None, "tags": []},
+    ]
+    write_rows(tmp_path / "rows.parquet", rows, columns, "mark")
+    assert read_rows(tmp_path / "rows.parquet") == ("mark", rows)
+
+
+@pytest.mark.slow
+def test_outdated_runs_are_replayed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ipsys_log.batch.tasks import replay_log
+
+    log = Path(shutil.copy(PAPER_LAB, tmp_path / "log.mcap"))
+    options: dict[str, Any] = {"outdated": True, "models": ("rigid",)}
+    api.replay(log, models=("rigid",))
+    before = log.read_bytes()
+    assert replay_log(log, **options).state == "not outdated"
+    assert log.read_bytes() == before
+    monkeypatch.setitem(VERSIONS, "rigid", 2)
+    result = replay_log(log, **options)
+    assert (result.state, result.runs) == ("computed", ("rigid_2",))
+    assert "run rigid is out of date" in result.text
+    # The old run is superseded: nothing is left to do.
+    assert replay_log(log, **options).state == "not outdated"

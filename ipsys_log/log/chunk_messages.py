@@ -243,11 +243,15 @@ def open_chunk(
     topics: Mapping[int, str],
     span: tuple[int, int],
     is_checked: bool = False,
+    next_chunk: ChunkRef | None = None,
 ) -> Cursor:
     """Return a cursor over the messages of the channels in `topics` with start <= log time <= end.
 
-    With `is_checked`, the chunk is read as a whole, and its CRC is checked.
+    With `is_checked`, the chunk is read as a whole, and its CRC is checked. `next_chunk` is the chunk to be
+    read from the disk meanwhile.
     """
+    if next_chunk is not None:
+        view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
     offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
     packed = chunk.compressed_size
     check_compression(view, name)

@@ -2,6 +2,7 @@
 
 import zlib
 from collections.abc import Callable, Mapping
+from itertools import zip_longest
 
 import numpy as np
 from mcap import records as mcap
@@ -46,7 +47,10 @@ def copy_messages(
         A chunk is damaged, or the new log has one of the topics with another schema.
     """
     view, contents = reader.view, reader.contents
-    for chunk in sorted(contents.chunks, key=lambda chunk: chunk.offset):
+    chunks = sorted(contents.chunks, key=lambda chunk: chunk.offset)
+    for chunk, next_chunk in zip_longest(chunks, chunks[1:]):
+        if next_chunk is not None:
+            view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
         copy_chunk(reader, writer, chunk, choose)
         advance(chunk.end)
     unchunked = _kept_rows(contents, to_rows(contents.unchunked), choose)

@@ -4,9 +4,10 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -34,7 +35,7 @@ from ipsys_log.log.journal import attach_journal
 from ipsys_log.log.known_contents import contents_of
 from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
-from ipsys_log.log.records import HEADER, parse, walk
+from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
 from ipsys_log.log.summary import NoFooterError
 
 __all__ = ["LogReader", "stored_hashes"]
@@ -163,7 +164,7 @@ class LogReader:
         without
             Offsets of chunks that are left out.
         is_checked
-            Read each chunk as a whole, and check its CRC.
+            Read each chunk as a whole, and check its CRC. The next chunk is read from the disk meanwhile.
 
         Raises
         ------
@@ -173,12 +174,8 @@ class LogReader:
         contents, view = self._contents, self._view
         wanted = self._topics_by_id(topics)
         span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
-        pending = [
-            PendingChunk(
-                chunk.start_ns,
-                chunk.offset,
-                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
-            )
+        chunks = [
+            chunk
             for chunk in contents.chunks
             if chunk.start_ns <= span[1]
             and chunk.end_ns >= span[0]
@@ -187,11 +184,29 @@ class LogReader:
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
+        next_chunks = self._next_chunks(chunks) if is_checked else {}
+        pending = [
+            PendingChunk(
+                chunk.start_ns,
+                chunk.offset,
+                partial(
+                    open_chunk,
+                    *(view, self._cache, chunk, wanted, span, is_checked, next_chunks.get(chunk.offset)),
+                ),
+            )
+            for chunk in chunks
+        ]
         if contents.unchunked:
             entries = to_rows(contents.unchunked)
             unchunked = partial(open_unchunked, view, self._cache, entries, wanted, span, contents.data_end)
             pending.append(PendingChunk(0, 0, unchunked))
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
+
+    @staticmethod
+    def _next_chunks(chunks: Sequence[ChunkRef]) -> dict[int, ChunkRef]:
+        """Return the chunk that is read after each chunk, by its offset."""
+        ordered = sorted(chunks, key=lambda chunk: (chunk.start_ns, chunk.offset))
+        return {before.offset: chunk for before, chunk in pairwise(ordered)}
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""

@@ -14,7 +14,7 @@ from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE
 
-__all__ = ["draw_latency"]
+__all__ = ["draw_latency", "draw_shares", "draw_steps"]
 
 _STEPS = ("detected", "located", "fused", "published")
 _NEAR, _FAR = "#0072B2", "#D3D7DB"
@@ -36,13 +36,14 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
     left = figure.add_axes((0.07, 0.11, 0.42, 0.73))
     right = figure.add_axes((0.6, 0.11, 0.37, 0.73))
     total_ms = np.sort(times_s["total"]) * 1e3
-    _draw_shares(left, total_ms)
-    _draw_steps(right, times_s)
+    draw_shares(left, total_ms)
+    draw_steps(right, times_s)
     figure.text(0.07, 0.94, f"Latency of {len(total_ms)} positions", fontsize=12)
     write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 
-def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
+def draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
+    """Draw the share of positions within a latency; ``total_ms`` (n,) is in ascending order."""
     share = 100 * np.arange(1, len(total_ms) + 1) / len(total_ms)
     axes.step(
         total_ms, share, where="post", color="black", label=f"all positions; longest {total_ms[-1]:.1f} ms"
@@ -60,7 +61,8 @@ def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
     _key(axes)
 
 
-def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
+def draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
+    """Draw the median and the 99th percentile of the duration of each step."""
     rows = np.arange(len(_STEPS))
     steps_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _STEPS]) * 1e3
     axes.barh(rows, steps_ms[:, 1], color=_FAR, label="99 % of positions")

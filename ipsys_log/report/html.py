@@ -16,6 +16,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, POSITIONS, TRACKS
+from ipsys_log.models.table import CORNER_MODELS, MODELS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
@@ -26,6 +27,7 @@ from ipsys_log.report.overlap_figure import overlap_pictures
 from ipsys_log.report.trajectory_table import TRAJECTORY_COLUMNS, rows_of_run
 from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.select import has_corners
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
@@ -133,10 +135,12 @@ def _tracks(session: Session) -> dict[str, Any]:
 def _commands(session: Session, findings: Findings) -> dict[str, str]:
     """Return the commands that print or draw the content of the sections, by name."""
     logs = " ".join(shlex.quote(path.name) for path in session.paths)
-    models = "".join(f" --model {shlex.quote(model)}" for model in findings.models)
+    usual = {*MODELS, *(CORNER_MODELS if has_corners(session) else ())}
+    named = () if usual == {*findings.models} else findings.models
+    models = "".join(f" --model {shlex.quote(model)}" for model in named)
     return {
         "report": f"ipsys report {logs}",
-        "evaluate": f"ipsys evaluate {logs}{models}",
+        "evaluate": f"ipsys evaluate {logs}{models} --details",
         "plots": f"ipsys evaluate {logs}{models} --plots figures",
         "tracks": f"ipsys view {logs}",
         "info": f"ipsys info {logs}",

@@ -115,14 +115,15 @@ def _timeline(
 
 
 def _draw_recorded(axes: Axes, row: int, camera: CameraRecording, start_ns: int, colour: str) -> None:
+    gaps = zip(camera.gaps.starts_ns, camera.gaps.lengths_s, strict=True)
+    begins_ns = [camera.start_ns, *(gap_ns + round(length_s * NS_PER_S) for gap_ns, length_s in gaps)]
     ends_ns = [*camera.gaps.starts_ns, camera.end_ns]
-    lengths_ns = [round(length_s * NS_PER_S) for length_s in camera.gaps.lengths_s]
-    begins_ns = [camera.start_ns, *np.add(camera.gaps.starts_ns, lengths_ns, dtype=np.int64).tolist()]
     bars_s = [
         ((begin_ns - start_ns) / NS_PER_S, (end_ns - begin_ns) / NS_PER_S)
         for begin_ns, end_ns in zip(begins_ns, ends_ns, strict=True)
     ]
-    axes.broken_barh(bars_s, (row - 0.25, 0.5), color=colour, alpha=0.65, lw=0)
+    # The edge keeps a single frame visible, whose bar has no width.
+    axes.broken_barh(bars_s, (row - 0.25, 0.5), fc=colour, ec=colour, lw=1.0)
 
 
 def _latency(session: Session) -> dict[str, Any]:
@@ -131,9 +132,9 @@ def _latency(session: Session) -> dict[str, Any]:
     times_s = step_times_s(entries) if entries else {}
     if not entries:
         return {"latency": [], "latency_count": 0, "latency_pictures": []}
-    shares, axes = new_figure(3.2)
-    draw_shares(axes, np.sort(times_s["total"]) * _MS_PER_S)
-    steps, step_axes = new_figure(3.2)
+    shares, axes = new_figure(3.4)
+    draw_shares(axes, np.sort(times_s["total"]) * _MS_PER_S, is_narrow=True)
+    steps, step_axes = new_figure(3.4)
     draw_steps(step_axes, times_s)
     return {
         "latency": [_latency_row(step, one) for step, one in latency_percentiles(times_s).items()],

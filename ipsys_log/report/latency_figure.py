@@ -42,8 +42,14 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
     write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 
-def draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
-    """Draw the share of positions within a latency; ``total_ms`` (n,) is in ascending order."""
+def draw_shares(axes: Axes, total_ms: NDArray[np.float64], is_narrow: bool = False) -> None:
+    """Draw the share of positions within a latency.
+
+    Parameters
+    ----------
+    total_ms : (n,), latencies in ascending order.
+    is_narrow : the figure is as wide as a phone; the legend gets a line for each entry.
+    """
     share = 100 * np.arange(1, len(total_ms) + 1) / len(total_ms)
     axes.step(
         total_ms, share, where="post", color="black", label=f"all positions; longest {total_ms[-1]:.1f} ms"
@@ -52,13 +58,13 @@ def draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
     for name, value_ms, dashes in (("median", median_ms, "--"), ("99 %", far_ms, ":")):
         axes.axvline(value_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {value_ms:.1f} ms")
     axes.set(
-        xlabel="latency in ms, from the arrival of a frame to its position",
+        xlabel="latency in ms" if is_narrow else "latency in ms, from the arrival of a frame to its position",
         ylabel="positions in %",
         ylim=(0, 101),
     )
     axes.set_xlim(0, min(float(total_ms[-1]) * 1.05, _SHOWN * far_ms))
     style_axes(axes)
-    _key(axes)
+    _key(axes, 1 if is_narrow else 3)
 
 
 def draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
@@ -78,6 +84,6 @@ def draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
     _key(axes)
 
 
-def _key(axes: Axes) -> None:
+def _key(axes: Axes, columns: int = 3) -> None:
     """Draw the legend above the axes, outside of the data."""
-    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9, frameon=False)
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=9, frameon=False)

@@ -11,7 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ipsys_log.analysis.trajectory_errors import ErrorSummary
+from ipsys_log.analysis.ground_truth import gather_paths
+from ipsys_log.analysis.trajectory_errors import ErrorSummary, trajectory_errors
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
@@ -213,17 +214,18 @@ class Log:
             The log has no tracks or no ground truth, or pandas is not installed.
         """
         from ipsys_log.exchange.data_frames import import_pandas
-        from ipsys_log.report.accuracy import read_trajectories
 
         pandas = import_pandas()
         name = self._run_of(TRACKS, run)
         assert name is not None  # tracks are a derived channel
         if not self._session.count(TRUTH.topic):
             raise IpsysError(f"{self._session}: has no ground truth; import one: ipsys import truth")
+        paths = gather_paths(self._session.messages(self._session.topics(TRACKS, name)))
+        true = gather_paths(self._session.messages([TRUTH.topic]))
         rows = []
-        for one in read_trajectories(self._session, name):
-            errors = [("ATE 3D", None, one.absolute_3d), ("ATE 2D", None, one.absolute_2d)]
-            errors += [("RPE", f"{rpe.delta:g} {rpe.unit}", rpe.summary) for rpe in one.relative]
+        for one in trajectory_errors(paths, true):
+            relative = [("RPE", f"{rpe.delta:g} {rpe.unit}", rpe.summary) for rpe in one.relative]
+            errors = [("ATE 3D", None, one.absolute_3d), ("ATE 2D", None, one.absolute_2d), *relative]
             rows += [
                 {"robot": one.robot, "metric": metric, "delta": delta, **asdict(summary)}
                 for metric, delta, summary in errors

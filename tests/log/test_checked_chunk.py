@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -44,7 +45,7 @@ def test_long_image_shifts_like_a_parsed_one(time_ns: int, offset_ns: int, frame
         with pytest.raises(LogError, match="another offset"):
             shift_times(IMAGE, data, offset_ns)
         return
-    proto = proto_class(IMAGE).FromString(data)
+    proto: Any = proto_class(IMAGE).FromString(data)
     proto.timestamp.seconds, proto.timestamp.nanos = divmod(time_ns + offset_ns, NS_PER_S)
     shifted = shift_times(IMAGE, data, offset_ns)
     assert shifted == proto.SerializeToString(deterministic=True)
@@ -63,6 +64,6 @@ def test_long_message_of_another_program_shifts(tail: bytes, is_valid: bool) -> 
         with pytest.raises(LogError, match="not a valid"):
             shift_times(IMAGE, data, NS_PER_S)
         return
-    expected = proto_class(IMAGE).FromString(data)
+    expected: Any = proto_class(IMAGE).FromString(data)
     expected.timestamp.seconds += 1
     assert proto_class(IMAGE).FromString(shift_times(IMAGE, data, NS_PER_S)) == expected

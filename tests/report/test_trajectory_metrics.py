@@ -110,7 +110,7 @@ def test_api_has_ate_and_rpe_as_evo_computes_them(log: Path, tmp_path: Path) -> 
         for name in ("rmse", "mean", "median", "std", "max"):
             assert row[f"{name}_m"] == pytest.approx(metric.get_all_statistics()[name], abs=1e-6), name
         assert row["p95_m"] == pytest.approx(np.percentile(metric.error, 95), abs=1e-6)
-        assert own.loc["RPE", "delta"].tolist() == ["1 m", "1 s"]
+        assert own[own.index == "RPE"]["delta"].tolist() == ["1 m", "1 s"]
 
 
 def test_pairs_skip_gaps_and_take_the_start_of_a_stop() -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages.channels import CHANNELS, MARKERS, TRACKS, Channel
+from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, MARKERS, TRACKS, Channel
 from ipsys_log.runs.options import Progress
 
 __all__ = [
@@ -201,4 +201,6 @@ def channel_of_table(name: str) -> Channel:
 
     if name not in TABLES:
         raise IpsysError(f"table {name!r} is not known; use one of {', '.join(TABLES)}")
+    if name == "pairs":  # camera points, each with the measurement of its point
+        return CAMERA_POINTS
     return next(channel for channel in CHANNELS if channel.name == name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from html import escape
 from os import PathLike
@@ -10,12 +11,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+from ipsys_log.analysis.ground_truth import gather_paths
+from ipsys_log.analysis.trajectory_errors import ErrorSummary, trajectory_errors
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation, LogUrl, find_logs, is_one_of
 from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.messages import Message
-from ipsys_log.messages.channels import CHANNELS, Channel
+from ipsys_log.messages.channels import CHANNELS, TRACKS, TRUTH, Channel
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
     from ipsys_log.soundness.finding import LogCheck
 
 __all__ = ["Export", "Listing", "Log", "StrPath", "Time"]
+
+_TRAJECTORY = ("robot", "metric", "delta")
 
 StrPath = str | PathLike[str]
 Time = int | datetime
@@ -179,8 +184,8 @@ class Log:
 
         Parameters
         ----------
-        name : ``markers``, ``camera_points``, ``positions``, ``tracks``, ``truth``, ``measurements``,
-            ``events`` or ``latency``.
+        name : ``markers``, ``camera_points``, ``pairs``, ``positions``, ``tracks``, ``truth``,
+            ``measurements``, ``events`` or ``latency``.
         run : the run of a derived channel; None: the newest complete one; several: a column ``run`` names it.
         start, end : as for :meth:`messages`.
 
@@ -194,6 +199,43 @@ class Log:
         wanted = [run] if run is None or isinstance(run, str) else list(run)
         runs = [self._run_of(channel_of_table(name), one) for one in wanted]
         return read_table(self._session, name, runs, _ns(start), _ns(end))
+
+    def trajectory_errors(self, run: str | None = None) -> pd.DataFrame:
+        """Return the errors of tracks against the ground truth of the log, by the definitions of evo.
+
+        A row has a robot and a metric: the absolute trajectory error (``ATE 3D`` and ``ATE 2D``), without an
+        alignment, or the relative pose error (``RPE``) over a distance or a time, its ``delta``. The columns
+        are the number of poses or pairs, and RMSE, mean, median, standard deviation, maximum and 95th
+        percentile in m.
+
+        Parameters
+        ----------
+        run : a run with tracks; None: the newest complete one.
+
+        Raises
+        ------
+        IpsysError
+            The log has no tracks or no ground truth, or pandas is not installed.
+        """
+        from ipsys_log.exchange.data_frames import import_pandas
+
+        pandas = import_pandas()
+        name = self._run_of(TRACKS, run)
+        assert name is not None  # tracks are a derived channel
+        if not self._session.count(TRUTH.topic):
+            raise IpsysError(f"{self._session}: has no ground truth; import one: ipsys import truth")
+        paths = gather_paths(self._session.messages(self._session.topics(TRACKS, name)))
+        true = gather_paths(self._session.messages([TRUTH.topic]))
+        rows = []
+        for one in trajectory_errors(paths, true):
+            relative = [("RPE", f"{rpe.delta:g} {rpe.unit}", rpe.summary) for rpe in one.relative]
+            errors = [("ATE 3D", None, one.absolute_3d), ("ATE 2D", None, one.absolute_2d), *relative]
+            rows += [
+                {"robot": one.robot, "metric": metric, "delta": delta, **asdict(summary)}
+                for metric, delta, summary in errors
+            ]
+        table: pd.DataFrame = pandas.DataFrame(rows, columns=[*_TRAJECTORY, *ErrorSummary.__slots__])
+        return table
 
     def export(
         self,

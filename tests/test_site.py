@@ -27,7 +27,8 @@ from tests.site_pages import (
 from tests.test_words import _SOURCES, texts
 
 PAGES: list[Path] = staging["pages"]()
-MADE = {"docs/api-reference.md", "docs/tutorial.md", "schemas/ipsys/v1/README.md"}
+NOTEBOOKS = {f"docs/{path.stem}.md" for path in (ROOT / "docs").glob("*.ipynb")}
+MADE = {"docs/api-reference.md", "schemas/ipsys/v1/README.md", *NOTEBOOKS}
 _GITHUB = MarkdownIt("commonmark").enable("table")
 # Elements whose number shows a list, table or block of code that Python-Markdown reads in another way.
 _ELEMENTS = ("h1", "h2", "h3", "ol", "ul", "li", "table", "tr", "pre", "img")

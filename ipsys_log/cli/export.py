@@ -43,7 +43,7 @@ def export(
         str,
         typer.Option(
             metavar="NAME",
-            help="tracks, positions, markers, camera_points, measurements, events, latency or truth.",
+            help="tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
         ),
     ] = "tracks",
     run: Annotated[

@@ -1,4 +1,4 @@
-"""Import of other data into a log: ``ipsys import imsel``, ``images``, ``videos``, ``ros`` and ``truth``."""
+"""Import of other data into a log: recordings, tables, and the ground truth of another system."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ def add_commands(app: typer.Typer) -> None:
     group.command("videos")(videos)
     group.command("ros")(ros)
     group.command("truth")(truth)
+    group.command("detections")(detections)
+    group.command("pairs")(pairs)
     app.add_typer(group, name="import")
 
 
@@ -207,6 +209,69 @@ def truth(
         for line in truth_lines(imported):
             console.print(line)
     remarks.print(f"results are in {imported.path}", markup=False)
+
+
+def detections(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A CSV table of markers, one row for each marker.")
+    ],
+    into: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="A log without images, which gets a new run.")
+    ] = None,
+    output: Annotated[
+        Path | None, log_option(help="A new log for the markers. Without --into, it needs --rig.")
+    ] = None,
+    run: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name of the new run. Default: imported.")
+    ] = None,
+    rig: RigFile = None,
+    calibration: Calibrations = None,
+) -> None:
+    """Import the detected markers of another program, for all stages after the detection.
+
+    The columns are time, camera, marker_id, and x0_px, y0_px to x3_px, y3_px of the corners, clockwise from
+    the top left of the marker. ipsys export --table markers writes such a table.
+    """
+    from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.exchange.detection_tables import DetectionOptions, import_detections
+    from ipsys_log.rig.file import load_rig
+
+    _refuse_log(file)
+    lab = load_rig(rig) if rig else None
+    cameras = [camera.name for camera in lab.cameras] if lab else []
+    lenses = load_calibrations(calibration, lambda: cameras)
+    imported = import_detections(file, into, output, DetectionOptions(lab, lenses, run))
+    text = ", ".join(f"{count} of {camera}" for camera, count in imported.markers.items())
+    console.print(f"run {imported.run}: markers: {text}")
+    remarks.print(f"results are in {imported.path}", markup=False)
+
+
+def pairs(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="A CSV table, one row for each camera that saw a calibration point."
+        ),
+    ],
+    output: NewLog,
+    rig: Annotated[Path, typer.Option("--rig", metavar="FILE", help="The rig file (lab.toml) of the lab.")],
+) -> None:
+    """Import calibration points with their camera points, for fit, evaluate and plan.
+
+    The columns are id, camera, xc_m, yc_m, zc_m in camera coordinates, and xw_m, yw_m, zw_m in the lab.
+    Optional columns are marker_id, splits and calibration_point. ipsys export --table pairs writes such a
+    table.
+    """
+    from ipsys_log.exchange.pair_tables import pair_messages, read_pairs
+    from ipsys_log.rig.file import load_rig
+    from ipsys_log.runs.output import write_log
+
+    _refuse_log(file)
+    lab = load_rig(rig)
+    table = read_pairs(file, lab)
+    write_log(output, pair_messages(table, file, lab))
+    text = ", ".join(f"{count} of {camera}" for camera, count in table.cameras.items())
+    console.print(f"{output} written: calibration points: {len(table.points)} (seen: {text})")
 
 
 def _truth_options(

@@ -188,11 +188,30 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
     check_file(target, "--html", [*logs, *([output] if output else [])])
     if _report_robots(logs, target):
         return
+    if _report_recording(logs, target):
+        return
     from ipsys_log.report.html import render_report
 
     with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
         write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
     console.print(f"{target} written: open it in a browser", markup=False)
+
+
+def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
+    """Write the page of a session without calibration points; return False if the logs have some."""
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import MEASUREMENTS
+    from ipsys_log.report.files import write_files
+    from ipsys_log.report.html import render_report
+
+    with Session(logs) as session:
+        if session.topics(MEASUREMENTS):
+            return False
+        page = render_report(session, ())
+    write_files(target.parent, {target.name: page.encode()})
+    console.print(f"{target} written: open it in a browser", markup=False)
+    remarks.print("the session has no calibration points: the page shows the recording and its runs")
+    return True
 
 
 def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:

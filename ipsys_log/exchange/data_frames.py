@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.codec import schema_name
@@ -22,6 +23,7 @@ from ipsys_log.messages import (
     Markers,
     Measurement,
     Message,
+    Pair,
     Positions,
     Tracks,
     WheelCommand,
@@ -34,6 +36,7 @@ from ipsys_log.messages.channels import (
     MARKERS,
     MEASUREMENTS,
     POSITIONS,
+    RIG,
     SMOOTHED_TRACKS,
     TRACKS,
     TRUTH,
@@ -82,7 +85,7 @@ _ITEMS = {
     "smoothed_tracks": _Table(SMOOTHED_TRACKS, Tracks, _TRACK),
     "truth": _Table(TRUTH, Tracks, ("robot", *_POINT)),
 }
-TABLES = (*_ITEMS, "measurements", "events", "latency", "commands")
+TABLES = (*_ITEMS, "measurements", "events", "latency", "commands", "pairs")
 
 
 def import_pandas() -> Any:
@@ -162,9 +165,12 @@ def _read_run(
         parts = list(_item_parts(session, _ITEMS[name], run, start_ns, end_ns))
         joined = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
         return _typed(pd, pd.DataFrame(joined, copy=False))
-    channel, row = _ROWS[name]
-    messages = session.messages(session.topics(channel), start_ns, end_ns)
-    rows = [_times(message) | row(message) for message in messages]
+    if name == "pairs":
+        rows = list(_pair_rows(session, run, start_ns, end_ns))
+    else:
+        channel, row = _ROWS[name]
+        messages = session.messages(session.topics(channel), start_ns, end_ns)
+        rows = [_times(message) | row(message) for message in messages]
     return _typed(pd, pd.DataFrame(rows, columns=_COLUMNS[name]))
 
 
@@ -319,6 +325,34 @@ def _command(message: Message) -> dict[str, Any]:
     return {name: getattr(command, name) for name in names}
 
 
+def _pair_rows(
+    session: Session, run: str | None, start_ns: int | None, end_ns: int | None
+) -> Iterator[dict[str, Any]]:
+    """Yield the calibration points of each camera; the range applies to the log times of measurements."""
+    sightings = gather_sightings(session.messages(session.topics(CAMERA_POINTS, run)))
+    messages = [*session.messages([*session.topics(RIG), *session.topics(MEASUREMENTS)])]
+    entered = {
+        message.payload.id: message for message in messages if isinstance(message.payload, Measurement)
+    }
+    for camera, pairs in build_pairs(sightings, valid_measurements(messages, None)).items():
+        for pair in pairs:
+            message = entered[pair.measurement]
+            if (start_ns or 0) <= message.log_time_ns and (end_ns is None or message.log_time_ns < end_ns):
+                yield _times(message) | {"camera": camera} | _pair(pair, message.payload)
+
+
+def _pair(pair: Pair, measurement: Measurement) -> dict[str, Any]:
+    return {
+        "id": pair.measurement,
+        "marker_id": pair.marker_id,
+        **dict(zip(("xc_m", "yc_m", "zc_m"), pair.camera_m.tolist(), strict=True)),
+        **dict(zip(("xw_m", "yw_m", "zw_m"), pair.world_m.tolist(), strict=True)),
+        "frames": pair.frames,
+        "splits": measurement.splits,
+        "calibration_point": pair.calibration_point,
+    }
+
+
 _ROWS: Mapping[str, tuple[Channel, Callable[[Message], dict[str, Any]]]] = {
     "measurements": (MEASUREMENTS, _measurement),
     "events": (EVENTS, _event),
@@ -330,6 +364,10 @@ _COLUMNS = {
         *("time", "log_time_ns", "id", "marker_id", "side", "height_m", "x_m", "y_m", "z_m"),
         *("still_start", "still_end", "distances_m", "splits", "withdraws"),
         *("readmits", "reason"),
+    ],
+    "pairs": [
+        *("time", "log_time_ns", "camera", "id", "marker_id", "xc_m", "yc_m", "zc_m"),
+        *("xw_m", "yw_m", "zw_m", "frames", "splits", "calibration_point"),
     ],
     "events": ["time", "log_time_ns", "kind", "camera", "marker_id", "text"],
     "latency": ["time", "log_time_ns", "camera", "received", "detected", "located", "fused", "published"],

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.csv_rows import open_as_text, parse_number, read_cells
 from ipsys_log.exchange.image_folders import parse_time
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
@@ -136,18 +135,8 @@ def _read_rows(path: Path, units: TruthUnits) -> list[_Row]:
     read = {".csv": _csv_rows, ".tum": _tum_rows, ".txt": _tum_rows}.get(suffix)
     if read is None:
         raise IpsysError(f"{path}: the format is not known; use a .csv table or a .tum trajectory")
-    with _readable(path):
+    with open_as_text(path):
         return list(read(path, units))
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise IpsysError(f"{path}: is not a text file with a table: {error}") from error
 
 
 def _paths_of(path: Path, rows: Sequence[_Row]) -> Iterator[TruthPath]:
@@ -202,21 +191,12 @@ class _Columns(NamedTuple):
 
 
 def _csv_rows(path: Path, units: TruthUnits) -> Iterator[_Row]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        table = csv.reader(file)
-        header = next(table, None)
-        if header is None:
-            raise IpsysError(f"{path}: is empty; export it again from the other system")
-        columns = _find_columns(path, header, units)
-        for cells in table:
-            where = f"{path}: line {table.line_num}"
-            if not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(header):
-                raise IpsysError(f"{where}: has {len(cells)} cells, but the header has {len(header)}")
-            if all(not cells[place].strip() for place in columns.axes):
-                continue  # the other system did not see the robot
-            yield _csv_row(cells, columns, where, table.line_num)
+    table = read_cells(path)
+    columns = _find_columns(path, next(table)[1], units)
+    for line, cells in table:
+        if all(not cells[place].strip() for place in columns.axes):
+            continue  # the other system did not see the robot
+        yield _csv_row(cells, columns, f"{path}: line {line}", line)
 
 
 def _csv_row(cells: Sequence[str], columns: _Columns, where: str, line: int) -> _Row:
@@ -307,13 +287,7 @@ def _forward_of(quaternion: Sequence[float], where: str) -> tuple[float, float, 
 
 
 def _number(text: str, where: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise IpsysError(f"{where}: {text.strip()[:40]!r} is not a number; leave a missing position empty")
-    return value
+    return parse_number(text, where, "leave a missing position empty")
 
 
 def _time_ns(text: str, tick_ns: int, where: str) -> int:

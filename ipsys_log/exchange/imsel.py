@@ -51,6 +51,7 @@ _NUMBERS = {
 }  # fmt: skip
 _CLASSES = range(6, 16)  # double to uint64; no cells, structures, objects or functions
 _LARGEST = 16 << 20  # bytes of one table
+_LARGEST_FILE = 64 << 20  # bytes of all tables of a file
 
 
 def read_mat(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -73,7 +74,7 @@ def read_mat(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _matrices(data: bytes) -> Iterator[bytes]:
-    offset = _HEAD
+    offset, unpacked = _HEAD, 0
     while offset < len(data):
         kind, size = _TAG.unpack_from(data, offset)
         body = data[offset + _TAG.size : offset + _TAG.size + size]
@@ -84,6 +85,9 @@ def _matrices(data: bytes) -> Iterator[bytes]:
             whole = zlib.decompressobj().decompress(body, _LARGEST)
             kind, size = _TAG.unpack_from(whole)
             body = whole[_TAG.size :]
+        unpacked += len(body)
+        if unpacked > _LARGEST_FILE:
+            raise ValueError("its tables are too large")
         if kind != _MATRIX or len(body) != size:
             raise ValueError("it has data other than tables")
         yield body

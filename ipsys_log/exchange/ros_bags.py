@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.exchange.bag_bounds import bound_reader, check_files, unpack_message
 from ipsys_log.geometry.lenses import check_calibration, same_intrinsics
 from ipsys_log.images.decode import RAW_ENCODINGS
 from ipsys_log.log.contents import parse_foreign_camera
@@ -147,16 +148,18 @@ def _rows(
     path: Path, reader: _Reader, connections: list[Connection]
 ) -> Iterator[tuple[str, int, CompressedImage | RawImage | CameraCalibration]]:
     """Yield topic, time and payload of the messages of some connections."""
+    is_packed = bound_reader(path, reader)
     decode = {connection.id: _decoder(path, reader, connection) for connection in connections}
     messages = reader.messages(connections) if connections else iter(())
     while True:
         with _faults(path):
             row = next(messages, None)
-        if row is None:
-            return
-        connection, time_ns, data = row
+            if row is None:
+                return
+            connection, time_ns, data = row
+            data = unpack_message(path, data) if is_packed else bytes(data)
         try:
-            payload = decode[connection.id](bytes(data))
+            payload = decode[connection.id](data)
         except LogError as error:
             raise IpsysError(f"{path}: {connection.topic} at {time_ns} ns: {error}") from error
         _check_image(payload, f"{path}: {connection.topic}")
@@ -201,8 +204,11 @@ def _open_bag(path: Path) -> Iterator[_Reader]:
         raise IpsysError(
             f"{path}: is not a bag of ROS 2: it has no metadata.yaml; run: ros2 bag reindex {path}"
         )
+    is_ros1 = path.suffix == ".bag"
     with _faults(path):
-        reader = Reader1(path) if path.suffix == ".bag" else Reader2(path)
+        if not is_ros1:
+            check_files(path)
+        reader = Reader1(path) if is_ros1 else Reader2(path)
         reader.open()
     try:
         yield reader
@@ -216,6 +222,8 @@ def _faults(path: Path) -> Iterator[None]:
     """Give the errors of the readers of rosbags one line. The block has only calls of these."""
     try:
         yield
+    except IpsysError:
+        raise
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror or error}") from error
     # The readers and their libraries raise about twenty types of errors, without a common class.

@@ -4,6 +4,7 @@ import os
 import stat
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -45,6 +46,10 @@ class LogBytes(Protocol):
 
     def plan(self, name: str, ranges: Iterable[tuple[int, int]]) -> None:
         """Announce ranges (start, end) that are going to be read, instead of those of the same name."""
+        ...
+
+    def prefetch(self, offset: int, length: int) -> None:
+        """Begin to read bytes that are going to be read, without waiting for them."""
         ...
 
     def fault(self, offset: int, reason: str) -> LogError: ...
@@ -102,6 +107,12 @@ class FileBytes:
 
     def plan(self, name: str, ranges: Iterable[tuple[int, int]]) -> None:
         """Do nothing: the operating system reads ahead."""
+
+    def prefetch(self, offset: int, length: int) -> None:
+        """Ask the operating system to read bytes from the disk in advance, without waiting for them."""
+        if hasattr(os, "posix_fadvise"):  # macOS lacks it
+            with suppress(OSError):
+                os.posix_fadvise(self.fd, offset, length, os.POSIX_FADV_WILLNEED)
 
     def _patched(self, offset: int, data: bytes) -> bytes:
         end = offset + len(data)

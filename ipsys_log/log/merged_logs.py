@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.checked_chunk import crc_of_changed
 from ipsys_log.log.contents import RawMessage
 from ipsys_log.log.part import copy_chunk
 from ipsys_log.log.reader import LogReader
@@ -62,15 +63,19 @@ class MergeSource:
         schemas = {topic: self.reader.channels[topic].schema for topic in wanted}
         names = {topic: schema.name if schema else "" for topic, schema in schemas.items()}
         for raw in self.reader.messages(wanted, without=without, is_checked=True):
-            data = bytes(raw.data)
+            data, crc = raw.data, raw.crc
             try:
                 if raw.topic in self.changes:
                     data = self.changes[raw.topic](data)
+                data = shift_times(names[raw.topic], data, self.offset_ns)
+                if crc is not None and data is not raw.data:
+                    crc = crc_of_changed(raw.data, crc, data)
                 yield RawMessage(
                     self.topics[raw.topic],
                     shift_time(raw.log_time_ns, self.offset_ns),
                     shift_time(raw.publish_time_ns, self.offset_ns),
-                    shift_times(names[raw.topic], data, self.offset_ns),
+                    data,
+                    crc,
                 )
             except LogError as error:
                 raise LogError(f"{self.reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error

@@ -1,7 +1,8 @@
 """Copies of parts of logs: whole chunks as they are, other messages one by one, in constant memory."""
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from itertools import zip_longest
 
 import numpy as np
 from mcap import records as mcap
@@ -10,12 +11,13 @@ from numpy.typing import NDArray
 
 from ipsys_log.log.bounds import chunk_excess
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.chunk_messages import Entries, Rows, chunk_entries, to_rows
+from ipsys_log.log.checked_chunk import Entries, Rows, check_messages, message_head, rows_by_offset
+from ipsys_log.log.chunk_messages import chunk_entries, to_rows
 from ipsys_log.log.chunks import unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import METADATA_NAME, Buffer, extend
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
+from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
 from ipsys_log.log.writer import LogWriter
 
 __all__ = ["Choose", "copy_chunk", "copy_messages", "copy_records"]
@@ -45,7 +47,10 @@ def copy_messages(
         A chunk is damaged, or the new log has one of the topics with another schema.
     """
     view, contents = reader.view, reader.contents
-    for chunk in sorted(contents.chunks, key=lambda chunk: chunk.offset):
+    chunks = sorted(contents.chunks, key=lambda chunk: chunk.offset)
+    for chunk, next_chunk in zip_longest(chunks, chunks[1:]):
+        if next_chunk is not None:
+            view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
         copy_chunk(reader, writer, chunk, choose)
         advance(chunk.end)
     unchunked = _kept_rows(contents, to_rows(contents.unchunked), choose)
@@ -130,13 +135,6 @@ def _adopt(contents: Contents, writer: LogWriter, key: int, is_distinct: bool = 
     return writer.adopt_channel(channel, contents.schemas.get(channel.schema_id), is_distinct)
 
 
-def _by_offset(entries: Mapping[int, Rows]) -> list[list[int]]:
-    """Return log time and offset of messages in the order of the file."""
-    rows = np.concatenate([*entries.values()])
-    ordered: list[list[int]] = rows[np.argsort(rows[:, 1], kind="stable")].tolist()
-    return ordered
-
-
 def _copy_rows(
     view: LogBytes,
     contents: Contents,
@@ -147,9 +145,9 @@ def _copy_rows(
 ) -> None:
     """Write messages one by one; ``read`` returns the bytes between two offsets."""
     topics = [contents.channels[key].topic for key in kept]
-    for time_ns, offset in _by_offset(kept):
+    for time_ns, offset in rows_by_offset(kept):
         head = read(offset, offset + MESSAGE_HEAD_SIZE)
-        opcode, length, key, _, log_ns, publish_ns = _message_head(view, head, 0, offset)
+        opcode, length, key, _, log_ns, publish_ns = message_head(view, head, 0, offset)
         if opcode != Opcode.MESSAGE or key not in kept or log_ns != time_ns:
             raise view.fault(offset, "a message index points to no message of its time")
         data = read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
@@ -159,12 +157,6 @@ def _copy_rows(
         if topics.count(topic) > 1:  # its channels differ in the version of their schema
             _adopt(contents, writer, key, is_distinct)
         writer.write(topic, log_ns, publish_ns, data)
-
-
-def _message_head(view: LogBytes, data: Buffer, position: int, offset: int) -> tuple[int, ...]:
-    if position + MESSAGE_HEAD_SIZE > len(data):
-        raise view.fault(offset, "a message reaches beyond the end of its chunk")
-    return MESSAGE.unpack_from(data, position)
 
 
 def _copy_chunk(
@@ -178,40 +170,14 @@ def _copy_chunk(
     whole = view.read(chunk.offset, chunk.length + chunk.index_length)
     start = head.data_offset - chunk.offset
     stored = memoryview(whole)[start : start + head.data_size]
-    data: Buffer = unpack(view, chunk.offset, head) if head.compression else stored
-    inside = _Inside(view, contents, chunk.offset, data)
-    rows = list(inside.rows(entries))
-    if head.crc and inside.crc != head.crc:
-        raise view.fault(chunk.offset, "the CRC of the chunk is wrong")
-    stored_crc = zlib.crc32(stored) if head.compression else inside.crc
+    data: Buffer = unpack(view, chunk.offset, head, False) if head.compression else stored
+    messages, data_crc = check_messages(view, chunk.offset, data, entries, head.crc)
+    rows = [
+        (contents.channels[key].topic, log_ns, publish_ns, end - start, own_crc)
+        for key, log_ns, publish_ns, _, start, end, own_crc in messages
+    ]
+    stored_crc = zlib.crc32(stored) if head.compression else data_crc
     crc = extend(zlib.crc32(whole[:start]), stored, stored_crc)
     crc = zlib.crc32(memoryview(whole)[start + len(stored) :], crc)
     counts = {key: len(rows_of_one) for key, rows_of_one in entries.items()}
     writer.copy_chunk(chunk, whole, crc, counts, rows)
-
-
-class _Inside:
-    """The messages inside a chunk: their rows for the hashes, and the CRC-32 of the whole chunk.
-
-    The CRC of an image is computed once: the hash of its channel and the CRC of the chunk both use it.
-    """
-
-    def __init__(self, view: LogBytes, contents: Contents, offset: int, data: Buffer) -> None:
-        self._view, self._contents, self._offset, self._data = view, contents, offset, memoryview(data)
-        self.crc = 0
-
-    def rows(self, entries: Entries) -> Iterator[tuple[str, int, int, int, int]]:
-        """Yield topic, log time, publish time, length and CRC of each message, in the order of the file."""
-        view, data, position = self._view, self._data, 0
-        for time_ns, offset in _by_offset(entries):
-            opcode, length, key, _, log_ns, publish_ns = _message_head(view, data, offset, self._offset)
-            start, end = offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length
-            is_valid = opcode == Opcode.MESSAGE and key in entries and log_ns == time_ns
-            has_more = position < offset and data[position] == Opcode.MESSAGE  # and the index lacks it
-            if not is_valid or has_more or offset < position or not start <= end <= len(data):
-                raise view.fault(self._offset, "a message index points to no message of its time")
-            crc = zlib.crc32(data[start:end])
-            self.crc = extend(zlib.crc32(data[position:start], self.crc), data[start:end], crc)
-            position = end
-            yield self._contents.channels[key].topic, log_ns, publish_ns, end - start, crc
-        self.crc = zlib.crc32(data[position:], self.crc)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -18,10 +19,10 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import ReadLimits
 from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
+from ipsys_log.log.checked_chunk import Rows
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
     RangeCache,
-    Rows,
     chunk_entries,
     open_chunk,
     open_unchunked,
@@ -37,7 +38,7 @@ from ipsys_log.log.known_contents import contents_of, open_remote
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
-from ipsys_log.log.records import HEADER, parse, walk
+from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
 from ipsys_log.log.summary import NoFooterError
 
 __all__ = ["LogReader", "stored_hashes"]
@@ -167,7 +168,7 @@ class LogReader:
         without
             Offsets of chunks that are left out.
         is_checked
-            Read each chunk as a whole, and check its CRC.
+            Read each chunk as a whole, and check its CRC. The next chunk is read from the disk meanwhile.
 
         Raises
         ------
@@ -187,11 +188,15 @@ class LogReader:
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
+        next_chunks = self._next_chunks(chunks) if is_checked else {}
         pending = [
             PendingChunk(
                 chunk.start_ns,
                 chunk.offset,
-                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
+                partial(
+                    open_chunk,
+                    *(view, self._cache, chunk, wanted, span, is_checked, next_chunks.get(chunk.offset)),
+                ),
             )
             for chunk in chunks
         ]
@@ -200,6 +205,12 @@ class LogReader:
             unchunked = partial(open_unchunked, view, self._cache, entries, wanted, span, contents.data_end)
             pending.append(PendingChunk(0, 0, unchunked))
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
+
+    @staticmethod
+    def _next_chunks(chunks: Sequence[ChunkRef]) -> dict[int, ChunkRef]:
+        """Return the chunk that is read after each chunk, by its offset."""
+        ordered = sorted(chunks, key=lambda chunk: (chunk.start_ns, chunk.offset))
+        return {before.offset: chunk for before, chunk in pairwise(ordered)}
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""

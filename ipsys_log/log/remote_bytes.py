@@ -180,6 +180,9 @@ class RemoteBytes:
         """Announce ranges that are going to be read; they replace the plan of the same name."""
         self.ranges.plan(name, ranges)
 
+    def prefetch(self, offset: int, length: int) -> None:
+        """Do nothing: plans announce the ranges."""
+
     def fault(self, offset: int, reason: str) -> LogError:
         """Return the error for damage at `offset`."""
         return LogError(

@@ -301,8 +301,12 @@ class LogWriter:
         """Return the hash of the messages that this writer has written to a channel."""
         return self._hashes.get(topic, ChannelHash())
 
-    def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
+    def write(
+        self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes, crc: int | None = None
+    ) -> None:
         """Add a message to a channel that was declared with `add_channel`; times in ns.
+
+        `crc` is the CRC-32 of the data if the caller knows it.
 
         Raises
         ------
@@ -324,7 +328,7 @@ class LogWriter:
         state = self._hashes.get(topic)
         if state is None:
             state = self._hashes[topic] = self._hash_so_far(topic)
-        crc = zlib.crc32(data)
+        crc = zlib.crc32(data) if crc is None else crc
         state.add_row(log_time_ns, publish_time_ns, len(data), crc)
         sequence = state.count & 0xFFFFFFFF
         if self._contents.unchunked:

@@ -20,7 +20,7 @@ from ipsys_log.models.table import is_known, reads_corners
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, uses_height
 from ipsys_log.runs.graph import input_runs, writes
-from ipsys_log.runs.provenance import complete_runs, replaced_lenses
+from ipsys_log.runs.provenance import complete_runs, newest_run, replaced_lenses
 from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.selection import rig_in_force
 
@@ -189,6 +189,10 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
     rig_cameras = [camera.name for camera in rig.cameras] if rig else []
     ordered = [name for name in rig_cameras if name in cameras]
     models = {accuracy.model: _model(session, accuracy.run) for accuracy in evaluated}
+    if (
+        not models and (run := newest_run(session, MODEL)) is not None
+    ):  # a live session with the model of a log
+        models[run] = _model(session, run)
     return Findings(
         rig,
         evaluated,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,16 +15,20 @@ from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.messages.channels import EVALUATION, POSITIONS, TRACKS
+from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, POSITIONS, TRACKS
+from ipsys_log.models.table import CORNER_MODELS, MODELS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
+from ipsys_log.report.html_recording import recording_values
 from ipsys_log.report.overlap_figure import overlap_pictures
 from ipsys_log.report.trajectory_table import TRAJECTORY_COLUMNS, rows_of_run
 from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.select import has_corners
+from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
 
@@ -41,10 +46,10 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     Raises
     ------
     IpsysError
-        The session has no evaluated model.
+        The session has calibration points, but no evaluated model.
     """
     findings = gather_findings(session, accuracies)
-    if not findings.cameras:
+    if not findings.cameras and session.topics(MEASUREMENTS):
         raise IpsysError(
             f"{session}: no model was evaluated, because no calibration point is held "
             "out; measure more points"
@@ -63,7 +68,9 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **_figure_values(findings),
         **_overlap(session, findings),
         **_tracks(session),
+        **recording_values(session),
         **_provenance(session, findings),
+        commands=_commands(session, findings),
     )
 
 
@@ -76,7 +83,7 @@ def _plain(value: Any) -> Any:
 
 def _text_values(findings: Findings) -> dict[str, Any]:
     return {
-        "head": html_sections.headline(findings),
+        "head": html_sections.headline(findings) if findings.cameras else None,
         "advice": html_sections.advice_rows(findings),
         "models": html_sections.model_rows(findings),
         "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
@@ -125,20 +132,49 @@ def _tracks(session: Session) -> dict[str, Any]:
     }
 
 
+def _commands(session: Session, findings: Findings) -> dict[str, str]:
+    """Return the commands that print or draw the content of the sections, by name."""
+    logs = " ".join(shlex.quote(path.name) for path in session.paths)
+    usual = {*MODELS, *(CORNER_MODELS if has_corners(session) else ())}
+    named = () if usual == {*findings.models} else findings.models
+    models = "".join(f" --model {shlex.quote(model)}" for model in named)
+    return {
+        "report": f"ipsys report {logs}",
+        "evaluate": f"ipsys evaluate {logs}{models} --details",
+        "plots": f"ipsys evaluate {logs}{models} --plots figures",
+        "tracks": f"ipsys view {logs}",
+        "info": f"ipsys info {logs}",
+        "check": f"ipsys check {logs} --details",
+        "latency": f"ipsys latency {logs} --plot latency.png",
+        "runs": f"ipsys runs {logs}",
+    }
+
+
 def _provenance(session: Session, findings: Findings) -> dict[str, Any]:
     """Return the provenance of the page: logs, runs and parameters."""
-    runs = _sources(session.runs(), [accuracy.run for accuracy in findings.accuracies])
-    newest = next((run for run in reversed(runs) if writes(run, EVALUATION)), None)
+    records = session.runs()
+    runs = (
+        _sources(records, [accuracy.run for accuracy in findings.accuracies])
+        if findings.accuracies
+        else records
+    )
+    newest = next((run for run in reversed(runs) if writes(run, EVALUATION)), runs[-1] if runs else None)
     return {
         "logs": [path.name for path in session.paths],
         "lab": findings.rig.name if findings.rig else "",
         "recorded": _span(format_time(session.start_ns)[:16], format_time(session.end_ns)[:16]),
-        "runs": runs,
+        "runs": _with_states(session, runs),
         "fingerprint": dict(sorted(newest.fingerprint.items())) if newest else {},
         "folds": FOLDS,
         "repeats": REPEATS,
         "subsets": SUBSETS,
     }
+
+
+def _with_states(session: Session, runs: Sequence[Run]) -> list[tuple[Run, str]]:
+    """Return runs, each with its state."""
+    states = {(stage.run.run, stage.run.stage): stage.state for stage in recorded_stages(session)}
+    return [(run, states.get((run.run, run.stage), "")) for run in runs]
 
 
 def _span(start: str, end: str) -> str:

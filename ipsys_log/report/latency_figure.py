@@ -14,7 +14,7 @@ from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE
 
-__all__ = ["draw_latency"]
+__all__ = ["draw_latency", "draw_shares", "draw_steps"]
 
 _STEPS = ("detected", "located", "fused", "published")
 _NEAR, _FAR = "#0072B2", "#D3D7DB"
@@ -36,13 +36,20 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
     left = figure.add_axes((0.07, 0.11, 0.42, 0.73))
     right = figure.add_axes((0.6, 0.11, 0.37, 0.73))
     total_ms = np.sort(times_s["total"]) * 1e3
-    _draw_shares(left, total_ms)
-    _draw_steps(right, times_s)
+    draw_shares(left, total_ms)
+    draw_steps(right, times_s)
     figure.text(0.07, 0.94, f"Latency of {len(total_ms)} positions", fontsize=12)
     write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 
-def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
+def draw_shares(axes: Axes, total_ms: NDArray[np.float64], is_narrow: bool = False) -> None:
+    """Draw the share of positions within a latency.
+
+    Parameters
+    ----------
+    total_ms : (n,), latencies in ascending order.
+    is_narrow : the figure is as wide as a phone; the legend gets a line for each entry.
+    """
     share = 100 * np.arange(1, len(total_ms) + 1) / len(total_ms)
     axes.step(
         total_ms, share, where="post", color="black", label=f"all positions; longest {total_ms[-1]:.1f} ms"
@@ -51,16 +58,17 @@ def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
     for name, value_ms, dashes in (("median", median_ms, "--"), ("99 %", far_ms, ":")):
         axes.axvline(value_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {value_ms:.1f} ms")
     axes.set(
-        xlabel="latency in ms, from the arrival of a frame to its position",
+        xlabel="latency in ms" if is_narrow else "latency in ms, from the arrival of a frame to its position",
         ylabel="positions in %",
         ylim=(0, 101),
     )
     axes.set_xlim(0, min(float(total_ms[-1]) * 1.05, _SHOWN * far_ms))
     style_axes(axes)
-    _key(axes)
+    _key(axes, 1 if is_narrow else 3)
 
 
-def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
+def draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
+    """Draw the median and the 99th percentile of the duration of each step."""
     rows = np.arange(len(_STEPS))
     steps_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _STEPS]) * 1e3
     axes.barh(rows, steps_ms[:, 1], color=_FAR, label="99 % of positions")
@@ -76,6 +84,6 @@ def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
     _key(axes)
 
 
-def _key(axes: Axes) -> None:
+def _key(axes: Axes, columns: int = 3) -> None:
     """Draw the legend above the axes, outside of the data."""
-    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9, frameon=False)
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=9, frameon=False)

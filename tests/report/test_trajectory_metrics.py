@@ -98,6 +98,21 @@ def test_trajectory_errors_are_those_of_evo(log: Path, tmp_path: Path) -> None:
             assert_same(one.summary, relative)
 
 
+def test_api_has_ate_and_rpe_as_evo_computes_them(log: Path, tmp_path: Path) -> None:
+    with ipsys.open(log) as opened:
+        table = opened.trajectory_errors("poly")
+    for robot in ("ada", "bob"):
+        truth, track, _ = evo_paths(log, tmp_path, robot)
+        metric = metrics.APE(metrics.PoseRelation.translation_part)
+        metric.process_data((truth, track))
+        own = table[table["robot"] == robot].set_index("metric")
+        row = own.loc["ATE 3D"]
+        for name in ("rmse", "mean", "median", "std", "max"):
+            assert row[f"{name}_m"] == pytest.approx(metric.get_all_statistics()[name], abs=1e-6), name
+        assert row["p95_m"] == pytest.approx(np.percentile(metric.error, 95), abs=1e-6)
+        assert own[own.index == "RPE"]["delta"].tolist() == ["1 m", "1 s"]
+
+
 def test_pairs_skip_gaps_and_take_the_start_of_a_stop() -> None:
     start, end = pairs_at(np.array([0.0, 0.5, 1.0, 1.0, 1.0, 4.0, 5.05]), 1.0, 0.1)
     assert list(zip(start.tolist(), end.tolist(), strict=True)) == [(0, 2), (5, 6)]

@@ -1,0 +1,196 @@
+"""Import of detected markers from a CSV table, as a run of a log."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.csv_rows import NamedRow, read_rows
+from ipsys_log.exchange.image_folders import parse_time
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import (
+    IMPORTED,
+    RIG_TOPIC,
+    CameraCalibration,
+    Marker,
+    Markers,
+    Message,
+    Rig,
+    Run,
+    calibration_topic,
+)
+from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.rig.file import check_name
+from ipsys_log.runs.output import append_run, open_target
+from ipsys_log.runs.provenance import check_run_name, fingerprint, free_name
+
+__all__ = ["DetectionOptions", "ImportedDetections", "import_detections"]
+
+_RUN = "imported"
+_CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "xy")
+_NEEDED = ("time", "camera", "marker_id", *_CORNERS)
+_LATEST_NS = 1 << 62
+_LARGEST_ID = (1 << 31) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionOptions:
+    """The options of an import: intrinsics by camera and a rig for a new log, and the name of the run."""
+
+    rig: Rig | None = None
+    lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
+    run: str | None = None
+
+
+class ImportedDetections(NamedTuple):
+    """The result of an import: the log, its new run, and the number of markers by camera."""
+
+    path: Path
+    run: str
+    markers: dict[str, int]
+
+
+def import_detections(
+    file: Path, into: Path | None, output: Path | None, options: DetectionOptions
+) -> ImportedDetections:
+    """Write the detected markers of a table into a run of a log.
+
+    The columns are those of an exported table of markers: ``time``, ``camera``, ``marker_id`` and ``x0_px``
+    to ``y3_px``. Optional are ``log_time_ns``, ``time_offset_ns`` and ``edge_offset_px``. The intrinsics of a
+    camera give the size of its images.
+
+    Parameters
+    ----------
+    into : a log without images; it gets the run unless there is an ``output``.
+    output : a new log.
+
+    Raises
+    ------
+    IpsysError
+        The table is wrong, a camera has no intrinsics, there is no rig, or the log has images: the stages
+        would detect the markers in these. Nothing is written then.
+    """
+    if into is None and output is None:
+        raise IpsysError("no log is named; give --into LOG, or -o LOG for a new one")
+    with ExitStack() as stack:
+        session = stack.enter_context(Session([into])) if into is not None else None
+        if session is not None and session.images:
+            raise IpsysError(
+                f"{session}: has images, in which ipsys detects the markers itself; import into a part "
+                f"without images: ipsys cut {session} -o part.mcap --exclude-topics '/cameras/*/image'"
+            )
+        if options.rig is None and (session is None or not session.topics(RIG)):
+            raise IpsysError(f"{session or file}: has no rig; add --rig FILE")
+        lenses = _lenses(session, options.lenses)
+        frames = _read_frames(file, lenses)
+        run = _run_name(session, options.run)
+        messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
+        if session is None:
+            messages = [*_settings(options, frames), *messages]
+        last_ns = frames[-1].log_time_ns
+        earlier = session.runs() if session is not None else []
+        number = max((other.number for other in earlier), default=0) + 1
+        parameters = {"format": "csv", "file": file.name}
+        record = Run(last_ns, run, IMPORTED, parameters, fingerprint(), number=number)
+        _, target = stack.enter_context(open_target([into] if into is not None else [], output))
+        append_run(target, record, last_ns, lambda: messages, {})
+    counts = Counter(dict.fromkeys(sorted({frame.camera for frame in frames}), 0))
+    for frame in frames:
+        counts[frame.camera] += len(frame.markers)
+    return ImportedDetections(output or target, run, dict(counts))
+
+
+class _Frame(NamedTuple):
+    log_time_ns: int
+    time_ns: int
+    camera: str
+    markers: tuple[Marker, ...]
+
+
+def _read_frames(file: Path, lenses: Mapping[str, CameraCalibration]) -> list[_Frame]:
+    """Return the frames of a table in log order, with their markers sorted by id."""
+    by_frame: dict[tuple[int, int, str], dict[int, Marker]] = {}
+    for row in read_rows(file, _NEEDED):
+        camera = check_name(row.text("camera"), f"{row.where}: camera name")
+        if camera not in lenses:
+            raise IpsysError(
+                f"{row.where}: camera {camera!r} has no intrinsics; add --calibration {camera}=FILE"
+            )
+        time_ns = _time_ns(row)
+        log_ns = row.optional("log_time_ns", row.integer)
+        log_ns = time_ns if log_ns is None else log_ns
+        if not 0 < log_ns < _LATEST_NS:
+            raise IpsysError(f"{row.where}: log_time_ns {log_ns} is not a time in ns since 1970")
+        markers = by_frame.setdefault((log_ns, time_ns, camera), {})
+        marker = _marker(row)
+        if markers.setdefault(marker.id, marker) is not marker:
+            raise IpsysError(f"{row.where}: marker {marker.id} is in this frame of {camera} already")
+    if not by_frame:
+        raise IpsysError(f"{file}: has no rows; export the markers again")
+    return [
+        _Frame(*key, tuple(markers[one] for one in sorted(markers)))
+        for key, markers in sorted(by_frame.items())
+    ]
+
+
+def _time_ns(row: NamedRow) -> int:
+    text = row.text("time")
+    try:
+        return parse_time(text)
+    except ValueError as error:
+        raise IpsysError(
+            f"{row.where}: time: {text[:40]!r} is not a time; write ISO 8601, or s, ms, us or ns since 1970"
+        ) from error
+
+
+def _marker(row: NamedRow) -> Marker:
+    marker_id = row.integer("marker_id")
+    if not 0 <= marker_id <= _LARGEST_ID:
+        raise IpsysError(f"{row.where}: marker_id {marker_id} is not the id of a marker")
+    return Marker(
+        marker_id,
+        np.array([row.number(name) for name in _CORNERS]).reshape(4, 2),
+        time_offset_ns=row.optional("time_offset_ns", row.integer),
+        edge_offset_px=row.optional("edge_offset_px", row.number),
+    )
+
+
+def _lenses(session: Session | None, given: Mapping[str, CameraCalibration]) -> dict[str, CameraCalibration]:
+    """Return the intrinsics by camera: those of the log, or the given ones."""
+    recorded = session.calibrations if session is not None else {}
+    own = {camera: session.payloads([topic])[-1] for camera, topic in recorded.items() if session}
+    return {**own, **given}
+
+
+def _run_name(session: Session | None, wanted: str | None) -> str:
+    if wanted is not None:
+        check_name(wanted, "--run")
+    if session is None:
+        return wanted or _RUN
+    if wanted is not None:
+        return check_run_name(session, IMPORTED, wanted, (MARKERS,))
+    return free_name(session, Run(0, _RUN, IMPORTED), _RUN, (MARKERS,))
+
+
+def _settings(options: DetectionOptions, frames: Sequence[_Frame]) -> Iterator[Message]:
+    """Yield the rig, and the intrinsics of the cameras with frames, just before the first frame."""
+    cameras = sorted({frame.camera for frame in frames})
+    log_ns = frames[0].log_time_ns - len(cameras) - 1
+    yield Message(RIG_TOPIC, log_ns, log_ns, options.rig)
+    for number, camera in enumerate(cameras, 1):
+        time_ns = log_ns + number
+        lens = replace(options.lenses[camera], timestamp=time_ns, frame_id=camera)
+        yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
+
+
+def _message(frame: _Frame, lens: CameraCalibration, run: str) -> Message:
+    markers = Markers(frame.time_ns, frame.markers, lens.width, lens.height)
+    topic = MARKERS.topic_of(run, frame.camera)
+    return Message(topic, frame.log_time_ns, frame.time_ns, markers, frame.camera)

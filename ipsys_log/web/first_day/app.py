@@ -22,8 +22,8 @@ from ipsys_log.survey.live import LiveScene
 from ipsys_log.web.access import MAY_WRITE
 from ipsys_log.web.app import build_app
 from ipsys_log.web.dashboard.app import build_dashboard
-from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.sources import dashboard_of_recording
+from ipsys_log.web.dashboard.state import Dashboard
 from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json
 
 __all__ = ["SetupApp"]
@@ -96,19 +96,10 @@ class SetupApp:
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
-        cameras = view.lab.cameras
-        setting = LiveSetting(
-            view.lab.rig,
-            view.lab.lenses,
-            view.model,
-            view.run,
-            cameras.states,
-            view.lab.monitor.checks,
-            view.log,
-            cameras.clock.now_ns,
-            view.streams,
+        lab = view.lab
+        dashboard = dashboard_of_recording(
+            lab.cameras, lab.settings, lab.monitor.checks, view.log, view.model, view.run, view.streams
         )
-        dashboard = Dashboard(setting, Operator(cameras.add, cameras.clock.now_ns, cameras.say))
         with self._dashboard.show(build_dashboard(dashboard)):
             yield dashboard
 

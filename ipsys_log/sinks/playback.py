@@ -240,7 +240,7 @@ def in_capture_order(messages: Iterable[Message], window_ns: int = _LOGGED_AFTER
     waiting: list[tuple[int, int, Message]] = []
     for number, message in enumerate(messages):
         heapq.heappush(waiting, (message.publish_time_ns, number, message))
-        while waiting[0][0] + window_ns <= message.log_time_ns:
+        while waiting and waiting[0][0] + window_ns <= message.log_time_ns:
             yield heapq.heappop(waiting)[-1]
     while waiting:
         yield heapq.heappop(waiting)[-1]

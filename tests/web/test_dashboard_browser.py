@@ -136,12 +136,12 @@ def test_operator_needs_only_the_keyboard(browser: Phone, lab: LiveLab) -> None:
         # After a reload it is the same device; another one may take over.
         browser.reload()
         says(browser, "#operation", "This device operates")
-        lab.operator.claim(True)
+        lab.operator.seat.claim(True)
         says(browser, "#operation", "Another device operates")
         assert not browser.run("document.querySelector('#mark').checkVisibility()")
         browser.tap("#take")
         says(browser, "#operation", "This device operates")
-        lab.operator.claim(True)
+        lab.operator.seat.claim(True)
         says(browser, "#take", "Take over")
 
 
@@ -170,7 +170,7 @@ def test_page_says_when_data_stop_and_goes_on_by_itself(browser: Phone, lab: Liv
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP, WALL], ids=["phone", "desktop", "wall"])
 def test_page_fits_the_screen_in_both_schemes(browser: Phone, lab: LiveLab, size: tuple[int, int]) -> None:
-    lab.operator.claim(False)
+    lab.operator.seat.claim(False)
     with page_of(lab.dashboard) as page, opened(browser, page.url, size):
         browser.wait(f"{COUNT.format('figure image')} === 2")
         browser.tap("#take")

@@ -230,7 +230,7 @@ class Dashboard:
     def _operation(self, now_ns: int) -> dict[str, Any]:
         if self.operator is None:
             return {}
-        operation: dict[str, Any] = {"operator": self.operator.number}
+        operation: dict[str, Any] = {"operator": self.operator.seat.number}
         segment = self.operator.segment
         if segment is not None:
             seconds = (now_ns - segment.start_ns) // NS_PER_S

@@ -26,7 +26,7 @@ from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
 from ipsys_log.runs.options import Request
 from ipsys_log.web.connections import PageLimits
 from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 from tests.live_recordings import again, attached_in_steps, lenses, sent
 from tests.playing import WAIT_LIMIT_S
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, markers, page_of, robot, tracks
@@ -354,7 +354,9 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
     (rig,) = (message.payload for message in settings if message.topic == RIG.topic)
     with attached:
         operator = Operator(attached.add, clock.now_ns, lambda text: None)
-        setting = LiveSetting(rig, lenses(lab_log), None, "poly", attached.states, {}, log, clock.now_ns, ())
+        setting = DashboardSetting(
+            rig, lenses(lab_log), None, "poly", attached.states, {}, log, clock.now_ns, ()
+        )
         dashboard = Dashboard(setting, operator)
         frames = 0
 

@@ -45,7 +45,7 @@ class Visitor:
 
     def tap(self, selector: str) -> None:
         """Tap a button; the page draws its panel before the button can be hit again."""
-        self.wait(f"document.querySelector({selector!r} + ':not(:disabled)')")
+        self.wait(f"document.querySelector({selector!r} + ':not(:disabled)')?.checkVisibility()")
         self.browser.tap(selector)
         self.inputs += 1
 
@@ -225,7 +225,7 @@ def test_keyboard_alone_reaches_the_next_step(browser: Phone, folder: Path) -> N
 
 def test_second_device_takes_over_before_it_changes_anything(browser: Phone, folder: Path) -> None:
     with opened(browser, folder) as url:
-        browser.tap("#simulate")
+        Visitor(browser).tap("#simulate")
         says(browser, "#operation", "This device operates")
         # Another device takes over: the page shows it, and its buttons wait.
         other = Client(url)

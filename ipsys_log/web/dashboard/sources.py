@@ -13,7 +13,7 @@ from ipsys_log.sinks.played_topics import PlayedScene
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.played_log import PlayedLog
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 
 __all__ = ["dashboard_of_player", "dashboard_of_recording"]
 
@@ -49,7 +49,7 @@ def dashboard_of_recording(
         if isinstance(message.payload, CameraCalibration)
     }
     now_ns = cameras.clock.now_ns
-    setting = LiveSetting(rig, lenses, model, run, cameras.states, checks, log, now_ns, streams)
+    setting = DashboardSetting(rig, lenses, model, run, cameras.states, checks, log, now_ns, streams)
     return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say))
 
 
@@ -64,7 +64,7 @@ def dashboard_of_player(player: Player, scene: PlayedScene) -> Dashboard:
     played = PlayedLog(player, scene)
     rig, lenses, model, run = scene.rig, scene.lenses, scene.model, scene.run
     log = Path(scene.name)
-    setting = LiveSetting(
+    setting = DashboardSetting(
         rig, lenses, model, run, played.states, {}, log, player.now_ns, player.streams, played
     )
     return Dashboard(setting)

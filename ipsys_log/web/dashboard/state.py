@@ -44,7 +44,7 @@ from ipsys_log.web.dashboard.status import (
     describe_streams,
 )
 
-__all__ = ["Dashboard", "LiveSetting"]
+__all__ = ["Dashboard", "DashboardSetting"]
 
 _NS_PER_MS = 1_000_000
 # Number of the last positions whose latencies count.
@@ -52,7 +52,7 @@ _LATENCIES = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class LiveSetting:
+class DashboardSetting:
     """The parts of a live recording, or of a played log, that the dashboard shows.
 
     Attributes
@@ -104,7 +104,7 @@ class Dashboard:
         *(Event, Latency, Rig, NewSession),
     )
 
-    def __init__(self, setting: LiveSetting, operator: Operator | None = None) -> None:
+    def __init__(self, setting: DashboardSetting, operator: Operator | None = None) -> None:
         self.end: str | None = None
         self.operator = operator
         self._setting, self._begin_ns = setting, setting.now_ns()

@@ -15,12 +15,13 @@ export async function post(path, body = {}) {
 }
 
 export class Seat {
-  // key: the name under which a reloaded page finds its number again.
+  // key: the name of the number in the store of the browser: all tabs, and a reloaded page, are the same device.
   constructor(key) {
     this.key = key;
-    this.number = Number(sessionStorage.getItem(key)) || 0;
     this.present = 0;
   }
+
+  get number() { return Number(localStorage.getItem(this.key)) || 0; }
 
   get operates() { return this.number !== 0 && this.number === this.present; }
 
@@ -28,12 +29,13 @@ export class Seat {
 
   async take() {
     const { operator } = await post("operate", { take_over: !this.isFree });
-    this.number = this.present = operator;
-    sessionStorage.setItem(this.key, operator);
+    localStorage.setItem(this.key, operator);
+    this.present = operator;
   }
 
   async release() {
     await post("operate", { release: this.number });
-    this.number = this.present = 0;
+    localStorage.removeItem(this.key);
+    this.present = 0;
   }
 }

@@ -237,6 +237,8 @@ def test_second_device_takes_over_before_it_changes_anything(browser: Phone, fol
         says(browser, "#operation", "This device operates")
         browser.wait("!document.querySelector('#save').disabled")
         assert other.ask("/api/start", {"action": "align"})[0] == 400
-        # After a reload it is the same device.
+        # After a reload, and in another tab, it is the same device.
         browser.reload()
+        says(browser, "#operation", "This device operates")
+        visit(browser, url)
         says(browser, "#operation", "This device operates")

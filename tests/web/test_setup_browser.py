@@ -93,7 +93,7 @@ def serving(folder: Path) -> Iterator[str]:
 def opened(browser: Phone, folder: Path, size: tuple[int, int] = PHONE) -> Iterator[str]:
     """Open the page of a folder, and leave it at the end; the browser must have reported no error."""
     with serving(folder) as url:
-        visit(browser, url, size)
+        browser.open(url, size)
         yield url
         leave(browser)
     assert unexpected(browser) == []

@@ -18,8 +18,11 @@ from tests.conftest import Unmeasured
 from tests.web.axe import serious_faults
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
 from tests.web.phone import Phone, phone
+from tests.web.test_connections import wait_until
+from tests.web.test_dashboard_browser import press
 from tests.web.test_dashboard_state import LENS, Stream, pairs_of_a_level_camera
 from tests.web.test_measuring_page import Recording, says
+from tests.web.test_setup_browser import focus
 
 # A browser, and axe-core from the registry of npm.
 pytestmark = pytest.mark.slow
@@ -35,7 +38,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
 
 
 def check(browser: Phone, place: object) -> None:
-    """Check the present page in both colour schemes."""
+    """Check the present page in both colour schemes, with all its folded parts."""
+    browser.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     for scheme in ("light", "dark"):
         browser.prefer(scheme)
         assert serious_faults(browser) == [], (place, scheme)
@@ -101,5 +105,29 @@ def test_setup_page_has_no_serious_fault(browser: Phone, folder: LabFolder, size
             browser.run(f"location.hash = '{name}'")
             browser.wait(f"document.querySelector('#step-{name}[aria-current]')")
             check(browser, (size, name))
+        leave(browser)
+        setup.session.close()
+
+
+def test_last_steps_of_the_setup_need_only_the_keyboard(browser: Phone, folder: LabFolder) -> None:
+    setup = SetupApp(folder)
+    with serve_app(setup.app, None, 0) as page:
+        browser.open(page.url, DESKTOP)
+        browser.wait("document.querySelector('#step-accuracy')")
+        focus(browser, "#step-accuracy")
+        press(browser, "Enter", "\r")
+        says(browser, "h2", "6. Fit and evaluation")
+        focus(browser, "#replay")
+        press(browser, "Enter", "\r")
+        wait_until(lambda: setup.session.jobs.present is not None and setup.session.jobs.present.ended)
+        says(browser, "#operation", "This device operates")
+        # The end of the job leaves the keyboard in the panel.
+        assert browser.run("document.querySelector('#panel').contains(document.activeElement)")
+        browser.reload()  # the page is not drawn again while the keyboard moves
+        browser.wait("document.querySelector('#onward')")
+        focus(browser, "#onward")
+        press(browser, "Enter", "\r")
+        says(browser, "h2", "7. Live view")
+        focus(browser, "#live")
         leave(browser)
         setup.session.close()

@@ -34,9 +34,12 @@ export function panel(name, state, act) {
     ...lines(state.faults.map((fault) => ["bad", fault])),
     ...(step.status === "waits" ? [] : content),
     ...onward,
-    make("p", { className: "command" }, "The same in a terminal, in this folder: ", make("code", { textContent: step.command })),
+    make("p", { className: "command" }, "The same in a terminal, in this folder: ", command(step.command)),
   ];
 }
+
+// A line ends between two words, never behind a hyphen.
+const command = (text) => make("code", {}, ...text.split(" ").flatMap((word) => [make("span", { textContent: word }), " "]));
 
 const sentence = (text) => `${text}.`.replace(/\.\.$/, ".");
 

@@ -6,11 +6,15 @@ The messages are those of ``ipsys live``: 30 times a second three frames of 1920
 tracks of 20 robots, and latencies. They reach the dashboard through the queue of a sink. The pages are in a
 process of their own and read everything. The share of a core is the processor time of the sink and of the
 server, divided by the time. It does not count while another process has the core.
+
+The frames of the page are those that a headless Chromium draws without a GPU, with all camera images. The
+browser draws on the same cores as the server.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,6 +22,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -44,10 +49,12 @@ from ipsys_log.messages import (
 from ipsys_log.sinks.sink import LiveSinks
 from ipsys_log.web.dashboard.app import build_dashboard
 from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 from ipsys_log.web.server import serve_app
 
 __all__ = ["measure"]
+
+_ROOT = Path(__file__).resolve().parent.parent
 
 _ROBOTS, _RATE_HZ, _CAMERAS = 20, 30, ("red", "white", "black")
 _SIZE_PX = 1920, 1080
@@ -79,6 +86,18 @@ sys.stdin.readline()
 print(min(updates, default=0), flush=True)
 """
 
+# The frames per second that a browser draws in a page.
+_FRAMES = """(async () => {{
+  let frames = 0, ends = false;
+  const count = () => {{ frames += 1; if (!ends) requestAnimationFrame(count); }};
+  requestAnimationFrame(count);
+  const begin = performance.now();
+  await new Promise((resolve) => setTimeout(resolve, {0}));
+  ends = true;
+  return (1000 * frames) / (performance.now() - begin);
+}})()"""
+_WINDOW_PX = 1280, 900
+
 
 def measure(options: argparse.Namespace) -> Report:
     """Show the messages of some seconds to different numbers of pages, in turns."""
@@ -104,11 +123,50 @@ def measure(options: argparse.Namespace) -> Report:
     for name, values in rates.items():
         if name != "no page":
             report.rows.append(Row(name, tuple(values), "updates/s"))
+    if shutil.which("chromium") is None:
+        report.remarks.append("dashboard: there is no chromium, so the frames of the page are not measured")
+    else:
+        drawn = tuple(_draw(seconds) for _ in range(options.rounds))
+        report.rows.append(Row("one page in Chromium", drawn, "frames/s", (">=", 30.0)))
     return report
 
 
 def _show(seconds: float, pages: int, with_images: bool) -> tuple[float, float]:
     """Return the share of a core, and the updates per second of the slowest page."""
+    with _served() as (show, url), _open_pages(url, pages, with_images) as read:
+        jpeg = _picture()
+        fed_s = [0.0]
+        feeder = threading.Thread(target=_feed, args=(show, jpeg, seconds, fed_s))
+        begin_cpu_s, begin_s = time.process_time(), time.perf_counter()
+        feeder.start()
+        feeder.join()
+        took_s = time.perf_counter() - begin_s
+        cpu_s = time.process_time() - begin_cpu_s - fed_s[0]
+        return cpu_s / took_s, read() / took_s
+
+
+def _draw(seconds: float) -> float:
+    """Return the frames per second of a page in Chromium while messages come."""
+    if str(_ROOT) not in sys.path:
+        sys.path.append(str(_ROOT))
+    from tests.web.phone import phone
+
+    with tempfile.TemporaryDirectory() as folder, _served() as (show, url), phone(Path(folder)) as browser:
+        ended, jpeg = threading.Event(), _picture()
+        feeder = threading.Thread(target=_feed, args=(show, jpeg, float("inf"), [0.0], ended))
+        feeder.start()
+        try:
+            browser.open(url, _WINDOW_PX)
+            browser.wait(f"document.querySelectorAll('figure image').length === {len(_CAMERAS)}")
+            return float(browser.run(_FRAMES.format(round(1000 * seconds))))
+        finally:
+            ended.set()
+            feeder.join()
+
+
+@contextmanager
+def _served() -> Iterator[tuple[LiveSinks, str]]:
+    """Serve a dashboard; yield its sinks and its address."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "live.mcap"
         log.write_bytes(bytes(1000))
@@ -116,31 +174,29 @@ def _show(seconds: float, pages: int, with_images: bool) -> tuple[float, float]:
         with (
             LiveSinks([dashboard], lambda kind, text: None) as show,
             serve_app(build_dashboard(dashboard), port=0) as page,
-            _open_pages(page.url, pages, with_images) as read,
         ):
-            jpeg = _picture()
-            fed_s = [0.0]
-            feeder = threading.Thread(target=_feed, args=(show, jpeg, seconds, fed_s))
-            begin_cpu_s, begin_s = time.process_time(), time.perf_counter()
-            feeder.start()
-            feeder.join()
-            took_s = time.perf_counter() - begin_s
-            cpu_s = time.process_time() - begin_cpu_s - fed_s[0]
-            return cpu_s / took_s, read() / took_s
+            yield show, page.url
 
 
 def _dashboard(log: Path) -> Dashboard:
     markers = tuple(RigMarker(n, robot=f"robot_{n}") for n in range(_ROBOTS))
     rig = Rig("lab", "DICT_4X4_100", 0.2, markers, floor=Floor(5.0, 5.0))
     states = {name: CameraState(up=True) for name in _CAMERAS}
-    setting = LiveSetting(rig, {}, None, "poly", states, {}, log, time.time_ns)
+    setting = DashboardSetting(rig, {}, None, "poly", states, {}, log, time.time_ns)
     return Dashboard(setting, Operator(lambda topic, payload: None, time.time_ns, lambda text: None))
 
 
-def _feed(show: LiveSinks, jpeg: bytes, seconds: float, fed_s: list[float]) -> None:
-    """Send the messages at their times; note the processor time that making them took."""
+def _feed(
+    show: LiveSinks, jpeg: bytes, seconds: float, fed_s: list[float], ended: threading.Event | None = None
+) -> None:
+    """Send the messages at their times; note the processor time that making them took.
+
+    The messages end after some seconds, or with an event.
+    """
     begin_s = time.perf_counter()
-    for number in range(round(seconds * _RATE_HZ)):
+    for number in count():
+        if number >= seconds * _RATE_HZ or (ended is not None and ended.is_set()):
+            break
         for message in _messages(number, jpeg):
             show(message)
         time.sleep(max(begin_s + (number + 1) / _RATE_HZ - time.perf_counter(), 0.0))
@@ -176,10 +232,10 @@ def _picture() -> bytes:
 
 
 @contextmanager
-def _open_pages(url: str, count: int, with_images: bool) -> Iterator[Callable[[], int]]:
+def _open_pages(url: str, number: int, with_images: bool) -> Iterator[Callable[[], int]]:
     """Open pages in a process of their own; yield a function that returns their smallest count of updates."""
     parts = urlsplit(url)
-    arguments = [str(parts.hostname), str(parts.port), str(count), "images" if with_images else "none"]
+    arguments = [str(parts.hostname), str(parts.port), str(number), "images" if with_images else "none"]
     with subprocess.Popen(
         [sys.executable, "-c", _PAGES, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as program:

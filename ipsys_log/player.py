@@ -19,7 +19,15 @@ from ipsys_log.messages import Message, Rig
 from ipsys_log.rig.file import check_robots
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
-from ipsys_log.sinks.played_topics import PlayedTopics, choose_topics, read_first, viewed_topics
+from ipsys_log.sinks.played_topics import (
+    PlayedScene,
+    PlayedTopics,
+    choose_topics,
+    dashboard_topics,
+    read_first,
+    read_scene,
+    viewed_topics,
+)
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.sinks.sink import LiveSinks, Sink
 from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
@@ -42,6 +50,7 @@ class Player:
     ----------
     runs : the runs of the played tracks; none: ground truth.
     lines : a line for each stream about its receivers, and one if the rig names no robots.
+    scene : the constant parts of the first log; None without a dashboard.
     """
 
     def __init__(
@@ -53,11 +62,13 @@ class Player:
         settings: StreamSettings | None = None,
         clock: Clock | None = None,
         say: Callable[[str], None] = lambda text: None,
+        has_dashboard: bool = False,
     ) -> None:
         if not paths:
             raise IpsysError("no log is given; name at least one")
         self._say, self._ended, self._stack = say, threading.Event(), ExitStack()
         self._first: list[Message] = []
+        self.scene: PlayedScene | None = None
         try:
             # Each log by itself: two logs may have runs of one name.
             sessions = [self._stack.enter_context(Session([path])) for path in paths]
@@ -75,6 +86,10 @@ class Player:
                     for row in read_first(session, rig)
                 ]
             page = self._stack.enter_context(closing(_open_page())) if settings.rerun else None
+            viewed = logs[0]
+            if has_dashboard:
+                self.scene = read_scene(*logs[0], rigs[0])
+                logs = [(session, dashboard_topics(session, chosen)) for session, chosen in logs]
             playback = self._playback = _open_playback(logs, options, clock)
             tracks = {chosen.tracks for _, chosen in logs}
             number, is_replayed = playback.session, not options.restamp
@@ -85,7 +100,7 @@ class Player:
             self._stack.close()
             raise
         self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
-        self._viewers = [] if page is None else [_viewer(*logs[0], rigs[0], page, say)]
+        self._viewers: list[Sink] = [] if page is None else [_viewer(*viewed, rigs[0], page, say)]
         lines = [stream.describe() for stream in self._streams]
         lines += [] if page is None else [page.describe()]
         if settings and not robots:
@@ -105,6 +120,19 @@ class Player:
 
     def __iter__(self) -> Iterator[LiveTracks]:
         return iter(self._tracker)
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """The open streams."""
+        return self._streams
+
+    def show_on(self, sink: Sink) -> None:
+        """Send the messages to a further sink; call this before the start."""
+        self._viewers.append(sink)
+
+    def now_ns(self) -> int:
+        """Return the time by which the age of a played message is computed."""
+        return self._playback.now_ns()
 
     @property
     def duration_s(self) -> float:

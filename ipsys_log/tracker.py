@@ -38,6 +38,7 @@ class Tracker:
     """
 
     name = "the tracker"
+    payloads: tuple[type, ...] = (Tracks,)
 
     def __init__(self, track: Callable[[Tracker], list[Outcome]]) -> None:
         self.dropped = 0

@@ -1,11 +1,13 @@
-"""The dashboard beside a live recording: ``ipsys live --web``."""
+"""The dashboard beside a recording or a playback: ``ipsys live --web``, ``ipsys stream LOG --web``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Optional
+
+import typer
 
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.measure_live import say_faults
@@ -13,16 +15,38 @@ from ipsys_log.cli.measure_live import say_faults
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import Message, Model
+    from ipsys_log.player import Player
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.web.dashboard.state import Dashboard
     from ipsys_log.web.server import PageServer
 
-__all__ = ["DashboardPlan", "first_run", "plan_dashboard", "serve_dashboard"]
+__all__ = [
+    "DashboardPlan",
+    "Web",
+    "WebPort",
+    "check_playback_page",
+    "first_run",
+    "plan_dashboard",
+    "serve_dashboard",
+    "serve_playback",
+]
 
 _USUAL_PORT = 8000
 _GAP = 4
+
+Web = Annotated[bool, typer.Option("--web", help="Show a page, the dashboard, for any number of browsers.")]
+WebPort = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--web-port",
+        min=0,
+        max=65535,
+        metavar="PORT",
+        help="Serve the dashboard on this port instead of 8000; 0 for any free port.",
+    ),
+]
 
 
 class DashboardPlan(NamedTuple):
@@ -45,18 +69,14 @@ def plan_dashboard(
     IpsysError
         The port is in use, or an option has no effect.
     """
-    from ipsys_log.errors import IpsysError
-
+    port = _checked_port(is_wanted, port)
     if not is_wanted:
-        if port is not None:
-            raise IpsysError("--web-port: has no effect without --web; add --web")
         return None
     import ipsys_log.web.dashboard.app  # noqa: F401
     from ipsys_log.runs.graph import copy_model
     from ipsys_log.runs.select import wanted_models
     from ipsys_log.web.server import check_port_free
 
-    port = _USUAL_PORT if port is None else port
     check_port_free(host, port, "--web-port")
     first, *_ = wanted_models(request)
     return DashboardPlan(host, port, copy_model(request, first)[1])
@@ -90,53 +110,79 @@ def serve_dashboard(
     if plan is None:
         yield []
         return
+    from ipsys_log.web.dashboard.sources import dashboard_of_recording
+
+    cameras, settings, status = opened
+    dashboard = dashboard_of_recording(cameras, settings, status.checks, log, plan.model, run, streams)
+    with _serve(dashboard, plan.host, plan.port, has_viewers=True):
+        yield [dashboard]
+
+
+def check_playback_page(is_wanted: bool, host: str | None, port: int | None) -> int:
+    """Check that the dashboard of a playback can be served; return its port.
+
+    Raises
+    ------
+    IpsysError
+        The port is in use, or an option has no effect.
+    """
+    port = _checked_port(is_wanted, port)
+    if is_wanted:
+        from ipsys_log.web.server import check_port_free
+
+        check_port_free(host, port, "--web-port")
+    return port
+
+
+@contextmanager
+def serve_playback(player: Player, host: str | None, port: int) -> Iterator[None]:
+    """Serve the dashboard of a player until the end of the block, and print its address.
+
+    Without a dashboard, the player has no scene, and nothing is served.
+    """
+    if player.scene is None:
+        yield
+        return
+    from ipsys_log.web.dashboard.sources import dashboard_of_player
+
+    dashboard = dashboard_of_player(player, player.scene)
+    player.show_on(dashboard)
+    # A log is not changed: all devices may only view.
+    with _serve(dashboard, host, port, has_viewers=False):
+        yield
+
+
+@contextmanager
+def _serve(dashboard: Dashboard, host: str | None, port: int, has_viewers: bool) -> Iterator[None]:
     from ipsys_log.web.dashboard.app import build_dashboard
     from ipsys_log.web.server import serve_app
 
-    dashboard = _dashboard(plan.model, opened, log, run, streams)
     app = build_dashboard(dashboard)
-    with serve_app(app, plan.host, plan.port, has_viewers=True, option="--web-port") as page:
-        _print_addresses(page)
+    with serve_app(app, host, port, has_viewers=has_viewers, option="--web-port") as page:
+        _print_addresses(page, is_secret=host is not None)
         try:
-            yield [dashboard]
+            yield
         finally:
             say_faults(page, "the dashboard")
 
 
-def _dashboard(
-    model: Model,
-    opened: tuple[LiveCameras, list[Message], LiveStatus],
-    log: Path,
-    run: str,
-    streams: Sequence[Sink],
-) -> Dashboard:
-    from ipsys_log.messages import CameraCalibration, Rig
-    from ipsys_log.web.dashboard.operator import Operator
-    from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+def _checked_port(is_wanted: bool, port: int | None) -> int:
+    from ipsys_log.errors import IpsysError
 
-    cameras, settings, status = opened
-    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
-    setting = LiveSetting(
-        rig,
-        {str(row.camera): row.payload for row in settings if isinstance(row.payload, CameraCalibration)},
-        model,
-        run,
-        cameras.states,
-        status.checks,
-        log,
-        cameras.clock.now_ns,
-        streams,
-    )
-    return Dashboard(setting, Operator(cameras.add, cameras.clock.now_ns, cameras.say))
+    if port is not None and not is_wanted:
+        raise IpsysError("--web-port: has no effect without --web; add --web")
+    return _USUAL_PORT if port is None else port
 
 
-def _print_addresses(page: PageServer) -> None:
-    """Print the address of the page; with a secret, one address to view and one to operate."""
-    if page.view_url is None:
-        remarks.print(f"dashboard at {page.url}", markup=False)
-        return
+def _print_addresses(page: PageServer, is_secret: bool) -> None:
+    """Print the address of the page; of a recording with secrets, one to view and one to operate."""
     from ipsys_log.web.server import qr_code
 
+    if page.view_url is None:
+        if is_secret:
+            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
+        remarks.print(f"dashboard at {page.url}", markup=False)
+        return
     codes = [
         [*qr_code(url).splitlines(), name] for url, name in ((page.view_url, "view"), (page.url, "operate"))
     ]

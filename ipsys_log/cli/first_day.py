@@ -62,3 +62,5 @@ def setup(folder: Folder, host: Host = None, port: Port = 8000) -> None:
             say_faults(server, "the setup page")
             for bug in page.session.jobs.bugs:
                 remarks.print(bug, markup=False, highlight=False)
+    if page.session.jobs.bugs:
+        raise typer.Exit(1)

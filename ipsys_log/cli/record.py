@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import remarks, say
-from ipsys_log.cli.dashboard import first_run, plan_dashboard, serve_dashboard
+from ipsys_log.cli.dashboard import Web, WebPort, first_run, plan_dashboard, serve_dashboard
 from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
     Calibrations,
@@ -41,21 +41,6 @@ Seconds = Annotated[
     typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
 ]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
-
-Web = Annotated[
-    bool,
-    typer.Option("--web", help="Show the recording on a page, the dashboard, for any number of browsers."),
-]
-WebPort = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(
-        "--web-port",
-        min=0,
-        max=65535,
-        metavar="PORT",
-        help="Serve the dashboard on this port instead of 8000; 0 for any free port.",
-    ),
-]
 
 _NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import say
+from ipsys_log.cli.dashboard import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.cli.options import log_argument
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
@@ -69,31 +70,37 @@ def stream(
     run: Run = None,
     topics: Topics = None,
     restamp: Restamp = "original",
+    web: Web = False,
+    web_port: WebPort = None,
 ) -> None:
     """Play logs as if they were live: send their positions to robots and other programs.
 
     The positions are those of a run; the command computes none. Keys: space pauses, . plays the next
     position, left and right move by 5 s, + and - change the rate, l loops, q ends. With --rig lab.toml, the
-    command opens the streams of this file; a log itself opens no stream.
+    command opens the streams of this file; a log itself opens no stream. With --web, a page shows the log.
     """
     allow_interrupt("stopped before the first position was sent")
     from ipsys_log.cli.keys import read_keys
     from ipsys_log.errors import IpsysError
+    from ipsys_log.extras import check_installed
     from ipsys_log.player import Player
     from ipsys_log.rig.file import load_rig
     from ipsys_log.sinks.playback import PlaybackOptions
 
     if restamp not in ("original", "now"):
         raise IpsysError(f"--restamp {restamp}: is not known; use original or now")
+    if web:
+        check_installed("--web needs", "starlette", "uvicorn")
     described = None if rig is None else load_rig(rig)
     folder = Path() if rig is None else rig.parent
-    settings = choose_streams(described, folder, **streams)
-    if not settings:
-        raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870")
+    settings = choose_streams(described, folder, has_page=web, **streams)
+    if not settings and not web:
+        raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870, or add --web")
+    port = check_playback_page(web, streams["host"], web_port)
     options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")
-    player = Player(logs, run, topics or (), options, settings, say=say)
+    player = Player(logs, run, topics or (), options, settings, say=say, has_dashboard=web)
     stop_on_signal(player.stop)
-    with player:
+    with serve_playback(player, streams["host"], port), player:
         for line in player.lines:
             say(line)
         with read_keys(player, say):

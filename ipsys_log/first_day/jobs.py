@@ -11,9 +11,13 @@ from typing import Any
 from ipsys_log.errors import IpsysError
 from ipsys_log.plain_text import plain_text
 
-__all__ = ["Job", "Jobs"]
+__all__ = ["Job", "JobStoppedError", "Jobs"]
 
 _MOST_LINES = 40
+
+
+class JobStoppedError(Exception):
+    """The user has stopped a job: its work ends here."""
 
 
 class Job:
@@ -40,7 +44,19 @@ class Job:
         self._lines.append(plain_text(text))
 
     def progress(self, stage: str, done: int, total: int | None) -> None:
-        """Show the progress of a stage."""
+        """Show the progress of a stage that a stop of the user may interrupt.
+
+        Raises
+        ------
+        JobStoppedError
+            The user has stopped the job.
+        """
+        self.note_progress(stage, done, total)
+        if self.is_stopped():
+            raise JobStoppedError(self.name)
+
+    def note_progress(self, stage: str, done: int, total: int | None) -> None:
+        """Show the progress of a stage that ends in order after a stop."""
         self._stage, self._done, self._total = stage, done, total or 0
 
     def on_stop(self, stop: Callable[[], object]) -> None:
@@ -125,6 +141,8 @@ def _run(job: Job, work: Callable[[Job], None]) -> None:
     """Do the work of a job; every exception becomes a text of the job."""
     try:
         work(job)
+    except JobStoppedError:
+        job.say("stopped; every finished step is kept")
     except IpsysError as error:
         job.error = plain_text(str(error))
     except Exception as error:

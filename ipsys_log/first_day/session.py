@@ -7,12 +7,12 @@ from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from ipsys_log.calibration.board import parse_board
 from ipsys_log.capture.usb_bus import UsbCamera
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.first_day import work
 from ipsys_log.first_day.alignment import AlignmentResult, read_result
+from ipsys_log.first_day.board_entry import BOARD_FIELDS, parse_board_entry
 from ipsys_log.first_day.board_search import BoardSearch
 from ipsys_log.first_day.camera_choice import (
     list_attached,
@@ -38,8 +38,6 @@ DICTIONARIES = (
     *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
 )
 
-# The board as the options of ``ipsys calibrate`` describe it without other values.
-_SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
 _CALIBRATION = "the calibration"
 
 
@@ -103,6 +101,7 @@ class SetupSession:
             "rig": self._describe_rig(progress),
             "cameras": self._describe_cameras(progress),
             "intrinsics": [asdict(one) for one in progress.intrinsics],
+            "board_fields": BOARD_FIELDS,
             "board": self._describe_board(),
             "alignment": self._describe_alignment(progress),
             "points": {
@@ -161,8 +160,8 @@ class SetupSession:
             raise IpsysError(f"the folder has no new intrinsics of camera {camera!r}; calibrate it first")
         set_calibration(self._folder.rig_file, camera, file)
 
-    def calibrate(self, camera: str, board: str) -> list[Fault]:
-        """Start the calibration of a camera with a board; return the fault of the board instead.
+    def calibrate(self, camera: str, typed: Mapping[str, str]) -> list[Fault]:
+        """Start the calibration of a camera with a board; return the fault of a field instead.
 
         Raises
         ------
@@ -173,15 +172,14 @@ class SetupSession:
         step = read_progress(self._folder)
         if camera not in [one.camera for one in step.intrinsics]:
             raise IpsysError(f"lab.toml has no camera {camera!r} with a source; reload this page")
-        try:
-            wanted = parse_board(board, _SQUARE_M, _MARKER_SCALE, _DICTIONARY, False)
-        except IpsysError as error:
-            return [Fault("board", str(error))]
+        entry = parse_board_entry(typed)
+        if isinstance(entry, Fault):
+            return [entry]
         pictures = self._folder.new_board_folder(camera)
-        search = self._search = BoardSearch(camera, wanted, pictures)
+        search = self._search = BoardSearch(camera, entry.parse(), pictures)
         self.jobs.start(
             f"{_CALIBRATION} of {camera}",
-            lambda job: work.calibrate(self._folder, search, pictures, board, job),
+            lambda job: work.calibrate(self._folder, search, pictures, entry, job),
         )
         return []
 

@@ -22,6 +22,7 @@ from ipsys_log.capture.simulated import show_board
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, load_lenses
+from ipsys_log.first_day.board_entry import BoardEntry
 from ipsys_log.first_day.board_search import BoardSearch
 from ipsys_log.first_day.camera_choice import set_calibration
 from ipsys_log.first_day.jobs import Job
@@ -101,7 +102,7 @@ def align(folder: LabFolder, job: Job) -> None:
             api.replay(log, until=_LAST_STAGE, method="pose", progress=job.progress, say=job.say)
 
 
-def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, board: str, job: Job) -> None:
+def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: BoardEntry, job: Job) -> None:
     """Take pictures of a board until they are enough or the job is stopped, and calibrate the camera.
 
     This is ``ipsys calibrate --rig lab.toml --board BOARD --camera NAME``; it also writes the file into the
@@ -114,7 +115,7 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, board: str
     """
     _, cameras = load_cameras(folder.rig_file, [search.camera])
     check_sources(cameras)
-    shown = [show_board(camera, board) for camera in cameras]
+    shown = [show_board(camera, entry.board) for camera in cameras]
     job.say(f"opening {search.camera}")
     with LiveCameras(shown, open_source, Clock(), job.say) as attached:
         job.on_stop(attached.stop)
@@ -126,7 +127,10 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, board: str
                 if search.is_enough:
                     attached.stop()
     job.say(f"{search.count} pictures are in {pictures.parent.name}/{pictures.name}")
-    (outcome,) = api.calibrate(pictures, board=board, cameras=[search.camera], progress=job.progress)
+    # A stop ends the search early: the pictures so far count.
+    (outcome,) = api.calibrate(
+        pictures, **entry._asdict(), cameras=[search.camera], progress=job.note_progress
+    )
     if not isinstance(outcome, CalibrationResult):
         raise IpsysError(outcome.reason)
     file = f"{search.camera}.yaml"
@@ -178,6 +182,8 @@ def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManage
 
 def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
     """Fit the model to all calibration points of the folder, and evaluate it (``ipsys replay``).
+
+    A stop keeps the finished runs; the logs get no part of a run.
 
     Raises
     ------
@@ -320,6 +326,6 @@ class _Enough:
         if span_ns >= self._span_ns and self._counts[camera] >= _LEAST_FRAMES:
             self._done.add(camera)
         shares = min(self._counts.values())
-        self._job.progress("frames of each camera", shares, None)
+        self._job.note_progress("frames of each camera", shares, None)
         if len(self._done) == len(self._counts):
             self._cameras.stop()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import heapq
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from math import isfinite
 from typing import Any
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import FrameTransforms, Message
+from ipsys_log.messages import FrameTransforms, Latency, Message
 from ipsys_log.sinks.streams.poses import NewSession, first_session
 from ipsys_log.sinks.timeline import Timeline
 from ipsys_log.units import NS_PER_S
@@ -240,7 +240,7 @@ def in_capture_order(messages: Iterable[Message], window_ns: int = _LOGGED_AFTER
     waiting: list[tuple[int, int, Message]] = []
     for number, message in enumerate(messages):
         heapq.heappush(waiting, (message.publish_time_ns, number, message))
-        while waiting[0][0] + window_ns <= message.log_time_ns:
+        while waiting and waiting[0][0] + window_ns <= message.log_time_ns:
             yield heapq.heappop(waiting)[-1]
     while waiting:
         yield heapq.heappop(waiting)[-1]
@@ -252,6 +252,9 @@ def _restamp(message: Message, time_ns: int) -> Message:
     if isinstance(payload, FrameTransforms):
         moved = (replace(row, timestamp=row.timestamp + shift_ns) for row in payload.transforms)
         payload = replace(payload, transforms=tuple(moved))
+    elif isinstance(payload, Latency):
+        times = (field.name for field in fields(payload) if field.name != "camera")
+        payload = replace(payload, **{name: getattr(payload, name) + shift_ns for name in times})
     elif hasattr(payload, "timestamp"):
         payload = replace(payload, timestamp=payload.timestamp + shift_ns)
     log_time_ns = message.log_time_ns + shift_ns

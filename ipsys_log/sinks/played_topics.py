@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Rig
-from ipsys_log.messages.channels import CALIBRATIONS, MEASUREMENTS, POSES, RIG_TOPIC, TRACKS, TRUTH
+from ipsys_log.messages import CameraCalibration, Message, Model, Rig
+from ipsys_log.messages.channels import (
+    CALIBRATIONS,
+    LATENCY,
+    MEASUREMENTS,
+    POSES,
+    POSITIONS,
+    RIG_TOPIC,
+    TRACKS,
+    TRUTH,
+)
 from ipsys_log.runs.provenance import newest_run
+from ipsys_log.sinks.selection import choose_runs, model_in_force
 
-__all__ = ["PlayedTopics", "choose_topics", "read_first", "viewed_topics"]
+__all__ = [
+    "PlayedScene",
+    "PlayedTopics",
+    "choose_topics",
+    "dashboard_topics",
+    "read_first",
+    "read_scene",
+    "viewed_topics",
+]
 
 
 class PlayedTopics(NamedTuple):
@@ -20,6 +39,27 @@ class PlayedTopics(NamedTuple):
     topics: tuple[str, ...]
     tracks: str
     run: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedScene:
+    """The constant parts of a played log, for a display.
+
+    Attributes
+    ----------
+    name : the name of the file.
+    rig, model : None if the log has none.
+    lenses : intrinsics by camera.
+    run : the run of the tracks; None: ground truth.
+    cameras : the cameras with images.
+    """
+
+    name: str
+    rig: Rig | None
+    lenses: Mapping[str, CameraCalibration]
+    model: Model | None
+    run: str | None
+    cameras: tuple[str, ...]
 
 
 def choose_topics(session: Session, run: str | None = None, names: Sequence[str] = ()) -> PlayedTopics:
@@ -69,6 +109,22 @@ def read_first(session: Session, rig: Rig | None) -> Iterator[Message]:
     yield from session.messages(session.topics(CALIBRATIONS))
     if rig is not None:
         yield Message(RIG_TOPIC, session.start_ns, session.start_ns, rig)
+
+
+def dashboard_topics(session: Session, chosen: PlayedTopics) -> PlayedTopics:
+    """Add the topics of the dashboard: images, markers, positions of the run, events, and latencies."""
+    complete = {record.run for record in session.runs()}
+    shown = choose_runs(session, [chosen.run] if chosen.run in complete else [])
+    positions = session.topics(POSITIONS, chosen.run) if chosen.run is not None else []
+    added = (*shown.frames, *positions, *shown.events, *session.topics(LATENCY))
+    return chosen._replace(topics=tuple(dict.fromkeys([*chosen.topics, *added])))
+
+
+def read_scene(session: Session, chosen: PlayedTopics, rig: Rig | None) -> PlayedScene:
+    """Return the constant parts of a log."""
+    lenses = {name: session.payloads([topic])[-1] for name, topic in session.calibrations.items()}
+    model = None if chosen.run is None else model_in_force(session, chosen.run)
+    return PlayedScene(session.paths[0].name, rig, lenses, model, chosen.run, tuple(sorted(session.images)))
 
 
 def _command(session: Session) -> str:

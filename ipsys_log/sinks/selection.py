@@ -14,13 +14,14 @@ from ipsys_log.messages import (
     EVENTS_TOPIC,
     RIG_TOPIC,
     TRUTH_TOPIC,
+    Model,
     Rig,
     Run,
 )
-from ipsys_log.messages.channels import EVENTS, MARKERS, POSITIONS, RUN_EVENTS, TRACKS, TRUTH
+from ipsys_log.messages.channels import EVENTS, MARKERS, MODEL, POSITIONS, RUN_EVENTS, TRACKS, TRUTH
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Shown", "choose_runs", "fade_ns", "rig_in_force"]
+__all__ = ["Shown", "choose_runs", "fade_ns", "model_in_force", "rig_in_force"]
 
 _FADE_STEPS = 3
 
@@ -122,3 +123,12 @@ def rig_in_force(session: Session, runs: Sequence[str]) -> Rig | None:
             return record.rig
     rigs = session.payloads([RIG_TOPIC]) if session.count(RIG_TOPIC) else []
     return next((rig for rig in reversed(rigs) if isinstance(rig, Rig)), None)
+
+
+def model_in_force(session: Session, run: str) -> Model | None:
+    """Return the fitted model of a run, or of a run from which it was made; None if the log has none."""
+    records = session.runs()
+    fitted = [name for name in _sources(records, [run]) if session.topics(MODEL, name)]
+    newest = run if run in fitted else _newest(records, fitted)
+    models = [] if newest is None else session.payloads(session.topics(MODEL, newest))
+    return models[-1] if models else None

@@ -7,10 +7,14 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from ipsys_log.first_day.jobs import Job
+from ipsys_log.web.first_day.app import SetupApp
+from ipsys_log.web.server import PageServer
 from tests.conftest import Ipsys
 from tests.playing import WAIT_LIMIT_S
 
@@ -39,3 +43,26 @@ def test_file_instead_of_a_folder_is_one_line(ipsys: Ipsys, tmp_path: Path) -> N
     assert done.code == 1
     assert "is a file; name a folder" in done.err
     assert len(done.err.strip().splitlines()) == 1
+
+
+def test_bug_in_a_job_ends_the_command_with_its_traceback(
+    ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    apps: list[SetupApp] = []
+    make = SetupApp.__init__
+
+    def keep(self: SetupApp, *given: object) -> None:
+        make(self, *given)  # type: ignore[arg-type]
+        apps.append(self)
+
+    def breaks(_: Job) -> None:
+        raise ZeroDivisionError("by zero")
+
+    def wait(_: PageServer, stopped: Callable[[], bool]) -> None:
+        apps[0].session.jobs.start("the fit", breaks)
+
+    monkeypatch.setattr(SetupApp, "__init__", keep)
+    monkeypatch.setattr(PageServer, "wait", wait)
+    done = ipsys("setup", tmp_path / "lab", "--port", 0)
+    assert done.code == 1
+    assert "ZeroDivisionError: by zero" in done.err

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.jobs import Job, Jobs
+from ipsys_log.first_day.lab_folder import LabFolder
+from ipsys_log.first_day.work import fit_and_evaluate
 
 
 def test_second_job_is_refused_until_the_first_ends() -> None:
@@ -49,6 +52,23 @@ def test_error_of_a_job_is_one_line_and_a_bug_keeps_its_traceback() -> None:
     jobs.close()
     (bug,) = jobs.bugs
     assert "in breaks" in bug
+
+
+def test_stopped_fit_keeps_the_log_and_is_no_error(lab: Path, tmp_path: Path) -> None:
+    folder = LabFolder(tmp_path)
+    before = lab.read_bytes()
+    jobs = Jobs()
+
+    def fit(job: Job) -> None:
+        job.stop()  # as the user, before the first frame is processed
+        fit_and_evaluate(folder, job)
+
+    jobs.start("the fit", fit)
+    jobs.close()
+    assert jobs.present is not None
+    assert (jobs.present.error, jobs.bugs) == ("", [])
+    assert "stopped" in jobs.present.describe()["lines"][-1]
+    assert lab.read_bytes() == before
 
 
 def test_stop_before_the_cameras_open_still_stops_them() -> None:

@@ -58,6 +58,13 @@ def test_late_messages_are_played_at_their_capture_time() -> None:
     assert times_of(playback(clock, log), clock) == [(n * STEP_NS, n * STEP_NS) for n in range(5)]
 
 
+def test_message_logged_long_after_its_capture_is_played() -> None:
+    log = [tracks(0), tracks(1, late_ns=3 * NS_PER_S), tracks(2, late_ns=3 * NS_PER_S)]
+    assert [message.publish_time_ns for message in in_capture_order(log)] == [
+        message.publish_time_ns for message in log
+    ]
+
+
 def test_capture_order_reads_little_ahead() -> None:
     read = 0
 

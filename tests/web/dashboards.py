@@ -35,7 +35,7 @@ from ipsys_log.messages import (
 from ipsys_log.units import NS_PER_S
 from ipsys_log.web.dashboard.app import build_dashboard
 from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 from ipsys_log.web.server import PageServer, serve_app
 from tests.playing import WAIT_LIMIT_S
 from tests.stages.drawing import jpeg
@@ -65,7 +65,7 @@ class LiveLab:
         self.said: list[str] = []
         self.states = {name: CameraState(frames=30, up=True, delay_s=0.004) for name in ("red", "white")}
         self.checks = {"red": FrameCheck((0,), (), 120.0, 1.0, ("the image is blurred: add light",))}
-        setting = LiveSetting(
+        setting = DashboardSetting(
             RIG, lenses or {}, model, "poly", self.states, self.checks, log, self.now_ns, tuple(streams)
         )
         self.operator = Operator(self.write, self.now_ns, self.said.append)

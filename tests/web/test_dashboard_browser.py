@@ -136,12 +136,12 @@ def test_operator_needs_only_the_keyboard(browser: Phone, lab: LiveLab) -> None:
         # After a reload it is the same device; another one may take over.
         browser.reload()
         says(browser, "#operation", "This device operates")
-        lab.operator.claim(True)
+        lab.operator.seat.claim(True)
         says(browser, "#operation", "Another device operates")
         assert not browser.run("document.querySelector('#mark').checkVisibility()")
         browser.tap("#take")
         says(browser, "#operation", "This device operates")
-        lab.operator.claim(True)
+        lab.operator.seat.claim(True)
         says(browser, "#take", "Take over")
 
 
@@ -168,9 +168,35 @@ def test_page_says_when_data_stop_and_goes_on_by_itself(browser: Phone, lab: Liv
     browser.console.clear()
 
 
+def lose_network(browser: Phone, is_lost: bool) -> None:
+    """Cut the page off from the server, or connect it again."""
+    browser.send("Network.enable")
+    unlimited = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    browser.send("Network.emulateNetworkConditions", offline=is_lost, **unlimited)
+
+
+def test_page_shows_the_newest_state_after_a_lost_network(browser: Phone, lab: LiveLab) -> None:
+    with page_of(lab.dashboard) as page:
+        browser.open(page.url, PHONE)
+        says(browser, "#state", "live")
+        lose_network(browser, True)
+        says(browser, "#state", "no data for")
+        # Meanwhile the recording goes on.
+        lab.run(5)
+        lab.feed(tracks(lab.time_ns, robot(1, 3.0, 2.0)), event(lab.time_ns, "camera_back", "white is back"))
+        lose_network(browser, False)
+        says(browser, "#state", "live")
+        says(browser, "#events", "white is back")
+        browser.wait(f"{COUNT.format('#floor .robot')} === 2")
+        browser.send("Page.navigate", url="about:blank")
+    # The lost network is the only error.
+    assert all('"network"' in text for text in browser.console)
+    browser.console.clear()
+
+
 @pytest.mark.parametrize("size", [PHONE, DESKTOP, WALL], ids=["phone", "desktop", "wall"])
 def test_page_fits_the_screen_in_both_schemes(browser: Phone, lab: LiveLab, size: tuple[int, int]) -> None:
-    lab.operator.claim(False)
+    lab.operator.seat.claim(False)
     with page_of(lab.dashboard) as page, opened(browser, page.url, size):
         browser.wait(f"{COUNT.format('figure image')} === 2")
         browser.tap("#take")

@@ -26,7 +26,7 @@ from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
 from ipsys_log.runs.options import Request
 from ipsys_log.web.connections import PageLimits
 from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 from tests.live_recordings import again, attached_in_steps, lenses, sent
 from tests.playing import WAIT_LIMIT_S
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, markers, page_of, robot, tracks
@@ -105,7 +105,8 @@ def test_page_of_this_machine_needs_no_secret_and_operates(lab: LiveLab) -> None
         assert caller.token == ""
         assert caller.ask("GET", "/")[0] == 200
         assert json.loads(caller.ask("GET", "/api/scene")[1])["may_operate"] is True
-        assert post(caller, "/api/operate", {}) == (200, {"operator": 1})
+        status, answer = post(caller, "/api/operate", {})
+        assert (status, answer["operator"]) == (200, lab.operator.seat.number)
 
 
 def test_page_without_a_secret_is_refused(lab: LiveLab) -> None:
@@ -130,7 +131,7 @@ def test_viewer_sees_everything_and_changes_nothing(lab: LiveLab) -> None:
         for path, body in ACTIONS.items():
             status, text = post(caller, path, {**body, "operator": number}, **viewer)
             assert (status, "may only view" in text) == (403, True), path
-        assert (lab.operator.number, lab.written) == (number, [])
+        assert (lab.operator.seat.number, lab.written) == (number, [])
         # A browser that opened both addresses is an operator.
         both = {"Cookie": f"{viewer['Cookie']}; {operator['Cookie']}"}
         assert post(caller, "/api/mark", {"operator": number, "text": "now"}, **both)[0] == 200
@@ -216,7 +217,7 @@ def test_wrong_request_is_refused_with_one_sentence(lab: LiveLab) -> None:
 
 
 def test_text_of_a_mark_cannot_control_the_terminal(lab: LiveLab) -> None:
-    number = lab.operator.claim(False)
+    number = lab.operator.seat.claim(False)
     lab.operator.mark(number, "a\x1b]0;b\x07 \u202e c")
     assert [written.text for written in lab.written] == ["a\\x1b]0;b\\x07 \\u202e c"]
     assert lab.said == ["mark: a\\x1b]0;b\\x07 \\u202e c"]
@@ -228,7 +229,7 @@ def test_mark_after_the_end_is_refused_with_the_reason() -> None:
 
     operator = Operator(ended, lambda: BEGIN_NS, print)
     with pytest.raises(IpsysError, match="the recording has ended"):
-        operator.start_segment(operator.claim(False), "warm-up")
+        operator.start_segment(operator.seat.claim(False), "warm-up")
     assert operator.segment is None
 
 
@@ -353,7 +354,9 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
     (rig,) = (message.payload for message in settings if message.topic == RIG.topic)
     with attached:
         operator = Operator(attached.add, clock.now_ns, lambda text: None)
-        setting = LiveSetting(rig, lenses(lab_log), None, "poly", attached.states, {}, log, clock.now_ns, ())
+        setting = DashboardSetting(
+            rig, lenses(lab_log), None, "poly", attached.states, {}, log, clock.now_ns, ()
+        )
         dashboard = Dashboard(setting, operator)
         frames = 0
 
@@ -363,8 +366,8 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
                 return
             shown.append(message)
             frames += message.topic.endswith("/image")
-            if frames == 20 and operator.number == 0:
-                number = operator.claim(False)
+            if frames == 20 and operator.seat.number == 0:
+                number = operator.seat.claim(False)
                 operator.mark(number, "robot pushed")
                 operator.start_segment(number, "warm-up")
                 operator.end_segment(number)

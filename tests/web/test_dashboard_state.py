@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 from itertools import pairwise
@@ -292,6 +293,24 @@ def test_data_are_made_once_for_all_pages(lab: LiveLab, monkeypatch: pytest.Monk
     assert len(made) == 4
     # Without news, only the status is made again, after a second.
     assert [{*parts(feed.newest(pages[0], 0.1 + n / 30))} for n in range(60)].count({"status"}) == 2
+
+
+def test_late_wake_ups_do_not_reduce_the_rate(lab: LiveLab) -> None:
+    now_s, late_s, updates = 1000.0, 0.008, 0
+
+    async def sleep(seconds: float) -> None:
+        nonlocal now_s
+        now_s += seconds + late_s
+        lab.feed(tracks(BEGIN_NS + round(now_s * 1e9), robot(0, 1.0, 1.0)))
+
+    async def read() -> None:
+        nonlocal updates
+        async for data in Feed(lab.dashboard).stream(lambda: now_s, sleep):
+            updates += b"event: robots" in data
+
+    begin_s = now_s
+    asyncio.run(read())
+    assert updates / (now_s - begin_s) == pytest.approx(30, abs=0.5)
 
 
 def test_slow_page_gets_only_the_newest_data(lab: LiveLab) -> None:

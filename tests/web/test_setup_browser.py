@@ -20,6 +20,7 @@ from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone, phone
 from tests.web.test_dashboard_browser import press
 from tests.web.test_measuring_page import FETCHED, says
+from tests.web.test_setup_page import Client
 
 # A browser for each test.
 pytestmark = pytest.mark.slow
@@ -44,7 +45,7 @@ class Visitor:
 
     def tap(self, selector: str) -> None:
         """Tap a button; the page draws its panel before the button can be hit again."""
-        self.wait(f"document.querySelector({selector!r} + ':not(:disabled)')")
+        self.wait(f"document.querySelector({selector!r} + ':not(:disabled)')?.checkVisibility()")
         self.browser.tap(selector)
         self.inputs += 1
 
@@ -88,15 +89,30 @@ def serving(folder: Path) -> Iterator[str]:
         assert server.exceptions.count == 0, server.exceptions.first
 
 
+@contextmanager
+def opened(browser: Phone, folder: Path, size: tuple[int, int] = PHONE) -> Iterator[str]:
+    """Open the page of a folder, and leave it at the end; the browser must have reported no error."""
+    with serving(folder) as url:
+        browser.open(url, size)
+        yield url
+        leave(browser)
+    assert unexpected(browser) == []
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "a_long_name_of_a_folder_for_a_lab"
+    path.mkdir()
+    return path
+
+
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Phone]:
     with phone(tmp_path) as one:
         yield one
 
 
-def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, tmp_path: Path) -> None:
-    folder = tmp_path / "lab"
-    folder.mkdir()
+def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: Path) -> None:
     visitor = Visitor(browser)
     with serving(folder) as url:
         browser.open(url)
@@ -140,12 +156,9 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, tmp_path
     assert np.median(positions_m) < 0.01
 
 
-def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, tmp_path: Path) -> None:
-    folder = tmp_path / "lab"
-    folder.mkdir()
+def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, folder: Path) -> None:
     visitor = Visitor(browser)
-    with serving(folder) as url:
-        browser.open(url)
+    with opened(browser, folder) as url:
         visitor.tap("#simulate")
         visitor.wait("document.querySelector('#onward')")
         browser.run("location.hash = 'intrinsics'")
@@ -168,15 +181,10 @@ def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, tmp_path: P
         visitor.wait(JOB_ENDED)
         # Without a point, the step is not done.
         says(browser, "#panel", "0 points measured")
-        leave(browser)
-    assert unexpected(browser) == []
 
 
-def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, tmp_path: Path) -> None:
-    folder = tmp_path / "a_long_name_of_a_folder_for_a_lab"
-    folder.mkdir()
-    with serving(folder) as url:
-        browser.open(url, DESKTOP)
+def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, folder: Path) -> None:
+    with opened(browser, folder, DESKTOP) as url:
         browser.wait("document.querySelector('#marker_length_m')")
         browser.run("document.querySelector('#marker_length_m').value = '20'")
         browser.tap("#save")
@@ -197,15 +205,10 @@ def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, tmp_path: 
                 for scheme in ("light", "dark"):
                     browser.prefer(scheme)
                     assert low_contrasts(browser) == [], (size, name, scheme)
-        leave(browser)
-    assert unexpected(browser) == []
 
 
-def test_keyboard_alone_reaches_the_next_step(browser: Phone, tmp_path: Path) -> None:
-    folder = tmp_path / "lab"
-    folder.mkdir()
-    with serving(folder) as url:
-        browser.open(url, DESKTOP)
+def test_keyboard_alone_reaches_the_next_step(browser: Phone, folder: Path) -> None:
+    with opened(browser, folder, DESKTOP):
         browser.wait("document.querySelector('#simulate')")
         focus(browser, "#simulate")
         press(browser, "Enter", "\r")
@@ -218,3 +221,24 @@ def test_keyboard_alone_reaches_the_next_step(browser: Phone, tmp_path: Path) ->
         focus(browser, "#step-points")
         press(browser, "Enter", "\r")
         says(browser, "h2", "5. Calibration points")
+
+
+def test_second_device_takes_over_before_it_changes_anything(browser: Phone, folder: Path) -> None:
+    with opened(browser, folder) as url:
+        Visitor(browser).tap("#simulate")
+        says(browser, "#operation", "This device operates")
+        # Another device takes over: the page shows it, and its buttons wait.
+        other = Client(url)
+        other.operate(take_over=True)
+        says(browser, "#operation", "Another device operates")
+        browser.run("location.hash = 'rig'")
+        browser.wait("document.querySelector('#save').disabled")
+        browser.tap("#take")
+        says(browser, "#operation", "This device operates")
+        browser.wait("!document.querySelector('#save').disabled")
+        assert other.ask("/api/start", {"action": "align"})[0] == 400
+        # After a reload, and in another tab, it is the same device.
+        browser.reload()
+        says(browser, "#operation", "This device operates")
+        visit(browser, url)
+        says(browser, "#operation", "This device operates")

@@ -38,12 +38,15 @@ class Client:
     def __init__(self, url: str, setup: SetupApp | None = None) -> None:
         self.parts, self.setup = urlsplit(url), setup
         self.cookie: dict[str, str] = {}
+        self.operator = 0
 
     def ask(self, path: str, body: Any = None, **headers: str) -> tuple[int, Any]:
         connection = http.client.HTTPConnection(
             str(self.parts.hostname), self.parts.port or 0, timeout=WAIT_LIMIT_S
         )
         try:
+            if isinstance(body, dict):
+                body = {"operator": self.operator, **body}
             data = None if body is None else json.dumps(body).encode()
             sent = {"X-Ipsys": "1", **self.cookie, **{k.replace("_", "-"): v for k, v in headers.items()}}
             connection.request("GET" if body is None else "POST", path, data, sent)
@@ -55,6 +58,12 @@ class Client:
             return answer.status, json.loads(text) if is_json else text
         finally:
             connection.close()
+
+    def operate(self, take_over: bool = False) -> None:
+        """Claim the seat of the operator."""
+        status, answer = self.ask("/api/operate", {"take_over": take_over})
+        assert status == 200
+        self.operator = answer["operator"]
 
     def state(self) -> dict[str, Any]:
         status, state = self.ask("/api/state")
@@ -81,7 +90,9 @@ def folder(tmp_path: Path) -> Path:
 def page(folder: Path) -> Iterator[Client]:
     setup = SetupApp(LabFolder(folder))
     with serve_app(setup.app, None, 0, has_viewers=True) as server:
-        yield Client(server.url, setup)
+        client = Client(server.url, setup)
+        client.operate()
+        yield client
         setup.session.close()
         assert server.exceptions.count == 0, server.exceptions.first
 
@@ -105,11 +116,11 @@ def test_restart_continues_where_the_files_are(page: Client, folder: Path) -> No
     other = SetupApp(LabFolder(folder))
     with serve_app(other.app, None, 0) as server:
         first, second = page.state(), Client(server.url).state()
-        assert first == second
+        assert {**first, "operator": 0} == second
         assert second["next"] == "alignment"
 
 
-def test_second_job_is_refused_and_any_device_stops_the_first(page: Client, folder: Path) -> None:
+def test_second_job_is_refused_and_the_operator_stops_the_first(page: Client, folder: Path) -> None:
     (folder / "lab.toml").write_text(SMALL)
     stopped = threading.Event()
 
@@ -121,6 +132,8 @@ def test_second_job_is_refused_and_any_device_stops_the_first(page: Client, fold
     page.setup.session.jobs.start("the fit", work)
     other = Client(page.parts.geturl())
     assert other.state()["job"]["name"] == "the fit"
+    assert "another device operates" in other.ask("/api/stop", {})[1]["error"]
+    other.operate(take_over=True)
     for path, body in (("/api/start", {"action": "align"}), ("/api/rig", {"values": {"name": "x"}})):
         status, answer = other.ask(path, body)
         assert (status, "the fit is not finished" in answer["error"]) == (400, True)
@@ -149,7 +162,8 @@ def test_pictures_of_cameras_are_seen_by_all(page: Client, folder: Path) -> None
         ("/api/start", {"action": "live"}),
         ("/api/start", {"action": "sheet"}),
         ("/api/start", []),
-        ("/api/calibrate", {"camera": "../red", "board": "6x4"}),
+        ("/api/calibrate", {"camera": "../red", "options": {"board": "6x4"}}),
+        ("/api/calibrate", {"camera": "red", "options": "6x4"}),
         ("/api/intrinsics", {"camera": "../../etc/passwd"}),
         ("/api/cameras", {"names": {"file:/etc/passwd": "red"}}),
         ("/api/cameras", {"names": ["red"]}),
@@ -194,5 +208,55 @@ def test_device_that_may_only_view_sees_and_changes_nothing(folder: Path) -> Non
             client = Client(str(url))
             assert client.ask(f"/?{client.parts.query}")[0] == 303
             assert client.state()["may_operate"] is may
+            if may:
+                client.operate()
             status, _ = client.ask("/api/rig", {"values": {}})
             assert (status, (folder / "lab.toml").exists()) == (200 if may else 403, may)
+
+
+def test_second_device_changes_nothing_until_it_takes_over(page: Client, folder: Path) -> None:
+    other = Client(page.parts.geturl())
+    for path in ("rig", "simulate", "cameras", "intrinsics", "calibrate", "start", "stop"):
+        status, answer = other.ask(f"/api/{path}", {})
+        assert (status, "press 'Take over'" in answer["error"]) == (400, True), path
+    assert "another device operates" in other.ask("/api/operate", {})[1]["error"]
+    assert list(folder.iterdir()) == []
+    assert page.state()["operator"] == other.state()["operator"] == page.operator
+    other.operate(take_over=True)
+    assert other.ask("/api/simulate", {}) == (200, {})
+    assert page.ask("/api/start", {"action": "align"})[0] == 400
+    assert page.ask("/api/operate", {"release": page.operator}) == (200, {})  # it operates no more
+    assert other.state()["operator"] == other.operator
+
+
+def test_device_of_an_earlier_server_does_not_operate(folder: Path) -> None:
+    numbers = set()
+    for _ in range(2):
+        setup = SetupApp(LabFolder(folder))
+        with serve_app(setup.app, None, 0) as server:
+            client = Client(server.url)
+            client.operate()
+            numbers.add(client.operator)
+    assert len(numbers) == 2
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "fault"),
+    [
+        ("board", "6", "--board 6: is not a board"),
+        ("square", "3 cm", "--square 3 cm: is not a number"),
+        ("square", "20", "--square 20: is not a length"),
+        ("lens", "ideal", "--lens ideal: is not known"),
+        ("marker_scale", "2", "--marker-scale 2: is not between 0 and 1"),
+        ("dictionary", "DICT_1X1", "--dictionary DICT_1X1: is unknown to OpenCV"),
+    ],
+)
+def test_option_of_the_board_is_checked_at_its_field(
+    page: Client, folder: Path, field: str, text: str, fault: str
+) -> None:
+    (folder / "lab.toml").write_text(SMALL)
+    options = {"board": "charuco:4x5", field: text}
+    status, answer = page.ask("/api/calibrate", {"camera": "red", "options": options})
+    assert (status, answer["faults"][0]["field"]) == (409, field)
+    assert answer["faults"][0]["text"].startswith(fault)
+    assert not (folder / "boards").exists()

@@ -15,6 +15,7 @@ from ipsys_log.web.dashboard.feed import Feed
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.pictures import shrink
 from ipsys_log.web.dashboard.state import Dashboard
+from ipsys_log.web.operator_seat import answer_claim, operator_of
 from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json, whole_number
 
 __all__ = ["build_dashboard"]
@@ -25,7 +26,7 @@ _FILES = {
     "/": ("dashboard.html", "text/html", _OWN),
     "/dashboard.css": ("dashboard.css", "text/css", _OWN),
     "/theme.css": ("theme.css", "text/css"),
-    "/make.js": ("make.js", "text/javascript"),
+    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("make", "operator")},
     **{f"/{name}.js": (f"{name}.js", "text/javascript", _OWN) for name in _SCRIPTS},
 }
 # Encoded pictures for later requests of other pages.
@@ -79,21 +80,17 @@ class _Answers:
     async def operate(self, request: Request) -> Response:
         """Claim the operation for a device, or release it."""
         body = await read_json(request)
-        operator = self._operator()
-        if "release" in body:
-            operator.release(_number(body["release"]))
-            return JSONResponse({})
-        return JSONResponse({"operator": operator.claim(body.get("take_over") is True)})
+        return JSONResponse(answer_claim(self._operator().seat, body))
 
     async def mark(self, request: Request) -> Response:
         body = await read_json(request)
-        self._operator().mark(_number(body.get("operator")), str(body.get("text", "")))
+        self._operator().mark(operator_of(body), str(body.get("text", "")))
         return JSONResponse({})
 
     async def segment(self, request: Request) -> Response:
         """Start a segment by its name, or end the present one."""
         body = await read_json(request)
-        operator, number = self._operator(), _number(body.get("operator"))
+        operator, number = self._operator(), operator_of(body)
         if "start" in body:
             operator.start_segment(number, str(body["start"]))
         else:
@@ -119,7 +116,3 @@ class _Answers:
             while len(self._pictures) > _KEPT:
                 del self._pictures[next(iter(self._pictures))]
         return self._pictures[key]
-
-
-def _number(value: object) -> int:
-    return value if isinstance(value, int) and not isinstance(value, bool) else 0

@@ -7,7 +7,7 @@ import { showTiles } from "./tiles.js";
 const $ = (id) => document.getElementById(id);
 // Without data for this time, the page says so.
 const QUIET_MS = 3000;
-let map, operation, source, heard = 0, end = null;
+let map, operation, source, heard = 0, end = null, played = null;
 
 function show(kind, text) {
   const chip = $("state");
@@ -18,11 +18,13 @@ function show(kind, text) {
 
 function judge() {
   const quiet = performance.now() - heard;
-  if (end === "ended") show("", "recording ended");
+  if (end === "ended") show("", played ? "playback ended" : "recording ended");
   else if (end === "failed") show("bad", "display failed: see the terminal");
-  else if (heard && quiet < QUIET_MS) show("good", "live");
+  else if (heard && quiet < QUIET_MS) show(played?.is_paused ? "" : "good", played ? playing(played) : "live");
   else if (heard) show("bad", `no data for ${Math.round(quiet / 1000)} s`);
 }
+
+const playing = ({ is_paused, rate }) => (is_paused ? "paused" : rate === 1 ? "playing" : `playing × ${rate}`);
 
 function listen(name, handle) {
   source.addEventListener(name, (message) => {
@@ -42,6 +44,7 @@ function connect() {
   listen("tiles", showTiles);
   listen("status", (data) => {
     end = data.end;
+    played = data.playback ?? null;
     showStatus(data);
     operation.show(data);
     judge();
@@ -69,6 +72,10 @@ async function begin() {
   }
   const scene = await answer.json();
   $("lab").textContent = scene.floor.lab;
+  if (scene.played) {
+    document.title = "ipsys playback";
+    $("kind").textContent = $("recording-title").textContent = "Playback";
+  }
   map = new FloorMap($("floor"), $("legend"), $("growth"), scene);
   operation = new Operation(scene.may_operate);
   reconnect();

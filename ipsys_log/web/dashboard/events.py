@@ -77,6 +77,12 @@ class RecentEvents:
             entry["count"] = earlier["count"] + 1
         self._entries.append(entry)
 
+    def forget(self) -> None:
+        """Forget all events: a playback begins again."""
+        self.version += 1
+        self.skipped.clear()
+        self._entries.clear()
+
     def newest_first(self) -> list[dict[str, Any]]:
         """Return the entries, the newest first; their times are in ms since 1970."""
         return list(reversed(self._entries))

@@ -11,10 +11,11 @@ from ipsys_log.web.dashboard.state import Dashboard
 
 __all__ = ["Feed"]
 
-# A page gets at most 30 updates per second.
+# A page gets at most 30 updates per second. All pages wake at the same times: an update is made once.
 _TICK_S = 1 / 30
 # Shortest time between two versions of a part. The status is made again after a second even without news.
-_TILES_S, _URGENT_S, _STATUS_S = 0.1, 0.1, 1.0
+# A wake-up is never exact, so these times are half a tick shorter than their number of ticks.
+_ROBOTS_S, _TILES_S, _URGENT_S, _STATUS_S = 0.5 * _TICK_S, 2.5 * _TICK_S, 2.5 * _TICK_S, 1.0
 # A stream ends after this time, and the page asks for the next one. So the limit of an answer holds for it,
 # too, and a page that does not read is disconnected.
 _STREAM_S, _RETRY_MS = 15.0, 200
@@ -55,7 +56,7 @@ class Feed:
         self._dashboard = dashboard
         # In the order of the versions of the dashboard.
         self._parts = (
-            _Part("robots", dashboard.robots, _TICK_S),
+            _Part("robots", dashboard.robots, _ROBOTS_S),
             _Part("tiles", dashboard.tiles, _TILES_S),
             _Part("status", dashboard.status, _URGENT_S, _STATUS_S),
         )
@@ -85,7 +86,8 @@ class Feed:
                 yield events
             if self._dashboard.end is not None and self._is_complete(sent):
                 return
-            await sleep(_TICK_S)
+            # A sleep of a whole tick would add the time of the work and of the wake-up to each tick.
+            await sleep(_TICK_S - now_s() % _TICK_S)
 
     def _is_complete(self, sent: dict[str, int]) -> bool:
         """Return whether a page has the newest version of each part."""

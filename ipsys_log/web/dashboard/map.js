@@ -79,6 +79,8 @@ export class FloorMap {
 
   // Show the newest poses. data: now in ms, and the robots.
   move(data) {
+    // A playback that goes to another time begins new trails.
+    if (this.data && data.session !== this.data.session) this.trails.clear();
     this.data = data;
     if (!this.at) return;
     const growth = Number(this.growth.value), present = new Set();

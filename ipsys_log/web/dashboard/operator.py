@@ -9,6 +9,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import EVENTS_TOPIC, Event
 from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
 from ipsys_log.plain_text import plain_text
+from ipsys_log.web.operator_seat import OperatorSeat
 
 __all__ = ["Operator", "Segment"]
 
@@ -33,39 +34,21 @@ class Operator:
 
     Attributes
     ----------
-    number : the number of the device that operates; 0: none.
+    seat : the seat of the device that operates.
     segment : the segment that has started; None: there is none.
-    version : increases with each change.
     """
 
     def __init__(
         self, add: Callable[[str, Any], None], now_ns: Callable[[], int], say: Callable[[str], object]
     ) -> None:
-        self.number, self.version = 0, 0
+        self.seat, self._written = OperatorSeat(), 0
         self.segment: Segment | None = None
         self._add, self._now_ns, self._say = add, now_ns, say
-        self._last = 0
 
-    def claim(self, take_over: bool) -> int:
-        """Return the number of a new operator.
-
-        Raises
-        ------
-        IpsysError
-            Another device operates, and the new one does not take over.
-        """
-        if self.number and not take_over:
-            raise IpsysError("another device operates; press 'Take over' to operate from this device")
-        self._last += 1
-        self.number = self._last
-        self.version += 1
-        return self.number
-
-    def release(self, number: int) -> None:
-        """End the operation by a device, if it still operates."""
-        if number == self.number:
-            self.number = 0
-            self.version += 1
+    @property
+    def version(self) -> int:
+        """A number that increases with each change of the seat or the segment."""
+        return self.seat.version + self._written
 
     def mark(self, number: int, text: str) -> None:
         """Write a remark of the operator to the log.
@@ -75,7 +58,7 @@ class Operator:
         IpsysError
             Another device operates, the text is empty or too long, or the recording has ended.
         """
-        self._check(number)
+        self.seat.check(number)
         now_ns = self._now_ns()
         self._write(Event(now_ns, MARK, _clean(text, _LONGEST_TEXT, "the text of the mark")), "mark: ")
 
@@ -88,7 +71,7 @@ class Operator:
             Another device operates, a segment has not ended, the name is empty or too long, or the recording
             has ended.
         """
-        self._check(number)
+        self.seat.check(number)
         if self.segment is not None:
             raise IpsysError(f"the segment {self.segment.name} has not ended; stop it first")
         name = _clean(name, _LONGEST_NAME, "the name of the segment")
@@ -104,7 +87,7 @@ class Operator:
         IpsysError
             Another device operates, no segment has started, or the recording has ended.
         """
-        self._check(number)
+        self.seat.check(number)
         if self.segment is None:
             raise IpsysError("no segment has started; start one first")
         (name, start_ns), now_ns = self.segment, self._now_ns()
@@ -112,13 +95,9 @@ class Operator:
         self._write(Event(now_ns, SEGMENT_ENDED, text, start=start_ns, end=now_ns, segment=name))
         self.segment = None
 
-    def _check(self, number: int) -> None:
-        if not number or number != self.number:
-            raise IpsysError("another device operates; press 'Take over' to operate from this device")
-
     def _write(self, event: Event, prefix: str = "") -> None:
         self._add(EVENTS_TOPIC, event)
-        self.version += 1
+        self._written += 1
         self._say(f"{prefix}{event.text}")
 
 

@@ -36,7 +36,8 @@ export function showRobots(data) {
 
 export function showStatus(data) {
   showCameras(data.cameras);
-  showRecording(data);
+  if (data.playback) showPlayback(data.playback);
+  else showRecording(data);
   showEvents(data.events);
   table($("latency"), ["step", "median", "99 %"], data.latency.map((row) => [row.step, `${row.median_ms.toFixed(1)} ms`, `${row.p99_ms.toFixed(1)} ms`]),
     "No position is published yet.");
@@ -69,6 +70,12 @@ function size(bytes) {
 function duration(seconds) {
   const whole = Math.floor(seconds), two = (value) => String(value).padStart(2, "0");
   return `${Math.floor(whole / 3600)}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
+}
+
+function showPlayback({ file, seconds, of_seconds, rate, is_paused, loops }) {
+  const rows = [["log", file], ["position", `${duration(seconds)} of ${duration(of_seconds)}`],
+    ["rate", `× ${rate}${is_paused ? ", paused" : ""}`], ["at the end", loops ? "begins again" : "stops"]];
+  fill($("recording"), rows, () => rows.flatMap(([name, value]) => [make("dt", {}, name), make("dd", {}, value)]));
 }
 
 function showRecording({ recording, segment }) {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import cv2
@@ -16,10 +16,10 @@ from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RawImage
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Pictures", "shrink"]
+__all__ = ["EVERY_NS", "Pictures", "shrink"]
 
 # At most five pictures of a camera per second.
-_EVERY_NS = NS_PER_S // 5
+EVERY_NS = NS_PER_S // 5
 # A frame without results of the stages is shown after this time.
 _UNMARKED_NS = 3 * NS_PER_S
 # Frames that wait for their markers, and pictures that a page may still ask for.
@@ -62,10 +62,15 @@ class _Tile:
 
 
 class Pictures:
-    """The newest frames of the cameras, at most five per second of each.
+    """The newest frames of the cameras, by default at most five per second of each.
 
     A frame is encoded when the first page asks for it. Without pages, nothing is encoded. A video shows
     its keyframes only.
+
+    Parameters
+    ----------
+    cameras : names of the cameras.
+    every_ns : returns the shortest time between two pictures of a camera, in log time.
 
     Attributes
     ----------
@@ -73,8 +78,9 @@ class Pictures:
     last_ns : log time of the last frame, by camera.
     """
 
-    def __init__(self, cameras: Iterable[str]) -> None:
+    def __init__(self, cameras: Iterable[str], every_ns: Callable[[], int] = lambda: EVERY_NS) -> None:
         self.version = 0
+        self._every_ns = every_ns
         self.last_ns: dict[str, int] = {}
         self._tiles = {camera: _Tile() for camera in sorted(cameras)}
 
@@ -86,7 +92,7 @@ class Pictures:
         payload = message.payload
         if isinstance(payload, Markers):
             image = next((one for one in tile.waiting if one.log_time_ns == message.log_time_ns), None)
-            if image is not None and _is_due(tile, image, _EVERY_NS):
+            if image is not None and _is_due(tile, image, self._every_ns()):
                 self._offer(tile, image, payload)
             return
         self.last_ns[str(message.camera)] = message.log_time_ns
@@ -97,6 +103,12 @@ class Pictures:
             tile.last_ns = message.log_time_ns  # the first markers may still come
         elif _is_due(tile, message, _UNMARKED_NS):
             self._offer(tile, message, None)
+
+    def forget(self) -> None:
+        """Forget all frames: a playback begins again."""
+        self._tiles = {camera: _Tile() for camera in self._tiles}
+        self.last_ns.clear()
+        self.version += 1
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the newest picture of each camera as JSON; ``picture`` is its address."""

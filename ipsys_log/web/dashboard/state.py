@@ -14,6 +14,7 @@ from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import (
+    RIG_TOPIC,
     CameraCalibration,
     CompressedImage,
     CompressedVideo,
@@ -28,11 +29,13 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.sinks.sink import Sink
+from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.units import NS_PER_S
 from ipsys_log.web.dashboard.events import RecentEvents
 from ipsys_log.web.dashboard.floor import describe_floor
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.pictures import Pictures
+from ipsys_log.web.dashboard.played_log import PlayedLog
 from ipsys_log.web.dashboard.robots import Robots
 from ipsys_log.web.dashboard.status import (
     CameraStatus,
@@ -41,7 +44,7 @@ from ipsys_log.web.dashboard.status import (
     describe_streams,
 )
 
-__all__ = ["Dashboard", "LiveSetting"]
+__all__ = ["Dashboard", "DashboardSetting"]
 
 _NS_PER_MS = 1_000_000
 # Number of the last positions whose latencies count.
@@ -49,38 +52,40 @@ _LATENCIES = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class LiveSetting:
-    """The parts of a live recording that the dashboard shows.
+class DashboardSetting:
+    """The parts of a live recording, or of a played log, that the dashboard shows.
 
     Attributes
     ----------
     rig, lenses, model : the lab, the intrinsics by camera, and the fitted model.
-    run : the run of the shown tracks.
+    run : the run of the shown tracks; None: ground truth.
     states, checks : states and last checks of the cameras, by name.
-    log : the log that is written.
+    log : the log that is written, or played.
     now_ns : the clock of the log times.
     streams : the streams of positions.
+    played : the playback of the log; None for a recording.
     """
 
-    rig: Rig
+    rig: Rig | None
     lenses: Mapping[str, CameraCalibration]
     model: Model | None
-    run: str
+    run: str | None
     states: Mapping[str, CameraState]
     checks: Mapping[str, FrameCheck]
     log: Path
     now_ns: Callable[[], int]
     streams: Sequence[Sink] = ()
+    played: PlayedLog | None = None
 
 
 class Dashboard:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that keeps the newest state of a recording.
+    """A :class:`~ipsys_log.sinks.sink.Sink` that keeps the newest state of a recording or a playback.
 
     The thread of the sink changes the state, and the thread of the page reads it.
 
     Parameters
     ----------
-    setting : the recording.
+    setting : the recording or the playback.
     operator : its segment and its number are a part of the state; None: the page cannot operate.
 
     Attributes
@@ -96,21 +101,24 @@ class Dashboard:
     name = "the dashboard"
     payloads: tuple[type, ...] = (
         *(CompressedImage, CompressedVideo, RawImage, Markers, Positions, Tracks),
-        *(Event, Latency, Rig),
+        *(Event, Latency, Rig, NewSession),
     )
 
-    def __init__(self, setting: LiveSetting, operator: Operator | None = None) -> None:
+    def __init__(self, setting: DashboardSetting, operator: Operator | None = None) -> None:
         self.end: str | None = None
         self.operator = operator
         self._setting, self._begin_ns = setting, setting.now_ns()
         self._floor = describe_floor(setting.rig, setting.model, setting.lenses)
         self._robots = Robots(setting.rig, self._begin_ns)
         self._events = RecentEvents()
-        self._pictures = Pictures(setting.states)
-        self._cameras = CameraStatus(setting.states, setting.checks, setting.now_ns)
+        played = setting.played
+        every_ns = () if played is None else (played.picture_every_ns,)
+        self._pictures = Pictures(setting.states, *every_ns)
+        self._cameras = CameraStatus(setting.states, setting.checks, setting.now_ns, played is None)
         self._latencies: deque[Latency] = deque(maxlen=_LATENCIES)
         self._overlap = OverlapSummary()
         self._computed: tuple[int, dict[str, Any]] | None = None
+        self._session = 0
         self._lock = threading.Lock()
 
     def consume(self, messages: Iterator[Message | None]) -> None:
@@ -131,13 +139,18 @@ class Dashboard:
                 "floor": self._floor,
                 "trails": self._robots.trails(),
                 "may_operate": may_operate and self.operator is not None,
+                "played": self._setting.played is not None,
             }
 
     def robots(self) -> dict[str, Any]:
-        """Return the newest poses; ``now`` is the time of the page in ms."""
+        """Return the newest poses; ``now`` is the time of the page in ms. A new session has new trails."""
         now_ns = self._setting.now_ns()
         with self._lock:
-            return {"now": (now_ns - self._begin_ns) // _NS_PER_MS, "robots": self._robots.rows(now_ns)}
+            return {
+                "now": (now_ns - self._begin_ns) // _NS_PER_MS,
+                "session": self._session,
+                "robots": self._robots.rows(now_ns),
+            }
 
     def tiles(self) -> dict[str, Any]:
         """Return the newest picture of each camera, with its markers."""
@@ -145,16 +158,16 @@ class Dashboard:
             return {"cameras": self._pictures.rows()}
 
     def status(self) -> dict[str, Any]:
-        """Return the state of cameras, recording, streams and operator, the latencies and the events."""
+        """Return the state of cameras, log, streams and operator, the latencies and the events."""
         now_ns = self._setting.now_ns()
         with self._lock:
             events, skipped = self._events.newest_first(), dict(self._events.skipped)
-            last_ns = dict(self._pictures.last_ns)
+            last_ns, session = dict(self._pictures.last_ns), self._session
         return {
             "now": (now_ns - self._begin_ns) // _NS_PER_MS,
             "end": self.end,
-            "cameras": self._cameras.rows(last_ns, skipped),
-            "recording": describe_recording(self._setting.log, now_ns - self._begin_ns),
+            "cameras": self._cameras.rows(last_ns, skipped, session),
+            **self._describe_log(now_ns),
             "streams": describe_streams(self._setting.streams),
             **self._statistics(now_ns),
             "events": events,
@@ -173,7 +186,11 @@ class Dashboard:
 
     def _add(self, message: Message) -> None:
         payload = message.payload
-        if isinstance(payload, Tracks):
+        if self._setting.played is not None:
+            self._setting.played.count(message)
+        if isinstance(payload, NewSession):
+            self._forget()
+        elif isinstance(payload, Tracks):
             if run_of_topic(message.topic) == self._setting.run:
                 self._robots.add(payload)
         elif isinstance(payload, Event):
@@ -184,6 +201,23 @@ class Dashboard:
             self._overlap(message)
         else:
             self._pictures.add(message)
+
+    def _forget(self) -> None:
+        """Forget all messages: a playback begins, and its times may be earlier than before."""
+        self._session += 1
+        for part in (self._robots, self._events, self._pictures):
+            part.forget()
+        self._latencies.clear()
+        self._overlap, self._computed = OverlapSummary(), None
+        if self._setting.rig is not None:
+            self._overlap(Message(RIG_TOPIC, 0, 0, self._setting.rig))
+
+    def _describe_log(self, now_ns: int) -> dict[str, Any]:
+        """Return the state of the recording, or of the playback."""
+        played = self._setting.played
+        if played is not None:
+            return {"playback": played.describe()}
+        return {"recording": describe_recording(self._setting.log, now_ns - self._begin_ns)}
 
     def _statistics(self, now_ns: int) -> dict[str, Any]:
         """Return latencies and disagreement of cameras, computed at most once per second."""
@@ -196,7 +230,7 @@ class Dashboard:
     def _operation(self, now_ns: int) -> dict[str, Any]:
         if self.operator is None:
             return {}
-        operation: dict[str, Any] = {"operator": self.operator.number}
+        operation: dict[str, Any] = {"operator": self.operator.seat.number}
         segment = self.operator.segment
         if segment is not None:
             seconds = (now_ns - segment.start_ns) // NS_PER_S

@@ -33,6 +33,7 @@ class CameraStatus:
     ----------
     states, checks : states and last checks of the cameras, by name; the recorder changes them.
     now_ns : the clock of the log times.
+    has_drops : the states have the numbers of dropped frames; those of a played log do not.
     """
 
     def __init__(
@@ -40,18 +41,26 @@ class CameraStatus:
         states: Mapping[str, CameraState],
         checks: Mapping[str, FrameCheck],
         now_ns: Callable[[], int],
+        has_drops: bool = True,
     ) -> None:
         self._states, self._checks, self._now_ns = states, checks, now_ns
+        self._has_drops = has_drops
         self._counts: dict[str, deque[tuple[int, int]]] = {name: deque() for name in states}
+        self._session = 0
 
-    def rows(self, last_ns: Mapping[str, int], skipped: Mapping[str, int]) -> list[dict[str, Any]]:
+    def rows(
+        self, last_ns: Mapping[str, int], skipped: Mapping[str, int], session: int = 0
+    ) -> list[dict[str, Any]]:
         """Return a row for each camera; a missing value is a missing key.
 
         Parameters
         ----------
         last_ns : log time of the last frame, by camera.
         skipped : number of skipped frames, by camera.
+        session : rates begin again with a new session of a playback.
         """
+        if session != self._session:
+            self._session, self._counts = session, {name: deque() for name in self._states}
         now_ns = self._now_ns()
         return [
             self._row(name, state, now_ns, last_ns.get(name), skipped.get(name, 0))
@@ -65,10 +74,11 @@ class CameraStatus:
             "name": name,
             "state": "ended" if state.finished else "up" if state.up else "lost",
             "frames": state.frames,
-            "dropped": state.dropped + state.missed,
             "skipped": skipped,
             "warnings": list(self._checks[name].warnings) if name in self._checks else [],
         }
+        if self._has_drops:
+            row["dropped"] = state.dropped + state.missed
         rate_hz = self._rate_hz(name, state.frames, now_ns)
         if rate_hz is not None:
             row["rate_hz"] = round(rate_hz, 1)

@@ -8,7 +8,7 @@ export function showTiles(data) {
   const where = document.getElementById("tiles");
   for (const camera of data.cameras) {
     if (!tiles.has(camera.name)) {
-      const svg = element("svg", { role: "img" }), note = make("small");
+      const svg = element("svg", { role: "img", "aria-label": `No image of camera ${camera.name} yet` }), note = make("small");
       tiles.set(camera.name, { svg, note, picture: null, loading: false });
       where.append(make("figure", {}, svg, make("figcaption", {}, camera.name, note)));
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,11 +22,14 @@ from ipsys_log.survey.live import LiveScene
 from ipsys_log.web.access import MAY_WRITE
 from ipsys_log.web.app import build_app
 from ipsys_log.web.dashboard.app import build_dashboard
-from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, LiveSetting
+from ipsys_log.web.dashboard.sources import dashboard_of_recording
+from ipsys_log.web.dashboard.state import Dashboard
+from ipsys_log.web.operator_seat import OperatorSeat, answer_claim, operator_of
 from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json
 
 __all__ = ["SetupApp"]
+
+Body = Mapping[str, Any]
 
 _OWN = "ipsys_log.web.first_day"
 _SCRIPTS = ("setup", "panels", "fields", "pictures")
@@ -34,7 +37,7 @@ _FILES = {
     "/": ("setup.html", "text/html", _OWN),
     "/setup.css": ("setup.css", "text/css", _OWN),
     "/theme.css": ("theme.css", "text/css"),
-    "/make.js": ("make.js", "text/javascript"),
+    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("make", "operator")},
     **{f"/{name}.js": (f"{name}.js", "text/javascript", _OWN) for name in _SCRIPTS},
 }
 
@@ -70,19 +73,15 @@ class SetupApp:
 
     def __init__(self, folder: LabFolder) -> None:
         self._measuring, self._dashboard = _Embedded(), _Embedded()
+        self._seat = OperatorSeat()
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
                 *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
                 Route("/picture/{kind}/{name}", self._picture),
                 Route("/api/state", self._state),
-                Route("/api/rig", self._rig, methods=["POST"]),
-                Route("/api/simulate", self._simulate, methods=["POST"]),
-                Route("/api/cameras", self._cameras, methods=["POST"]),
-                Route("/api/intrinsics", self._intrinsics, methods=["POST"]),
-                Route("/api/calibrate", self._calibrate, methods=["POST"]),
-                Route("/api/start", self._start, methods=["POST"]),
-                Route("/api/stop", self._stop, methods=["POST"]),
+                Route("/api/operate", self._operate, methods=["POST"]),
+                *self._changes(),
                 Mount("/measure", self._measuring),
                 Mount("/live", self._dashboard),
             ],
@@ -96,19 +95,10 @@ class SetupApp:
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
-        cameras = view.lab.cameras
-        setting = LiveSetting(
-            view.lab.rig,
-            view.lab.lenses,
-            view.model,
-            view.run,
-            cameras.states,
-            view.lab.monitor.checks,
-            view.log,
-            cameras.clock.now_ns,
-            view.streams,
+        lab = view.lab
+        dashboard = dashboard_of_recording(
+            lab.cameras, lab.settings, lab.monitor.checks, view.log, view.model, view.run, view.streams
         )
-        dashboard = Dashboard(setting, Operator(cameras.add, cameras.clock.now_ns, cameras.say))
         with self._dashboard.show(build_dashboard(dashboard)):
             yield dashboard
 
@@ -117,7 +107,7 @@ class SetupApp:
         state = await asyncio.to_thread(self.session.describe)
         pages = {"measure": self._measuring.app is not None, "live": self._dashboard.app is not None}
         may = request.scope.get(MAY_WRITE, True)
-        return JSONResponse({**state, "pages": pages, "may_operate": may})
+        return JSONResponse({**state, "pages": pages, "may_operate": may, "operator": self._seat.number})
 
     async def _picture(self, request: Request) -> Response:
         data = self.session.picture(request.path_params["kind"], request.path_params["name"])
@@ -126,36 +116,35 @@ class SetupApp:
         kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
         return Response(data, media_type=kind)
 
-    async def _rig(self, request: Request) -> Response:
-        typed = _texts(await read_json(request), "values")
-        return _answer(await asyncio.to_thread(self.session.save_rig, typed))
+    async def _operate(self, request: Request) -> Response:
+        """Claim the setup for a device, or release it."""
+        return JSONResponse(answer_claim(self._seat, await read_json(request)))
 
-    async def _simulate(self, _: Request) -> Response:
-        await asyncio.to_thread(self.session.simulate)
-        return JSONResponse({})
+    def _change(self, path: str, act: Callable[[Body], Sequence[Fault] | None]) -> Route:
+        """Return the route of a change, which only the operator may make; its work is in another thread."""
 
-    async def _cameras(self, request: Request) -> Response:
-        names = _texts(await read_json(request), "names")
-        return _answer(await asyncio.to_thread(self.session.save_cameras, names))
+        async def answer(request: Request) -> Response:
+            body = await read_json(request)
+            self._seat.check(operator_of(body))
+            faults = await asyncio.to_thread(act, body)
+            if not faults:
+                return JSONResponse({})
+            return JSONResponse({"faults": [fault._asdict() for fault in faults]}, 409)
 
-    async def _intrinsics(self, request: Request) -> Response:
-        camera = str((await read_json(request)).get("camera", ""))
-        await asyncio.to_thread(self.session.use_intrinsics, camera)
-        return JSONResponse({})
+        return Route(path, answer, methods=["POST"])
 
-    async def _calibrate(self, request: Request) -> Response:
-        body = await read_json(request)
-        camera, board = str(body.get("camera", "")), str(body.get("board", ""))
-        return _answer(await asyncio.to_thread(self.session.calibrate, camera, board))
-
-    async def _start(self, request: Request) -> Response:
-        action = str((await read_json(request)).get("action", ""))
-        await asyncio.to_thread(self.session.start, action)
-        return JSONResponse({})
-
-    async def _stop(self, _: Request) -> Response:
-        self.session.jobs.stop()
-        return JSONResponse({})
+    def _changes(self) -> list[Route]:
+        session = self.session
+        changes: dict[str, Callable[[Body], Sequence[Fault] | None]] = {
+            "rig": lambda body: session.save_rig(_texts(body, "values")),
+            "simulate": lambda _: session.simulate(),
+            "cameras": lambda body: session.save_cameras(_texts(body, "names")),
+            "intrinsics": lambda body: session.use_intrinsics(str(body.get("camera", ""))),
+            "calibrate": lambda body: session.calibrate(str(body.get("camera", "")), _texts(body, "options")),
+            "start": lambda body: session.start(str(body.get("action", ""))),
+            "stop": lambda _: session.jobs.stop(),
+        }
+        return [self._change(f"/api/{name}", act) for name, act in changes.items()]
 
 
 def _texts(body: Mapping[str, Any], key: str) -> dict[str, str]:
@@ -170,10 +159,3 @@ def _texts(body: Mapping[str, Any], key: str) -> dict[str, str]:
     if not isinstance(value, dict):
         raise IpsysError(f"{key} must be an object of texts; reload this page")
     return {str(name): str(text) for name, text in value.items()}
-
-
-def _answer(faults: Sequence[Fault]) -> Response:
-    """Return an empty answer, or the faults of the fields."""
-    if not faults:
-        return JSONResponse({})
-    return JSONResponse({"faults": [fault._asdict() for fault in faults]}, 409)

@@ -1,20 +1,14 @@
-// Requests to the server, and fields with their faults.
+// Changes on the server, and fields with their faults.
 import { make } from "./make.js";
+import { Seat, post } from "./operator.js";
 
-export async function post(path, body = {}) {
-  let answer;
-  try {
-    answer = await fetch(`api/${path}`, {
-      method: "POST", headers: { "Content-Type": "application/json", "X-Ipsys": "1" }, body: JSON.stringify(body),
-    });
-  } catch {
-    throw new Error("ipsys does not answer. Is it still running in the terminal?");
-  }
-  const kind = answer.headers.get("content-type") ?? "";
-  const content = kind.includes("json") ? await answer.json() : { error: await answer.text() };
-  if (content.faults) return content.faults;
-  if (!answer.ok) throw new Error(content.error || `error ${answer.status}`);
-  return [];
+// The seat of this device; a request names its number.
+export const seat = new Seat("ipsys-setup");
+
+// Ask for a change, as the operator; return the faults of the fields.
+export async function change(path, body = {}) {
+  if (!seat.operates && seat.isFree) await seat.take();
+  return (await post(path, { ...body, operator: seat.number })).faults ?? [];
 }
 
 // A text field; its fault is below it, and a screen reader reads it with the field.
@@ -25,15 +19,23 @@ export function field(id, label, value, properties = {}) {
   return make("div", {}, make("label", { htmlFor: id, textContent: label }), input, make("p", { id: `${id}-fault`, className: "fault" }));
 }
 
+// A choice of texts.
+export function choice(id, label, value, texts) {
+  const select = make("select", { id, name: id }, ...texts.map((text) => make("option", { value: text, selected: text === value, defaultSelected: text === value }, text)));
+  select.setAttribute("aria-describedby", `${id}-fault`);
+  return make("div", {}, make("label", { htmlFor: id, textContent: label }), select, make("p", { id: `${id}-fault`, className: "fault" }));
+}
+
 // Show faults at their fields, and move the focus to the first one.
 export function showFaults(form, faults, idOf) {
-  for (const input of form.querySelectorAll("input")) {
+  for (const input of form.querySelectorAll("input, select")) {
     input.setAttribute("aria-invalid", "false");
     document.getElementById(`${input.id}-fault`).textContent = "";
   }
   for (const fault of [...faults].reverse()) {
     const input = document.getElementById(idOf(fault.field));
     input.setAttribute("aria-invalid", "true");
+    input.closest("details")?.setAttribute("open", "");
     document.getElementById(`${input.id}-fault`).textContent = fault.text;
     input.focus();
   }

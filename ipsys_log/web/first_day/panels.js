@@ -1,5 +1,5 @@
 // The content of each step. The server decides what can be done; the page only asks.
-import { field, post, showFaults } from "./fields.js";
+import { change, choice, field, showFaults } from "./fields.js";
 import { make } from "./make.js";
 import { alignedImage, cameraImage } from "./pictures.js";
 
@@ -18,7 +18,7 @@ export function shownPart(name, state) {
     points: state.points, accuracy: state.answer, live: null,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
-  return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_operate, state.faults]);
+  return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
 }
 
 export function panel(name, state, act) {
@@ -34,9 +34,12 @@ export function panel(name, state, act) {
     ...lines(state.faults.map((fault) => ["bad", fault])),
     ...(step.status === "waits" ? [] : content),
     ...onward,
-    make("p", { className: "command" }, "The same in a terminal, in this folder: ", make("code", { textContent: step.command })),
+    make("p", { className: "command" }, "The same in a terminal, in this folder: ", command(step.command)),
   ];
 }
+
+// A line ends between two words, never behind a hyphen.
+const command = (text) => make("code", {}, ...text.split(" ").flatMap((word) => [make("span", { textContent: word }), " "]));
 
 const sentence = (text) => `${text}.`.replace(/\.\.$/, ".");
 
@@ -49,8 +52,8 @@ function button(text, work, id, more = {}) {
 // A button that starts a job; no other job may work.
 function starter(text, action, state, act, isMain = true) {
   const busy = state.job && !state.job.ended;
-  const properties = { disabled: busy || !state.may_operate, className: isMain ? "main" : "" };
-  return button(text, () => act(() => post("start", { action })), action, properties);
+  const properties = { disabled: busy || !state.may_change, className: isMain ? "main" : "" };
+  return button(text, () => act(() => change("start", { action })), action, properties);
 }
 
 function lines(rows) {
@@ -58,7 +61,7 @@ function lines(rows) {
 }
 
 function submit(form, state, act, isMain, work) {
-  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: isMain ? "main" : "", textContent: "Save", disabled: !state.may_operate })));
+  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: isMain ? "main" : "", textContent: "Save", disabled: !state.may_change })));
   form.noValidate = true;
   form.addEventListener("submit", (event) => { event.preventDefault(); act(work); });
   return form;
@@ -80,10 +83,10 @@ function rig(state, act, step) {
   }
   submit(form, state, act, step.status !== "done", async () => {
     const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
-    showFaults(form, await post("rig", { values: typed }), (key) => key);
+    showFaults(form, await change("rig", { values: typed }), (key) => key);
   });
   if (exists) return [form];
-  const simulated = button("Use the simulated lab", () => act(() => post("simulate")), "simulate", { disabled: !state.may_operate });
+  const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
     make("p", { textContent: "Measure the black square of a printed marker. If a printer scales it by 2 %, each height has an error of 4 cm." }),
     form,
@@ -103,7 +106,7 @@ function cameras(state, act, step) {
   form.append(make("div", { className: "cards" }, ...cards));
   submit(form, state, act, step.status !== "done", async () => {
     const names = Object.fromEntries(state.cameras.map((one) => [one.key, document.getElementById(cameraId(one.key)).value]));
-    showFaults(form, await post("cameras", { names }), cameraId);
+    showFaults(form, await change("cameras", { names }), cameraId);
   });
   return [
     make("p", { textContent: "Names have small letters, digits and _. A network camera is written into lab.toml with a text editor: source = \"rtsp://...\"." }),
@@ -114,19 +117,22 @@ function cameras(state, act, step) {
 
 function intrinsics(state, act) {
   const works = state.job && !state.job.ended;
-  const board = field("board", "Inner corners of the chessboard, such as 6x4", "6x4", { maxLength: 40 });
-  const form = make("form", { className: "grid" }, board);
+  const made = state.board_fields.map(([key, label, value, choices]) => (choices.length ? choice(key, label, value, choices) : field(key, label, value, { maxLength: 40 })));
+  // Most users keep all but the first values: the board itself.
+  const form = make("form", {}, make("div", { className: "grid" }, made[0]),
+    make("details", {}, make("summary", { textContent: "Square, lens model and ChArUco board" }), make("div", { className: "grid" }, ...made.slice(1))));
   form.addEventListener("submit", (event) => event.preventDefault());
   const calibrate = (camera) => act(async () => {
-    showFaults(form, await post("calibrate", { camera, board: document.getElementById("board").value }), (key) => key);
+    const options = Object.fromEntries(state.board_fields.map(([key]) => [key, document.getElementById(key).value]));
+    showFaults(form, await change("calibrate", { camera, options }), (key) => key);
   });
   const cards = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
     make("b", { textContent: one.camera }),
     make("p", { className: one.known ? "text" : "fault", textContent: one.text }),
     make("div", { className: "actions" },
-      ...(one.file ? [button(`Use ${one.file}`, () => act(() => post("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_operate })] : []),
+      ...(one.file ? [button(`Use ${one.file}`, () => act(() => change("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_change })] : []),
       button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
-        { className: one.known || one.file ? "" : "main", disabled: works || !state.may_operate })))));
+        { className: one.known || one.file ? "" : "main", disabled: works || !state.may_change })))));
   return [
     make("p", { textContent: "Print a chessboard on a flat plate (ipsys markers --board 6x4 -o board.pdf). Move it through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far." }),
     form,

@@ -1,5 +1,5 @@
 // The setup page. Every second it reads the state from the server, so that all devices show the same.
-import { post } from "./fields.js";
+import { change, seat } from "./fields.js";
 import { make } from "./make.js";
 import { panel, shownPart } from "./panels.js";
 import { boardImage } from "./pictures.js";
@@ -48,15 +48,19 @@ function drawSteps() {
   if (focused?.startsWith("step-")) $(focused)?.focus();
 }
 
+const initial = (one) => one.defaultValue ?? [...one.options].find((option) => option.defaultSelected)?.value;
+
 function drawPanel() {
   const part = shownPart(selected, state);
   if (part === shown) return;
   // Typed texts and the focus survive a change by another device.
   const same = shown.startsWith(`["${selected}"`);
-  const typed = same ? [...$("panel").querySelectorAll("input")].filter((one) => one.value !== one.defaultValue).map((one) => [one.id, one.value]) : [];
+  const typed = same ? [...$("panel").querySelectorAll("input, select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.value]) : [];
   const focused = same ? document.activeElement?.id : "", within = same && $("panel").contains(document.activeElement);
   shown = part;
+  const unfolded = same && $("panel").querySelector("form details")?.open;
   $("panel").replaceChildren(...panel(selected, state, act));
+  if (unfolded) $("panel").querySelector("form details")?.setAttribute("open", "");
   for (const [id, value] of typed) if ($(id)) $(id).value = value;
   if (focused && $("panel").contains($(focused))) $(focused).focus();
   // A button that has vanished leaves the keyboard in the panel.
@@ -67,7 +71,7 @@ function drawPanel() {
 function drawJob() {
   const job = state.job, works = job && !job.ended;
   $("job").hidden = !works;
-  $("stop").hidden = !state.may_operate;
+  $("stop").hidden = !state.may_change;
   if (job?.ended && job.error && job.error !== told) tell(job.error);
   if (!works) return;
   const text = `${job.stopping ? "Stopping" : "Working"}: ${job.name}`;
@@ -82,12 +86,25 @@ function drawJob() {
   if (job.total) { bar.max = job.total; bar.value = job.done; } else bar.removeAttribute("value");
 }
 
+// Show who operates. Without an operator, the first device that changes something operates.
+function drawOperator() {
+  const { operates, isFree } = seat;
+  $("operate").hidden = state.may_operate && isFree;
+  const text = !state.may_operate ? "This device only views." : operates ? "This device operates." : "Another device operates.";
+  if ($("operation").textContent !== text) $("operation").textContent = text;
+  $("take").textContent = operates ? "Stop operating" : "Take over";
+  $("take").hidden = !state.may_operate;
+}
+
 async function read() {
   clearTimeout(timer);
   try {
     const answer = await fetch("api/state");
     if (!answer.ok) throw new Error(await answer.text());
     state = await answer.json();
+    seat.present = state.operator;
+    state.may_change = state.may_operate && (seat.operates || seat.isFree);
+    drawOperator();
     const count = state.steps.filter((step) => step.status === "done").length;
     chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} done`);
     $("folder").textContent = state.rig.name ?? state.folder;
@@ -109,5 +126,6 @@ addEventListener("hashchange", () => {
   scrollTo(0, 0);
   $("panel").focus();
 });
-$("stop").addEventListener("click", () => act(() => post("stop")));
+$("take").addEventListener("click", () => act(() => (seat.operates ? seat.release() : seat.take())));
+$("stop").addEventListener("click", () => act(() => change("stop")));
 read();

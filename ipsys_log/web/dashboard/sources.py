@@ -1,0 +1,70 @@
+"""The dashboards of a live recording, and of a played log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ipsys_log.capture.live_check import FrameCheck
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.messages import CameraCalibration, Message, Model, Rig
+from ipsys_log.player import Player
+from ipsys_log.sinks.played_topics import PlayedScene
+from ipsys_log.sinks.sink import Sink
+from ipsys_log.web.dashboard.operator import Operator
+from ipsys_log.web.dashboard.played_log import PlayedLog
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
+
+__all__ = ["dashboard_of_player", "dashboard_of_recording"]
+
+
+def dashboard_of_recording(
+    cameras: LiveCameras,
+    settings: Sequence[Message],
+    checks: Mapping[str, FrameCheck],
+    log: Path,
+    model: Model,
+    run: str,
+    streams: Sequence[Sink],
+) -> Dashboard:
+    """Return the dashboard of a live recording, with an operator.
+
+    Parameters
+    ----------
+    cameras : the open cameras.
+    settings : the first messages of the log: the rig and the intrinsics.
+    checks : last checks of the cameras, by name.
+    log, model, run : the log that is written, the fitted model, and the run of its tracks.
+    streams : the streams of positions.
+
+    Raises
+    ------
+    IpsysError
+        The model or the intrinsics of a camera are not valid.
+    """
+    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
+    lenses = {
+        str(message.camera): message.payload
+        for message in settings
+        if isinstance(message.payload, CameraCalibration)
+    }
+    now_ns = cameras.clock.now_ns
+    setting = DashboardSetting(rig, lenses, model, run, cameras.states, checks, log, now_ns, streams)
+    return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say))
+
+
+def dashboard_of_player(player: Player, scene: PlayedScene) -> Dashboard:
+    """Return the dashboard of a played log. It has no operator: a log is not changed.
+
+    Raises
+    ------
+    IpsysError
+        The model or the intrinsics of a camera are not valid.
+    """
+    played = PlayedLog(player, scene)
+    rig, lenses, model, run = scene.rig, scene.lenses, scene.model, scene.run
+    log = Path(scene.name)
+    setting = DashboardSetting(
+        rig, lenses, model, run, played.states, {}, log, player.now_ns, player.streams, played
+    )
+    return Dashboard(setting)

@@ -1,0 +1,149 @@
+"""The dashboard of a played log: ``ipsys stream LOG --web``."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages.channels import LATENCY, TRACKS
+from ipsys_log.player import Player
+from ipsys_log.sinks.playback import PlaybackOptions
+from ipsys_log.web.dashboard.sources import dashboard_of_player
+from tests.cli.test_stream_command import started, stop
+from tests.conftest import Ipsys
+from tests.sinks.streaming import write_tracks
+from tests.test_bad_input import refused
+from tests.web.dashboards import page_of
+from tests.web.phone import phone
+from tests.web.test_access import Caller
+from tests.web.test_dashboard_page import Reader, post
+from tests.web.test_measuring_page import says
+
+FAST = 10.0
+# Two instants or more of each camera.
+STEPS = 12
+
+
+@contextmanager
+def shown(log: Path, host: str | None = None, **options: Any) -> Iterator[tuple[Player, str]]:
+    """A playing log and the address of its page; the playback waits at first."""
+    player = Player([log], options=PlaybackOptions(start_paused=True, **options), has_dashboard=True)
+    assert player.scene is not None
+    dashboard = dashboard_of_player(player, player.scene)
+    player.show_on(dashboard)
+    with page_of(dashboard, host) as page, player:
+        yield player, page.url
+
+
+def test_played_log_fills_the_page(recorded: Path) -> None:
+    with Session([recorded]) as session:
+        tracks = session.payloads(session.topics(TRACKS, "poly"))
+        cameras, has_latencies = sorted(session.images), session.count(LATENCY.topic) > 0
+    with shown(recorded) as (player, url), closing(Reader(url)) as reader:
+        caller = Caller(url)
+        scene = json.loads(caller.ask("GET", "/api/scene")[1])
+        assert (scene["played"], scene["may_operate"]) == (True, False)
+        assert scene["floor"]["views"]
+        status = reader.next("status")
+        assert [camera["name"] for camera in status["cameras"]] == cameras
+        assert all("dropped" not in camera for camera in status["cameras"])
+        assert (status["playback"]["is_paused"], "recording" in status) == (True, False)
+        player.rate = FAST
+        player.resume()
+        last = {track.robot: track.x_m for row in tracks for track in row.tracks}
+        data = reader.until("robots", lambda data: len(data["robots"]) == len(last))
+        assert {row["name"] for row in data["robots"]} == set(last)
+        final = reader.until("status", lambda data: data["end"])
+        assert bool(final["latency"]) is has_latencies
+
+
+def step_from(player: Player, share: float) -> None:
+    """Move a paused player to a share of its log, and play some instants from there."""
+    player.seek(share * player.duration_s)
+    for _ in range(STEPS):
+        player.step()
+
+
+def test_seek_back_begins_new_trails(recorded: Path) -> None:
+    with shown(recorded) as (player, url), closing(Reader(url)) as reader:
+        step_from(player, 0.5)
+        late = reader.until("robots", lambda data: data["robots"])
+        step_from(player, 0.0)
+        early = reader.until("robots", lambda data: data["session"] > late["session"] and data["robots"])
+        assert early["now"] < late["now"]
+        trails = json.loads(Caller(url).ask("GET", "/api/scene")[1])["trails"]
+        assert trails
+        assert max(time_ms for points in trails.values() for time_ms, *_ in points) < late["now"]
+        player.stop()
+
+
+def test_paused_page_has_the_pictures_of_its_instant(recorded: Path) -> None:
+    with shown(recorded) as (player, url), closing(Reader(url)) as reader:
+        step_from(player, 0.0)
+        tiles = reader.until("tiles", lambda data: all("picture" in one for one in data["cameras"]))
+        assert reader.until("status", lambda data: data["playback"]["is_paused"])
+        addresses = [one["picture"] for one in tiles["cameras"]]
+        assert [Caller(url).ask("GET", f"/{one}")[0] for one in addresses] == [200] * len(addresses)
+        player.stop()
+
+
+def test_page_of_a_log_offers_no_action(tmp_path: Path) -> None:
+    with shown(write_tracks(tmp_path / "x.mcap")) as (player, url):
+        caller = Caller(url)
+        for path in ("/api/operate", "/api/mark", "/api/segment"):
+            status, answer = post(caller, path, {})
+            assert (status, "only shows a log" in answer["error"]) == (400, True)
+        player.stop()
+
+
+def test_page_is_refused_before_the_log_is_played(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = write_tracks(tmp_path / "x.mcap", 3)
+    assert "or add --web" in refused(ipsys, log, "stream", log)
+    assert "--web-port: has no effect without --web" in refused(
+        ipsys, log, "stream", log, "--udp", "9870", "--web-port", "8000"
+    )
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert "is in use" in refused(ipsys, log, "stream", log, "--web", "--web-port", port)
+
+
+def test_command_serves_a_log_without_a_stream(tmp_path: Path) -> None:
+    log = write_tracks(tmp_path / "x.mcap")
+    program = started("stream", log, "--web", "--web-port", 0, "--loop")
+    assert program.stderr is not None
+    try:
+        line = next(line for line in program.stderr if "dashboard at" in line)
+        match = re.search(r"http://\S+", line)
+        assert match is not None
+        with closing(Reader(match[0])) as reader:
+            assert reader.next("status")["playback"]["loops"] is True
+            robots = reader.until("robots", lambda data: data["robots"])["robots"]
+            assert {row["name"] for row in robots} <= {"ada", "bob"}
+    finally:
+        stop(program)
+
+
+@pytest.mark.slow
+def test_browser_shows_rate_and_pause(recorded: Path, tmp_path: Path) -> None:
+    with shown(recorded, rate=0.5, loop=True) as (player, url), phone(tmp_path) as browser:
+        browser.open(url, (1280, 900))
+        says(browser, "h1", "Playback")
+        says(browser, "#state", "paused")
+        player.resume()
+        says(browser, "#state", "playing × 0.5")
+        says(browser, "#recording", "× 0.5")
+        browser.wait("document.querySelectorAll('#floor .other, #floor .robot').length > 0")
+        browser.wait("document.querySelectorAll('figure image').length > 0")
+        assert browser.run("document.querySelector('#operate-panel').hidden")
+        player.loop = False
+        player.rate = FAST
+        says(browser, "#state", "playback ended")
+        assert browser.console == []

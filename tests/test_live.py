@@ -40,7 +40,7 @@ from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.verify import diff, verify
 from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.sink import Consumer, send_all
-from ipsys_log.stages.detect import Detect
+from ipsys_log.stages.detect import FrameDetector
 from ipsys_log.survey.checks import check_entry, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.live import LiveScene
@@ -226,7 +226,7 @@ def test_cameras_without_intrinsics_are_reported_first(
 def test_failed_stage_does_not_stop_the_recording(
     lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(self: Detect, message: Message) -> Any:
+    def broken(self: FrameDetector, message: Message) -> Any:
         raise IpsysError("camera red: its frames are 10 x 10 px")
 
     target = tmp_path / "x.mcap"
@@ -242,7 +242,7 @@ def test_failed_stage_does_not_stop_the_recording(
     frames = sent(lab_log)
     attached = LiveCameras(cameras(*frames), playing(frames, inf, before=before), Clock(), say)
     with monkeypatch.context() as patch:
-        patch.setattr(Detect, "_frame", broken)
+        patch.setattr(FrameDetector, "_frame", broken)
         with attached, pytest.raises(IpsysError, match="has all frames; to process them: ipsys replay"):
             pipeline.live(attached, settings_of(lab_log, attached), target, Request(model_from=calibration))
     with Session([target]) as session:

@@ -118,7 +118,7 @@ def test_pieces_in_any_order_give_the_bytes_of_one_process(corners: str, part: P
         assert plan is not None
         assert task.step is not None
         wired = wire(task.stage, "edges", {}, task.step("edges"))
-    assert len(plan.pieces) > 4
+    assert len(plan.pieces) > (4 if corners == "edges" else 1)  # stock has the usual period
     # As workers do it: pickled, each with the log opened anew, and the last piece first.
     sent = pickle.loads(pickle.dumps((plan.run, plan.pieces[::-1])))
     results = [pickle.loads(pickle.dumps(compute_piece_of_logs(sent[0], piece))) for piece in sent[1]]

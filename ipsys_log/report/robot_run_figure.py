@@ -231,7 +231,7 @@ def _label(axes: Axes, where_m: NDArray[np.float64], text: str, colour: str) -> 
     side = 1 if where_m[0] < np.mean(axes.get_xlim()) else -1
     axes.annotate(
         text,
-        where_m,
+        (float(where_m[0]), float(where_m[1])),
         (6 * side, 5),
         textcoords="offset points",
         ha="left" if side > 0 else "right",

@@ -220,10 +220,21 @@ def draw_paths(session: Session, result: RobotRunResult) -> Figure:
         axes.plot(*at_m.T, "x", color=colour, ms=8, mew=1.8)
         for point in robot.reached:
             at_s = (point.start_ns - result.start_ns) / NS_PER_S
-            where, offset = at_m[point.number - 1], (6, 5)
-            axes.annotate(
-                f"{at_s:.0f} s", where, offset, textcoords="offset points", color=colour, fontsize=9
-            )
+            _label(axes, at_m[point.number - 1], f"{at_s:.0f} s", colour)
     axes.tick_params(labelsize=8, colors=NOTE)
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8, frameon=False)
     return figure
+
+
+def _label(axes: Axes, where_m: NDArray[np.float64], text: str, colour: str) -> None:
+    """Write a text beside a point, on the side of the middle of the floor."""
+    side = 1 if where_m[0] < np.mean(axes.get_xlim()) else -1
+    axes.annotate(
+        text,
+        (float(where_m[0]), float(where_m[1])),
+        (6 * side, 5),
+        textcoords="offset points",
+        ha="left" if side > 0 else "right",
+        color=colour,
+        fontsize=9,
+    )

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import foxglove
@@ -27,7 +28,9 @@ from websockets.typing import Origin, Subprotocol
 from ipsys_log.errors import IpsysError
 from ipsys_log.log import codec as log_codec
 from ipsys_log.messages import CompressedImage, Event, Message
+from ipsys_log.sinks.sink import DropReport
 from ipsys_log.sinks.streams import foxglove as foxglove_stream
+from ipsys_log.sinks.streams import foxglove_client
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.foxglove_messages import SUBPROTOCOLS, Subscriptions
 from ipsys_log.sinks.streams.poses import NewSession
@@ -321,6 +324,21 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
             assert received < 100
     assert events[0][0] == "sink_dropped"
     assert "1 message dropped (a client is too slow)" in events[0][1]
+
+
+def test_slow_client_loses_images_before_other_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[str | bytes] = []
+    monkeypatch.setattr(foxglove_client, "broadcast", lambda connections, data: sent.append(data))
+    events: list[str] = []
+    transport = SimpleNamespace(get_write_buffer_size=lambda: 3 << 20)
+    connection: Any = SimpleNamespace(transport=transport)
+    client = foxglove_client.Client(
+        connection, DropReport("Foxglove", lambda kind, text: events.append(text))
+    )
+    client.put(b"image", is_image=True)
+    client.put(b"tracks")
+    assert sent == [b"tracks"]
+    assert events == ["Foxglove: 1 message dropped (a client is too slow)"]
 
 
 def test_port_in_use_is_named() -> None:

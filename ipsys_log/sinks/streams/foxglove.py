@@ -216,7 +216,6 @@ class FoxgloveStream:
         client.put(write_server_info("ipsys", self._session, self._is_replayed))
         client.put(write_advertise(list(self._channels.values())))
         self._clients |= {client}
-        sending = asyncio.create_task(client.send())
         try:
             async for text in connection:
                 self._subscribe(client, text)
@@ -224,7 +223,6 @@ class FoxgloveStream:
             pass  # a client that vanishes, or sends something else
         finally:
             self._clients -= {client}
-            sending.cancel()
 
     def _subscribe(self, client: Client, text: str | bytes) -> None:
         """Read a message of a client; a new subscriber gets the last message of latched types."""

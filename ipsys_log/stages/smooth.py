@@ -20,10 +20,9 @@ def _compute(view: StageView, progress: Progress) -> list[Timed]:
     rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
     if rig is None:
         raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
-    frames = list(_frames(view))
-    progress(0, len(frames))
-    poses = smooth_positions(frames, rig, model_of(view))
-    progress(len(frames), len(frames))
+    progress(0, 1)
+    poses = smooth_positions(_frames(view), rig, model_of(view))
+    progress(1, 1)
     return _messages(poses)
 
 

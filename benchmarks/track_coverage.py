@@ -5,8 +5,8 @@ has a standard deviation of 0.6, so the mean of 20 labs is uncertain by 0.14. Si
 drive share these errors. So the NEES of a track minus that of the single positions shows the part of the
 filter, with a tenth of this uncertainty.
 
-All cameras are covered in the last part of a drive. The filter is causal: the rows before are those of a drive
-without a gap, and one run gives all figures.
+All cameras are covered in the last part of a drive. The filter is causal: the rows before are those of a
+drive without a gap, and one run gives all figures.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ each instant. A step is the change of the error between two rows up to 60 ms apa
 the cameras of the last 100 ms changes. Steps and velocities have 95th percentiles over all labs and robots.
 The script prints tables, and writes JSON with -o.
 
-``--track-coverage`` compares covariances with errors in many labs, with short drives: see ``track_coverage.py``.
+``--track-coverage`` compares covariances with errors in many labs, with short drives (``track_coverage.py``).
 """
 
 from __future__ import annotations

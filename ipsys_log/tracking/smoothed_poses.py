@@ -88,10 +88,10 @@ def _smooth_track(
     times_ns = [record.time_ns for record in records]
     durations_s = np.diff(times_ns) / NS_PER_S
     end = len(records)
-    for states in smooth_track(gather_sightings(records), durations_s, settings.motion, fade_m):
-        first = end - len(states.means)
+    for smoothed in smooth_track(gather_sightings(records), durations_s, settings.motion, fade_m):
+        first = end - len(smoothed.means)
         # A pose does not need the amplitudes.
-        states = States(states.means, states.covariances, np.empty((end - first, MOTION, 0)))
+        states = States(smoothed.means, smoothed.covariances, np.empty((end - first, MOTION, 0)))
         for place in range(end - 1, first - 1, -1):
             # Sightings of one instant have equal states: the last one has the pose.
             if place + 1 == len(records) or times_ns[place + 1] > times_ns[place]:

@@ -80,12 +80,10 @@ def smooth_track(
         yield States(means[:, :MOTION].copy(), own_part, cross)
 
 
-def _smooth_block(
-    means: Array, covariances: Array, forward: Array, spread: Array, later: _State
-) -> _State:
+def _smooth_block(means: Array, covariances: Array, forward: Array, spread: Array, later: _State) -> _State:
     """Replace the filtered states (b,) of a block by smoothed ones; return a copy of the first one.
 
-    ``later`` is the smoothed state after the block, if there is a step from the last state of the block to it.
+    ``later`` is the smoothed state after the block, if there is a step from the last state to it.
     """
     gains, rest = _gains(covariances[: len(forward)], forward, spread)
     for n in range(len(forward) - 1, -1, -1):

@@ -60,7 +60,8 @@ def smooth_positions(
     limits, reader = settings or TrackSettings(), FrameReader(model)
     reader.use_rig(rig)
     tracks, sources = RobotTracks(limits, reader.modes.fade_m, complete=True), _Sources()
-    waiting = sorted(frames, key=lambda one: (one.time_ns, one.camera, one.log_time_ns), reverse=True)
+    waiting = sorted(frames, key=lambda one: (one.time_ns, one.camera, one.log_time_ns))
+    waiting.reverse()  # each frame is forgotten when it is read
     while waiting:
         frame = waiting.pop()
         seen = reader.read(frame.camera, frame.time_ns, frame.positions)

@@ -79,14 +79,19 @@ class History:
         """Replace the records from a place on, and forget those that no late sighting can reach."""
         if not self.records or records[0].time_ns < self.began_ns:
             self.began_ns = records[0].time_ns
-        self.records[place:] = records
-        self.times_ns[place:] = [record.time_ns for record in records]
+        if place == len(self.records) and len(records) == 1:  # mostly
+            self.records.append(records[0])
+            self.times_ns.append(records[0].time_ns)
+        else:
+            self.records[place:] = records
+            self.times_ns[place:] = [record.time_ns for record in records]
         oldest_ns = self.times_ns[-1] - HISTORY_NS
         # The last record before the oldest time stays: a sighting at that time starts from it.
         forgotten = max(bisect_right(self.times_ns, oldest_ns) - 1, 0)
-        if self.complete:
-            self.older += [record.sighted for record in self.records[:forgotten]]
-        del self.records[:forgotten], self.times_ns[:forgotten]
+        if forgotten:
+            if self.complete:
+                self.older += [record.sighted for record in self.records[:forgotten]]
+            del self.records[:forgotten], self.times_ns[:forgotten]
         if len(self.rows_ns) > _MOST_ROWS:
             self.rows_ns = {time_ns for time_ns in self.rows_ns if time_ns >= oldest_ns}
 

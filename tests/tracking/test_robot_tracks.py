@@ -306,3 +306,13 @@ def test_slow_synchronised_cameras_predict_no_robot_that_one_of_them_sees() -> N
         poses += observe(tracks, Sighting(time_ns, "red", circle(time_ns, 0.26)))
     assert len(poses) == 12
     assert {pose.coasting_ns for pose in poses} == {None}
+
+
+def test_complete_history_keeps_all_sightings_but_few_states() -> None:
+    sightings = sight(circle, 2.0)
+    tracks = RobotTracks(complete=True)
+    follow(sightings, tracks=tracks)
+    ((_, history),) = tracks.histories()
+    assert [one.time_ns for one in history.everything()] == [one.time_ns for one in sightings]
+    # Only a late sighting needs states: those of half a second.
+    assert len(history.records) < len(sightings) / 3

@@ -2,7 +2,7 @@
 
     python benchmarks/tracks.py --drive-labs 20                      # every condition and calibration
     python benchmarks/tracks.py --condition 1_m_s --calibrations best
-    python benchmarks/tracks.py --drive-labs 200 --calibrations joint --contenders fuse
+    python benchmarks/tracks.py --track-coverage --drive-labs 200    # are the covariances right?
 
 Three robots drive through each lab, on a path that no calibration has seen. The cameras are 0, 11 and 22 ms
 out of step, and take 30 frames per second. The first 0.5 s of a track are left out.
@@ -12,6 +12,8 @@ all single positions in the same drive. ``1 ms`` is the error on a grid of insta
 each instant. A step is the change of the error between two rows up to 60 ms apart. At a hand-over, the set of
 the cameras of the last 100 ms changes. Steps and velocities have 95th percentiles over all labs and robots.
 The script prints tables, and writes JSON with -o.
+
+``--track-coverage`` compares covariances with errors in many labs, with short drives (``track_coverage.py``).
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from results import Report, command
 from rounds import Row
 from threadpoolctl import threadpool_limits
 from track_contenders import COASTING, CONTENDERS
+from track_coverage import COVERAGE_DRIVE_S, coverage_of_lab, coverage_table
 from track_drives import CALIBRATIONS, Condition, SeenDrive, calibrate, cover, drive_through
 from track_errors import (
     Figures,
@@ -36,6 +39,7 @@ from track_errors import (
 )
 
 from ipsys_log.errors import FitError
+from ipsys_log.joint.payload import JOINT
 
 __all__ = ["measure"]
 
@@ -89,6 +93,9 @@ _FAST_M_S = 1.0
 def measure(options: argparse.Namespace) -> Report:
     """Track the robots of every condition, with every calibration and contender."""
     report = Report("tracks")
+    if options.track_coverage:
+        _add_coverage(report, options)
+        return report
     sigma_m = options.height_sigma_mm / 1000
     conditions = [
         replace(one, height_sigma_m=sigma_m) for one in _CONDITIONS if options.condition in one.name
@@ -106,6 +113,18 @@ def measure(options: argparse.Namespace) -> Report:
                 if not condition.unknown_clocks or model == _ESTIMATES_CLOCKS:
                     _add(report, condition, model, _measure_labs(condition, model, contenders, options))
     return report
+
+
+def _add_coverage(report: Report, options: argparse.Namespace) -> None:
+    """Add the coverage of the covariances of ``joint``: a table for each condition."""
+    conditions = [one for one in _CONDITIONS if options.condition in one.name]
+    seeds = range(_FIRST_SEED, _FIRST_SEED + (1 if options.smoke else options.drive_labs))
+    with threadpool_limits(1):
+        for condition in conditions[:1] if options.smoke else conditions:
+            model = _ESTIMATES_CLOCKS if condition.unknown_clocks else JOINT
+            labs = [coverage_of_lab(condition, model, seed, COVERAGE_DRIVE_S) for seed in seeds]
+            report.details[condition.name] = labs
+            report.tables.append(coverage_table(f"{condition.name}: {model}", labs))
 
 
 def _measure_labs(
@@ -219,6 +238,7 @@ def _title(key: str) -> str:
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--drive-labs", type=int, default=5, help="labs of each condition")
+    parser.add_argument("--track-coverage", action="store_true", help="coverage of the covariances of joint")
     parser.add_argument("--drive-s", type=float, default=20.0, help="duration of a drive in s")
     parser.add_argument("--height-sigma-mm", type=float, default=0.0, help="sigma of the robots' heights")
     parser.add_argument("--condition", default="", help="only conditions with this in their name")

@@ -27,10 +27,12 @@ def playing(
     rate_hz: float,
     stamped: bool = True,
     before: Callable[[str, int], None] = lambda camera, number: None,
+    age_ns: Callable[[str, int], int] = lambda camera, number: 1_000_000,
 ) -> Open:
     """An opener of cameras that send their frames once, in real time; ``before`` is called before each frame.
 
-    All cameras send the frames of one number at one time.
+    All cameras send the frames of one number at one time. ``age_ns`` is the time from the stamp of a frame to
+    its arrival; it is negative if the clock of the camera is ahead.
     """
     starts_s: dict[str, float] = {}
 
@@ -45,7 +47,7 @@ def playing(
                 if wait_s > 0:
                     time.sleep(wait_s)
                 before(camera.name, number)
-                yield Frame(data, "jpeg", clock.now_ns() - 1_000_000 if stamped else None)
+                yield Frame(data, "jpeg", clock.now_ns() - age_ns(camera.name, number) if stamped else None)
 
         yield sent()
 

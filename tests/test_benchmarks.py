@@ -102,6 +102,33 @@ def test_table_of_coverage_has_means_over_labs(monkeypatch: pytest.MonkeyPatch) 
     assert lines[-1] == "  clocks: RMS error 0.354 ms, stated 0.500 ms, ratio 0.71"
 
 
+def test_coverage_of_tracks_is_compared_with_that_of_single_positions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    table = importlib.import_module("track_coverage").coverage_table
+    labs = []
+    for nees in (0.5, 1.5):  # the errors of a lab share its calibration
+        single = {"inside_68": 0.6, "inside_95": 0.9, "nees": nees}
+        labs.append({"single positions": single, "fuse": {**single, "nees": nees + 0.25}})
+    lines = table("made up", labs).splitlines()
+    assert lines[0] == "made up, 2 labs"
+    assert " ".join(lines[2].split()) == "single positions 60.0 ± 0.0 90.0 ± 0.0 1.00 ± 0.50"
+    assert " ".join(lines[3].split()) == "fuse 60.0 ± 0.0 90.0 ± 0.0 1.25 ± 0.50 0.250 ± 0.000"
+
+
+@pytest.mark.slow
+def test_coverage_of_tracks_is_measured(tmp_path: Path) -> None:
+    output = tmp_path / "results.json"
+    command = [sys.executable, "tracks.py", "--track-coverage", "--smoke", "-o", str(output)]
+    done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert max(map(len, done.stdout.replace(str(output), "").splitlines())) <= 80
+    ((lab,),) = json.loads(output.read_text(encoding="utf-8"))["details"]["tracks"].values()
+    assert {"single positions", "fuse, at capture", "fuse, coasting", "smooth, half-way"} < set(lab)
+    assert abs(lab["fuse, at capture"]["nees"] - lab["single positions"]["nees"]) < 0.3
+
+
 def test_corners_are_scored_against_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(BENCHMARKS)
     detection, scenes = importlib.import_module("detection"), importlib.import_module("scenes")

@@ -90,7 +90,8 @@ class Plan:
     parameters : the parameters on which the result depends, as in the record of the run.
     reads : the channels of the row that a run with these parameters reads.
     step : makes the step of a causal stage for a run of a given name; or
-    compute : returns the payload of a stage that needs the whole log, or a list of :class:`Timed` payloads.
+    compute : returns the payload of a stage that needs the whole log, or :class:`Timed` payloads: a list or
+        an iterator.
     notes : remarks for the user; ``compute`` may add some.
     """
 

@@ -322,7 +322,8 @@ def _compute_whole(task: Task, session: Session, name: str, progress: Progress) 
     assert task.compute is not None
     computed = task.compute(partial(progress, task.stage.name))
     # One payload, such as a model, speaks of the whole log: it belongs to the last message.
-    rows = computed if isinstance(computed, list) else [Timed(session.last(task.topics)[0], computed)]
+    is_timed = isinstance(computed, (list, Iterator))
+    rows = computed if is_timed else [Timed(session.last(task.topics)[0], computed)]
     for log_time_ns, payload in rows:
         topic = task.stage.channel_for(type(payload)).topic_of(name)
         yield Message(topic, log_time_ns, payload.timestamp, payload)

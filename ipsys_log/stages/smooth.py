@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Track, Tracks
+from ipsys_log.messages import Tracks
 from ipsys_log.messages.channels import EVENTS, POSITIONS, RIG, SMOOTHED_TRACKS
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, Timed
 from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
@@ -16,14 +16,13 @@ from ipsys_log.tracking.track_rows import make_track
 __all__ = ["STAGE"]
 
 
-def _compute(view: StageView, progress: Progress) -> list[Timed]:
+def _compute(view: StageView, progress: Progress) -> Iterator[Timed]:
     rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
     if rig is None:
         raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
-    frames = list(_frames(view))
-    progress(0, len(frames))
-    poses = smooth_positions(frames, rig, model_of(view))
-    progress(len(frames), len(frames))
+    progress(0, 1)
+    poses = smooth_positions(_frames(view), rig, model_of(view))
+    progress(1, 1)
     return _messages(poses)
 
 
@@ -36,19 +35,16 @@ def _frames(view: StageView) -> Iterator[Frame]:
             yield Frame(time_ns, camera, message.log_time_ns, message.payload.positions)
 
 
-def _messages(poses: list[SmoothedPose]) -> list[Timed]:
-    """Return a message for each instant. Log times do not decrease, although a sighting can be late."""
-    by_time: dict[int, list[Track]] = defaultdict(list)
-    log_times_ns: dict[int, int] = {}
-    for log_time_ns, pose in poses:
-        by_time[pose.time_ns].append(make_track(pose))
-        log_times_ns[pose.time_ns] = max(log_time_ns, log_times_ns.get(pose.time_ns, 0))
-    rows, newest_ns = [], 0
-    for time_ns, tracks in by_time.items():
-        newest_ns = max(newest_ns, log_times_ns[time_ns])
+def _messages(poses: Sequence[SmoothedPose]) -> Iterator[Timed]:
+    """Yield a message for each instant. Log times do not decrease, although a sighting can be late."""
+    newest_ns = 0
+    for time_ns, together in groupby(poses, key=lambda one: one.pose.time_ns):
+        tracks = []
+        for log_time_ns, pose in together:
+            tracks.append(make_track(pose))
+            newest_ns = max(newest_ns, log_time_ns)
         tracks.sort(key=lambda track: track.id)
-        rows.append(Timed(newest_ns, Tracks(time_ns, tuple(tracks))))
-    return rows
+        yield Timed(newest_ns, Tracks(time_ns, tuple(tracks)))
 
 
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:

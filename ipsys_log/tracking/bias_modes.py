@@ -104,8 +104,9 @@ class BiasModes:
         i, j = cells[:, 0], cells[:, 1]
         s, t = shares[:, 0, None, None], shares[:, 1, None, None]
         u, v = 1 - s, 1 - t
-        table = self.tables[camera]
-        near, right, above, far = table[i, j], table[i + 1, j], table[i, j + 1], table[i + 1, j + 1]
+        row = self.grid.shape[1]
+        corners = i * row + j + np.array([[0], [row], [1], [row + 1]])
+        near, right, above, far = self.tables[camera].reshape(-1, 3, self.count).take(corners, axis=0)
         sensitivities = np.empty((count, 4, self.count))
         sensitivities[:, :3] = (near * u + right * s) * v + (above * u + far * s) * t
         near, right, above, far = near[:, :2], right[:, :2], above[:, :2], far[:, :2]

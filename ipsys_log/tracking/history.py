@@ -9,12 +9,25 @@ from typing import NamedTuple
 from ipsys_log.tracking.filter import Sightings, States
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["HISTORY_NS", "History", "Record"]
+__all__ = ["HISTORY_NS", "History", "Record", "Sighted"]
 
 # A sighting that is older than the newest one by more than this is left out.
 HISTORY_NS = NS_PER_S // 2
 # More instants than this are checked for those that no late sighting can reach.
 _MOST_ROWS = 256
+
+
+class Sighted(NamedTuple):
+    """An accepted sighting: a row of the sightings of a message.
+
+    ``inside`` is the flag of the position, see :class:`ipsys_log.messages.Position`.
+    """
+
+    time_ns: int
+    camera: str
+    inside: bool | None
+    sightings: Sightings
+    sighting: int
 
 
 class Record(NamedTuple):
@@ -31,14 +44,19 @@ class Record(NamedTuple):
     states: States
     state: int
 
+    @property
+    def sighted(self) -> Sighted:
+        """The sighting without the state."""
+        return Sighted(self.time_ns, self.camera, self.inside, self.sightings, self.sighting)
+
 
 @dataclass(slots=True)
 class History:
     """The records of one robot, for as long as a late sighting can change them.
 
     ``times_ns`` are the times of the records, ``rows_ns`` the instants of the poses that were given out, and
-    ``began_ns`` is the time of the first record. A ``complete`` history forgets nothing, for processing after
-    the recording.
+    ``began_ns`` is the time of the first record. A ``complete`` history keeps the ``older`` sightings without
+    their states, for processing after the recording.
     """
 
     records: list[Record] = field(default_factory=list)
@@ -46,6 +64,7 @@ class History:
     rows_ns: set[int] = field(default_factory=set)
     complete: bool = False
     began_ns: int = 0
+    older: list[Sighted] = field(default_factory=list)
 
     @property
     def newest(self) -> Record:
@@ -60,16 +79,25 @@ class History:
         """Replace the records from a place on, and forget those that no late sighting can reach."""
         if not self.records or records[0].time_ns < self.began_ns:
             self.began_ns = records[0].time_ns
-        self.records[place:] = records
-        self.times_ns[place:] = [record.time_ns for record in records]
-        if self.complete:
-            return
+        if place == len(self.records) and len(records) == 1:  # mostly
+            self.records.append(records[0])
+            self.times_ns.append(records[0].time_ns)
+        else:
+            self.records[place:] = records
+            self.times_ns[place:] = [record.time_ns for record in records]
         oldest_ns = self.times_ns[-1] - HISTORY_NS
         # The last record before the oldest time stays: a sighting at that time starts from it.
         forgotten = max(bisect_right(self.times_ns, oldest_ns) - 1, 0)
-        del self.records[:forgotten], self.times_ns[:forgotten]
+        if forgotten:
+            if self.complete:
+                self.older += [record.sighted for record in self.records[:forgotten]]
+            del self.records[:forgotten], self.times_ns[:forgotten]
         if len(self.rows_ns) > _MOST_ROWS:
             self.rows_ns = {time_ns for time_ns in self.rows_ns if time_ns >= oldest_ns}
+
+    def everything(self) -> list[Sighted]:
+        """Return all sightings in order of time; of a ``complete`` history."""
+        return [*self.older, *(record.sighted for record in self.records)]
 
     def recent(self, time_ns: int, window_ns: int) -> list[Record]:
         """Return the records of a window that ends at a time."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Model, Position, Rig
+from ipsys_log.tracking.filter import States
 from ipsys_log.tracking.frame_reader import FrameReader
-from ipsys_log.tracking.history import History
+from ipsys_log.tracking.history import Sighted
+from ipsys_log.tracking.motion import MOTION
 from ipsys_log.tracking.smoother import smooth_track
 from ipsys_log.tracking.tracks import Pose, Robot, RobotTracks, TrackSettings, gather_sightings
 from ipsys_log.units import NS_PER_S
@@ -39,12 +42,13 @@ _Sources = dict[int, tuple[int, Sequence[bool]]]
 
 
 def smooth_positions(
-    frames: Sequence[Frame], rig: Rig, model: Model | None, settings: TrackSettings | None = None
+    frames: Iterable[Frame], rig: Rig, model: Model | None, settings: TrackSettings | None = None
 ) -> list[SmoothedPose]:
     """Return the smoothed poses of all robots, one for each instant of a sighting, in order of time.
 
     The filter runs over the frames in order of their capture times, and selects the sightings of each track.
-    The order of the frames in the log has no effect.
+    The order of the frames in the log has no effect. Only the sightings stay in memory until they are
+    smoothed: neither the frames, nor the states of the filter.
 
     Parameters
     ----------
@@ -56,7 +60,10 @@ def smooth_positions(
     limits, reader = settings or TrackSettings(), FrameReader(model)
     reader.use_rig(rig)
     tracks, sources = RobotTracks(limits, reader.modes.fade_m, complete=True), _Sources()
-    for frame in sorted(frames, key=lambda one: (one.time_ns, one.camera, one.log_time_ns)):
+    waiting = sorted(frames, key=lambda one: (one.time_ns, one.camera, one.log_time_ns))
+    waiting.reverse()  # each frame is forgotten when it is read
+    while waiting:
+        frame = waiting.pop()
         seen = reader.read(frame.camera, frame.time_ns, frame.positions)
         if seen is not None:
             sources[id(seen.sightings)] = frame.log_time_ns, seen.has_covariance
@@ -66,36 +73,45 @@ def smooth_positions(
     poses = [
         pose
         for robot, history in tracks.histories()
-        for pose in _smooth_track(robot, history, sources, limits, reader.modes.fade_m)
+        for pose in _smooth_track(robot, history.everything(), sources, limits, reader.modes.fade_m)
     ]
     return sorted(poses, key=lambda one: (one.pose.time_ns, str(one.pose.robot)))
 
 
 def _smooth_track(
     robot: Robot,
-    history: History,
+    records: Sequence[Sighted],
     sources: _Sources,
     settings: TrackSettings,
     fade_m: NDArray[np.float64],
 ) -> Iterator[SmoothedPose]:
-    records = history.records
+    """Yield the smoothed poses of one track, the last one first."""
     times_ns = [record.time_ns for record in records]
     durations_s = np.diff(times_ns) / NS_PER_S
-    states = smooth_track(gather_sightings(records), durations_s, settings.motion, fade_m)
-    for row, record in enumerate(records):
-        # Sightings of one instant have equal states: the last one has the pose.
-        if row + 1 == len(records) or times_ns[row + 1] > times_ns[row]:
-            recent = history.recent(record.time_ns, settings.window_ns)
-            flags = [one.inside for one in recent if one.inside is not None]
-            log_time_ns, known = sources[id(record.sightings)]
-            pose = Pose(
-                robot,
-                record.time_ns,
-                states,
-                row,
-                tuple(sorted({one.camera for one in recent})),
-                any(flags) if flags else None,
-                known[record.sighting],
-                age_ns=record.time_ns - times_ns[0],
-            )
-            yield SmoothedPose(log_time_ns, pose)
+    end = len(records)
+    for smoothed in smooth_track(gather_sightings(records), durations_s, settings.motion, fade_m):
+        first = end - len(smoothed.means)
+        # A pose does not need the amplitudes.
+        states = States(smoothed.means, smoothed.covariances, np.empty((end - first, MOTION, 0)))
+        for place in range(end - 1, first - 1, -1):
+            # Sightings of one instant have equal states: the last one has the pose.
+            if place + 1 == len(records) or times_ns[place + 1] > times_ns[place]:
+                window = slice(bisect_left(times_ns, times_ns[place] - settings.window_ns), place + 1)
+                log_time_ns, known = sources[id(records[place].sightings)]
+                pose = Pose(
+                    robot,
+                    times_ns[place],
+                    states,
+                    place - first,
+                    *_recent(records[window]),
+                    known[records[place].sighting],
+                    age_ns=times_ns[place] - times_ns[0],
+                )
+                yield SmoothedPose(log_time_ns, pose)
+        end = first
+
+
+def _recent(records: Sequence[Sighted]) -> tuple[tuple[str, ...], bool | None]:
+    """Return the cameras of recent sightings, and whether one of them is inside the calibrated volume."""
+    flags = [one.inside for one in records if one.inside is not None]
+    return tuple(sorted({one.camera for one in records})), any(flags) if flags else None

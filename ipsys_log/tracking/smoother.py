@@ -8,6 +8,8 @@ considers the amplitudes has no optimal smoother, so this one estimates them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,12 +23,24 @@ Array = NDArray[np.float64]
 _HEADING = 3
 # The speed of a robot is that between two sightings this long before and after: cameras differ by some mm.
 _SPEED_S = 0.1
+# Sightings of a block: 40 MB with 21 amplitudes.
+_BLOCK = 512
+# A mean (s,) and its covariance (s, s).
+_State = tuple[Array, Array]
 
 
 def smooth_track(
-    sightings: Sightings, durations_s: Array, noise: MotionNoise, fade_m: Array | None = None
-) -> States:
-    """Return the motion of one robot by all sightings of its track.
+    sightings: Sightings,
+    durations_s: Array,
+    noise: MotionNoise,
+    fade_m: Array | None = None,
+    block: int = _BLOCK,
+) -> Iterator[States]:
+    """Yield the motion of one robot by all sightings of its track: block by block, the last one first.
+
+    The memory for the covariances of all amplitudes is that of one block. The first pass of the filter keeps
+    only its state at the beginning of each block; the second pass filters one block again, and smooths it.
+    The size of a block has no effect on the result.
 
     Parameters
     ----------
@@ -34,26 +48,51 @@ def smooth_track(
     durations_s : (n - 1,), times between the sightings, at least 0.
     noise : the usual motion.
     fade_m : (m,), of the amplitudes, see :class:`~ipsys_log.tracking.filter.States`.
+    block : sightings of a block.
 
-    Returns
-    -------
-    States : n, one at each sighting. Those of the same instant are equal.
+    Yields
+    ------
+    States : of the sightings of a block in order of time. Those of the same instant are equal.
 
     References
     ----------
     Rauch, Tung and Striebel, AIAA Journal 1965. Covariances are sums of squares, as in the form of Joseph.
     """
-    speeds_m_s = _speeds(sightings.poses[:, :2], durations_s)
-    forward, spread = _transition(durations_s, speeds_m_s, noise, fade_m, sightings.sensitivities.shape[2])
-    means, covariances = _filter(sightings, forward, spread, noise)
-    gains, rest = _gains(covariances[:-1], forward, spread)
-    for n in range(len(durations_s) - 1, -1, -1):
-        change = means[n + 1] - forward[n] @ means[n]
+    speeds_m_s, count = _speeds(sightings.poses[:, :2], durations_s), sightings.sensitivities.shape[2]
+
+    def steps(first: int, last: int) -> tuple[Array, Array]:
+        return _transition(durations_s[first:last], speeds_m_s[first:last], noise, fade_m, count)
+
+    firsts = range(0, len(sightings.poses), block)
+    begins = [_begin(sightings, noise)]
+    for first in firsts[:-1]:
+        means, covariances = _filter(begins[-1], sightings, first, *steps(first, first + block))
+        begins.append((means[-1].copy(), covariances[-1].copy()))
+    later = begins[-1]  # not used: the last block has no step after it
+    for first, begin in zip(reversed(firsts), reversed(begins), strict=True):
+        forward, spread = steps(first, first + block)
+        own = len(sightings.poses[first : first + block])
+        means, covariances = _filter(begin, sightings, first, forward[: own - 1], spread[: own - 1])
+        later = _smooth_block(means, covariances, forward, spread, later)
+        both = (covariances + covariances.swapaxes(1, 2)) / 2
+        # Copies: a view would keep the memory of all amplitudes.
+        own_part, cross = both[:, :MOTION, :MOTION].copy(), -both[:, :MOTION, MOTION:]
+        yield States(means[:, :MOTION].copy(), own_part, cross)
+
+
+def _smooth_block(means: Array, covariances: Array, forward: Array, spread: Array, later: _State) -> _State:
+    """Replace the filtered states (b,) of a block by smoothed ones; return a copy of the first one.
+
+    ``later`` is the smoothed state after the block, if there is a step from the last state to it.
+    """
+    gains, rest = _gains(covariances[: len(forward)], forward, spread)
+    for n in range(len(forward) - 1, -1, -1):
+        mean, covariance = (means[n + 1], covariances[n + 1]) if n + 1 < len(means) else later
+        change = mean - forward[n] @ means[n]
         change[_HEADING] = _wrap(change[_HEADING])
         means[n] += gains[n] @ change
-        covariances[n] = rest[n] + gains[n] @ covariances[n + 1] @ gains[n].T
-    covariances = (covariances + covariances.swapaxes(1, 2)) / 2
-    return States(means[:, :MOTION], covariances[:, :MOTION, :MOTION], -covariances[:, :MOTION, MOTION:])
+        covariances[n] = rest[n] + gains[n] @ covariance @ gains[n].T
+    return means[0].copy(), covariances[0].copy()
 
 
 def _speeds(points_m: Array, durations_s: Array) -> Array:
@@ -66,20 +105,31 @@ def _speeds(points_m: Array, durations_s: Array) -> Array:
     return speeds
 
 
-def _filter(sightings: Sightings, forward: Array, spread: Array, noise: MotionNoise) -> tuple[Array, Array]:
-    """Return the means (n, s) and covariances (n, s, s) after each sighting."""
+def _begin(sightings: Sightings, noise: MotionNoise) -> _State:
+    """Return the state after the first sighting."""
     first = start(sightings.take(np.array([0])), noise)
-    count, m = len(sightings.poses), sightings.sensitivities.shape[2]
-    means, covariances = np.zeros((count, MOTION + m)), np.zeros((count, MOTION + m, MOTION + m))
-    means[0, :MOTION], covariances[0, :MOTION, :MOTION] = first.means[0], first.covariances[0]
+    size = MOTION + sightings.sensitivities.shape[2]
+    mean, covariance = np.zeros(size), np.eye(size)
+    mean[:MOTION], covariance[:MOTION, :MOTION] = first.means[0], first.covariances[0]
     # The errors of the filter are estimates minus truths.
-    covariances[0, :MOTION, MOTION:] = -first.cross[0]
-    covariances[0, MOTION:, :MOTION] = -first.cross[0].T
-    covariances[0, MOTION:, MOTION:] = np.eye(m)
+    covariance[:MOTION, MOTION:], covariance[MOTION:, :MOTION] = -first.cross[0], -first.cross[0].T
+    return mean, covariance
+
+
+def _filter(
+    begin: _State, sightings: Sightings, first: int, forward: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Return the means (k + 1, s) and covariances (k + 1, s, s) of a state and after the next k sightings.
+
+    ``begin`` is the state after the sighting ``first``.
+    """
+    count, size = len(forward) + 1, len(begin[0])
+    means, covariances = np.empty((count, size)), np.empty((count, size, size))
+    means[0], covariances[0] = begin
     for n in range(1, count):
         mean = forward[n - 1] @ means[n - 1]
         covariance = forward[n - 1] @ covariances[n - 1] @ forward[n - 1].T + spread[n - 1]
-        means[n], covariances[n] = _update(mean, covariance, sightings, n)
+        means[n], covariances[n] = _update(mean, covariance, sightings, first + n)
     return means, covariances
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
-from ipsys_log.tracking.history import HISTORY_NS, History, Record
+from ipsys_log.tracking.history import HISTORY_NS, History, Record, Sighted
 from ipsys_log.tracking.motion import MotionNoise
 from ipsys_log.units import NS_PER_S
 
@@ -114,7 +114,7 @@ class RobotTracks:
     ----------
     settings : the limits of tracks.
     fade_m : (m,), of the amplitudes of the calibration, see :class:`~ipsys_log.tracking.filter.States`.
-    complete : keep all sightings of all tracks, for their smoothing.
+    complete : keep all sightings of all tracks, without their states, for their smoothing.
     """
 
     def __init__(
@@ -375,7 +375,7 @@ def _gather(records: Sequence[Record]) -> States:
     )
 
 
-def gather_sightings(records: Sequence[Record]) -> Sightings:
+def gather_sightings(records: Sequence[Record | Sighted]) -> Sightings:
     """Return the sightings of records of different messages together."""
     return Sightings(
         np.array([record.sightings.poses[record.sighting] for record in records]),

@@ -188,6 +188,28 @@ def test_covered_robot_coasts_with_growing_covariance_and_ends() -> None:
     assert errors_m(after[3:], circle).max() < 1e-3
 
 
+@pytest.mark.parametrize(("speed_m_s", "braking_m_s2"), [(0.26, 0.8), (1.0, 2.0)])
+def test_robot_that_brakes_while_unseen_is_in_the_region(speed_m_s: float, braking_m_s2: float) -> None:
+    covered_ns = START_NS + NS_PER_S
+
+    def drive(time_ns: int) -> Array:
+        seen_s = (min(time_ns, covered_ns) - START_NS) / NS_PER_S
+        braking_s = min(max(time_ns - covered_ns, 0) / NS_PER_S, speed_m_s / braking_m_s2)
+        x_m = speed_m_s * (seen_s + braking_s) - braking_m_s2 / 2 * braking_s**2
+        return np.array([1 + x_m, 2.0, 0.1, 0.0])
+
+    tracks = RobotTracks()
+    follow([one for one in sight(drive, 1.0) if one.time_ns < covered_ns], tracks=tracks)
+    squares = []
+    for later_ms in range(150, 900, 50):
+        (pose,) = tracks.coast(covered_ns + later_ms * MS)
+        missed_m = place_of(pose)[:2] - drive(pose.time_ns)[:2]
+        spread_m2 = pose.states.covariances[pose.state, :2, :2]
+        squares.append(missed_m @ np.linalg.solve(spread_m2, missed_m))
+    # The limit of the 95 % region.
+    assert max(squares) < 5.99, squares
+
+
 @pytest.mark.parametrize(("seen", "longest_s"), [(1, 0.0), (2, 0.0), (3, 1.0)])
 def test_robot_seen_once_or_twice_is_not_predicted(seen: int, longest_s: float) -> None:
     rows = follow(with_another(sight(circle, 1.0)[:seen]))
@@ -284,3 +306,13 @@ def test_slow_synchronised_cameras_predict_no_robot_that_one_of_them_sees() -> N
         poses += observe(tracks, Sighting(time_ns, "red", circle(time_ns, 0.26)))
     assert len(poses) == 12
     assert {pose.coasting_ns for pose in poses} == {None}
+
+
+def test_complete_history_keeps_all_sightings_but_few_states() -> None:
+    sightings = sight(circle, 2.0)
+    tracks = RobotTracks(complete=True)
+    follow(sightings, tracks=tracks)
+    ((_, history),) = tracks.histories()
+    assert [one.time_ns for one in history.everything()] == [one.time_ns for one in sightings]
+    # Only a late sighting needs states: those of half a second.
+    assert len(history.records) < len(sightings) / 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.tracking.filter import Sightings, start
+from ipsys_log.tracking.filter import Sightings, States, start
 from ipsys_log.tracking.motion import MOTION, POSE, MotionNoise, transition
 from ipsys_log.tracking.smoother import smooth_track
 
@@ -63,10 +63,17 @@ def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Arra
     return best.reshape(count, size)[:, :MOTION], posterior[own, :, own][:, :MOTION, :MOTION]
 
 
+def smooth_whole(sightings: Sightings, durations_s: Array, block: int = 5) -> States:
+    """Return the smoothed states of all sightings in order; few sightings make several blocks."""
+    blocks = list(smooth_track(sightings, durations_s, NOISE, block=block))[::-1]
+    names = ("means", "covariances", "cross")
+    return States(*(np.concatenate([getattr(one, name) for one in blocks]) for name in names))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_smoothed_track_equals_a_batch_solution(seed: int) -> None:
     durations_s, sightings = make_sightings(seed, 12)
-    smoothed = smooth_track(sightings, durations_s, NOISE)
+    smoothed = smooth_whole(sightings, durations_s)
     means, covariances = condition_all(durations_s, sightings)
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     # In units of the standard deviations: the state has metres, radians and amplitudes.
@@ -83,7 +90,7 @@ def test_heading_is_smoothed_across_the_turn_of_pi() -> None:
     wrapped[:, 3] = (turned[:, 3] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(np.diff(wrapped[:, 3])).max() > 6
     results = [
-        smooth_track(one, durations_s, NOISE).means[:, 3]
+        smooth_whole(one, durations_s).means[:, 3]
         for one in (
             Sightings(poses, sightings.noise, sightings.sensitivities, sightings.clock_s)
             for poses in (turned, wrapped)
@@ -100,7 +107,15 @@ def test_common_error_is_not_reduced_by_smoothing() -> None:
     modes[:, 0, 0] = 0.002  # the same error of x everywhere
     noise = np.broadcast_to(np.diag([1e-8, 1e-8, 1e-8, 1e-8]), (count, 4, 4))
     sightings = Sightings(poses, noise, modes, np.zeros((count, MODES)))
-    smoothed = smooth_track(sightings, durations_s, NOISE)
+    smoothed = smooth_whole(sightings, durations_s)
     sigmas_m = np.sqrt(np.diagonal(smoothed.covariances, axis1=1, axis2=2))
     assert sigmas_m[:, 0] == pytest.approx(0.002, rel=0.02)
     assert sigmas_m[:, 1].max() < 1e-4
+
+
+@pytest.mark.parametrize("block", [1, 7, 20, 39, 40, 1000])
+def test_size_of_a_block_changes_no_bit(block: int) -> None:
+    durations_s, sightings = make_sightings(6, 40)
+    whole, parts = (smooth_whole(sightings, durations_s, size) for size in (40, block))
+    for name in ("means", "covariances", "cross"):
+        assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()

@@ -1,4 +1,4 @@
-"""What a log has recorded: the frames of each camera, their gaps, and the events by kind."""
+"""The recording in a log: the frames of each camera, their gaps, and the events by kind."""
 
 from __future__ import annotations
 

@@ -45,8 +45,9 @@ _HTML = (
     None,
 )
 _HELP = (
-    "Write an HTML page with the accuracy of a log's models. The page needs no network. For a log of ipsys "
-    f"drive: its errors, and figure 12 of the paper.{MORE}"
+    "Write an HTML page on a session: the accuracy of its models, the recording with its gaps, events and "
+    "latency, and the runs. The page needs no network. Without calibration points, it has no accuracy. For a "
+    f"log of ipsys drive: its errors, and figure 12 of the paper.{MORE}"
 )
 
 

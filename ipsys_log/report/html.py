@@ -140,7 +140,7 @@ def _commands(session: Session, findings: Findings) -> dict[str, str]:
     models = "".join(f" --model {shlex.quote(model)}" for model in named)
     return {
         "report": f"ipsys report {logs}",
-        "evaluate": f"ipsys evaluate {logs}{models} --details",
+        "errors": f"ipsys evaluate {logs}{models} --details",
         "plots": f"ipsys evaluate {logs}{models} --plots figures",
         "tracks": f"ipsys view {logs}",
         "info": f"ipsys info {logs}",

@@ -3,9 +3,9 @@
     python benchmarks/remote.py --mb 1000
 
 The log has the images of a sample log, repeated and filled up to 600 kB each, with all results up to the
-tracks. The server (moto) counts its answers, those to HEAD requests too, and their bytes.
-Each command runs in a process of its own, so that it knows nothing of the log. Speed is not measured: this
-server reads the whole object for each request.
+tracks. The server (moto) counts the requests that it answers, HEAD requests too, and the bytes of its
+answers. Each command runs in a process of its own, so that it knows nothing of the log. Speed is not
+measured: this server reads the whole object for each request.
 """
 
 from __future__ import annotations

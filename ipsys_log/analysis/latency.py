@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import LATENCY_TOPIC, Latency, Message
 from ipsys_log.messages.channels import LATENCY, MARKERS, POSITIONS, TRACKS, Channel
 from ipsys_log.units import NS_PER_S
@@ -75,7 +75,7 @@ class Ledger:
         return Message(LATENCY_TOPIC, message.log_time_ns, message.publish_time_ns, latency, message.camera)
 
 
-def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
+def recorded_latencies(paths: Sequence[LogLocation]) -> list[Latency]:
     """Return the latency ledger of a log.
 
     Raises

@@ -147,6 +147,7 @@ ipsys drift week*.mcap --fix                       # correct its pose
 """,
     "info": """
 ipsys info monday.mcap
+ipsys info s3://lab/monday.mcap          # at a URL: docs/scale.md
 """,
     "check": """
 ipsys check monday.mcap                  # is it sound? exit code 0, 1 or 2

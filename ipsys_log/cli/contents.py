@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import AsJson, ReadLogs, log_argument
+from ipsys_log.cli.options import AsJson, LogList, ReadLogs, log_argument
 from ipsys_log.cli.signals import writes_nothing
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands"]
 
-Logs = Annotated[list[Any], log_argument(help="Logs, files or URLs; each one is read separately.")]
+Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
 _Seconds = Optional[float]  # noqa: UP045
 
 

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 
+    LogList = list[LogLocation]
+else:
+    LogList = list[str]  # typer knows no union of types
+
 __all__ = [
     "AsJson",
     "Calibrations",
@@ -24,6 +28,7 @@ __all__ = [
     "FileLogs",
     "Force",
     "Host",
+    "LogList",
     "Logs",
     "Method",
     "ModelOfOther",
@@ -69,12 +74,11 @@ def _locations(texts: list[str]) -> list[Any]:
     return find_logs(texts)
 
 
-# An argument for logs, as files or URLs. Its value is a list of `LogLocation`, which typer does not know.
-log_argument = partial(typer.Argument, metavar="LOG", parser=str, callback=_locations)
+log_argument = partial(typer.Argument, metavar="LOG", callback=_locations)
 Logs = Annotated[
-    list[Any], log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
+    LogList, log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
 ]
-ReadLogs = Annotated[list[Any], log_argument(help="Logs, files or URLs, read as one session.")]
+ReadLogs = Annotated[LogList, log_argument(help="Logs, files or URLs, read as one session.")]
 FileLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
 
 # File name extensions of other input and output files: a log with such a name is a mistake.

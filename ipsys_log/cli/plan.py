@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, FileLogs, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile, cameras_of, load_calibrations
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def plan(
-    logs: FileLogs,
+    logs: Logs,
     places: Places = 5,
     model: Model = "best",
     height_m: Heights = None,
@@ -112,7 +112,7 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
         remarks.print(f"{plot} drawn", markup=False)
 
 
-def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
+def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
     """Check that a plan is possible, before a model is fitted."""
     from ipsys_log.analysis.calibration_points import measured
     from ipsys_log.errors import IpsysError

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import typer
 
 from ipsys_log.cli.console import say
 from ipsys_log.cli.dashboard import Web, WebPort, check_playback_page, serve_playback
-from ipsys_log.cli.options import log_argument
+from ipsys_log.cli.options import LogList, log_argument
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
 
 __all__ = ["add_commands"]
 
-Logs = Annotated[list[Any], log_argument(help="Logs to play, files or URLs, merged by time.")]
+Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
 RigFile = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),

@@ -18,7 +18,7 @@ __all__ = ["contents_of", "note_contents", "one_reading", "open_remote"]
 
 @dataclass(slots=True)
 class _Reading:
-    """What is known in one reading: tables of contents by identity, and the cached ranges of URLs."""
+    """The tables of contents by identity, and the cached ranges of URLs, of one reading."""
 
     contents: dict[object, tuple[object, Contents]] = field(default_factory=dict)
     ranges: dict[LogUrl, RemoteRanges] = field(default_factory=dict)

@@ -290,15 +290,26 @@ class LogReader:
         """
         if topic not in self.channels:
             raise LogError(f"{self.path} has no topic {topic}. To list the topics: ipsys info {self.path}")
-        if self._stored is None:
-            self._stored = stored_hashes(self._view, self._contents)
-        state = self._stored.get(topic)
-        if state is None or state.count != self.channels[topic].message_count:
+        state = self._known_hash(topic)
+        if state is None:
             state = ChannelHash()
             for message in self.messages([topic]):
                 state.add(message.log_time_ns, message.publish_time_ns, message.data)
-            self._stored[topic] = state
+            self._hashes()[topic] = state
         return state.digest.hex()
+
+    def has_stored_hash(self, topic: str) -> bool:
+        """Return whether the hash of a channel is known without a read of its messages."""
+        return topic in self.channels and self._known_hash(topic) is not None
+
+    def _known_hash(self, topic: str) -> ChannelHash | None:
+        state = self._hashes().get(topic)
+        return state if state is not None and state.count == self.channels[topic].message_count else None
+
+    def _hashes(self) -> dict[str, ChannelHash]:
+        if self._stored is None:
+            self._stored = stored_hashes(self._view, self._contents)
+        return self._stored
 
     def check_file(self, watch: Watch) -> FileCheck:
         """Read every byte of the log, and compare records, CRCs, indexes, summary and stored hashes."""

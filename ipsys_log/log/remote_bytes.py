@@ -186,8 +186,7 @@ class RemoteBytes:
     def fault(self, offset: int, reason: str) -> LogError:
         """Return the error for damage at `offset`."""
         return LogError(
-            f"{self.path} is damaged at byte {offset}: {reason}. Download it, and repair the file: "
-            "ipsys repair"
+            f"{self.path} is damaged at byte {offset}: {reason}. Download it, and run: ipsys repair FILE"
         )
 
     def refusal(self, reason: str) -> BoundError:

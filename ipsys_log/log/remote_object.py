@@ -19,6 +19,7 @@ from ipsys_log.plain_text import plain_text
 __all__ = ["RemoteObject", "list_objects", "open_object"]
 
 _PAUSES_S = (0.1, 0.4, 1.6, 4.0)
+_SELF_REPEATING = ("s3", "s3a", "gs", "gcs")  # their file systems repeat a request some times themselves
 _LONGEST_REASON = 200
 # HTTP status codes of requests that may succeed when they are repeated.
 _PASSING_STATUS = (408, 425, 429)
@@ -242,7 +243,8 @@ def _repeat(url: LogUrl, ask: Callable[[], T]) -> T:
     LogError
         One line: the failure, and what to do.
     """
-    for pause_s in (*_PAUSES_S, None):
+    pauses_s = _pauses_s(url)
+    for pause_s in (*pauses_s, None):
         try:
             return ask()
         except (LogError, *_BUGS):
@@ -252,6 +254,10 @@ def _repeat(url: LogUrl, ask: Callable[[], T]) -> T:
                 raise _failure(url, error) from error
         time.sleep(pause_s)
     raise AssertionError("the last attempt returns or raises")
+
+
+def _pauses_s(url: LogUrl) -> tuple[float, ...]:
+    return _PAUSES_S[:1] if url.scheme in _SELF_REPEATING else _PAUSES_S
 
 
 def _status_of(error: BaseException) -> int | None:
@@ -297,7 +303,7 @@ def _failure(url: LogUrl, error: BaseException) -> LogError:
         return LogError(f"{url} does not exist")
     if type(error).__name__ == _NO_CREDENTIALS:
         return LogError(f"{url} cannot be read: there are no credentials for {url.scheme}://; give some")
-    tried = f" after {len(_PAUSES_S) + 1} attempts" if _may_pass(error) else ""
+    tried = f" after {len(_pauses_s(url)) + 1} attempts" if _may_pass(error) else ""
     cause = error.__cause__ if isinstance(error, FileNotFoundError) and error.__cause__ else error
     return LogError(
         f"{url} cannot be read{tried}: {_reason(url, cause)}; check the address and the connection"

@@ -6,7 +6,6 @@ import re
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 from rich.text import Text
 
@@ -18,6 +17,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.plain_text import plain_text
+from ipsys_log.runs.frame_times import channel_times
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.survey.from_log import FinishedLog
@@ -140,7 +140,7 @@ def _lens(session: Session, camera: str) -> dict[str, Any] | None:
 
 def _channel(session: Session, topic: str) -> dict[str, Any]:
     readers = [reader for reader in session.readers if topic in reader.channels]
-    times_ns = np.sort(np.concatenate([reader.times(topic) for reader in readers]))
+    times_ns = channel_times(session, topic)
     schema = readers[0].channels[topic].schema
     name = schema.name if schema else None
     gaps = FrameGaps()

@@ -99,7 +99,7 @@ def serve_ranges() -> Iterator[Store]:
 
     with Server(("127.0.0.1", 0), Handler) as server:
         store.address = f"http://127.0.0.1:{server.server_address[1]}"
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         yield store
         server.shutdown()

@@ -110,7 +110,7 @@ def test_logs_of_a_pattern_are_read_as_one(bucket: Any) -> None:
 @pytest.mark.parametrize(
     ("environment", "text"),
     [
-        ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "cannot be read after 5 attempts: "),
+        ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "cannot be read after 2 attempts: "),
         ({}, "does not exist"),
     ],
 )

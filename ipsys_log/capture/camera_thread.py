@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, mid_exposure_ns
+from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage, mid_exposure_ns
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import frame_payload
 from ipsys_log.capture.video_packets import find_size, is_decodable_start
@@ -154,6 +154,9 @@ class CameraReader:
             with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
                 self._is_open.set()
                 for frame in frames:
+                    if isinstance(frame, SourceMessage):
+                        self._pass_on(frame)
+                        continue
                     if shared.stopped.is_set():
                         break
                     if frame is not None:
@@ -166,6 +169,13 @@ class CameraReader:
                 self._say("camera_lost", f"{error}; ipsys tries again")
             return error
         return None
+
+    def _pass_on(self, message: SourceMessage) -> None:
+        """Put another message of the source into the stream; show the text of an event."""
+        topic, payload = message
+        self._shared.put(Arrival(self._shared.clock.now_ns(), topic, payload.timestamp, payload))
+        if isinstance(payload, Event):
+            self._shared.say(payload.text)
 
     def _take(self, frame: Frame) -> None:
         state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()

@@ -115,6 +115,11 @@ class LiveCameras:
         self._reason = reason or self._reason
         self._ending = True
 
+    @property
+    def is_stopped(self) -> bool:
+        """Return whether :meth:`stop` was called."""
+        return self._ending
+
     def __iter__(self) -> Generator[Message | None, None, None]:
         """Yield messages; requesting the next message acknowledges the previous write.
 

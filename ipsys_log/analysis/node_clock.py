@@ -8,12 +8,13 @@ above::
     sent_ns - received_ns  <=  offset  <=  back_ns - replied_ns
 
 A line in the time of the node must separate the lower bounds from the upper ones. The estimate is the middle
-of the line pair that has the greatest distance: jitter moves most bounds away from the lines, and the exchanges
-with the least delay decide. A constant difference between the delays of both directions cannot be observed.
-Half of it is an error of the offset; it is always less than the bound of the estimate.
+of the line pair that has the greatest distance: jitter moves most bounds away from the lines, and the
+exchanges with the least delay decide. A constant difference between the delays of both directions cannot be
+observed. Half of it is an error of the offset; it is always less than the bound of the estimate.
 
-References: F. Cristian, Probabilistic clock synchronization, Distributed Computing 3 (1989) 146-158; S. B. Moon,
-P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM 1999.
+References: F. Cristian, Probabilistic clock synchronization, Distributed Computing 3 (1989) 146-158; S. B.
+Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM
+1999.
 """
 
 from __future__ import annotations

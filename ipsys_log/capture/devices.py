@@ -19,6 +19,7 @@ from ipsys_log.capture.frames import (
     Open,
     Say,
     SourceError,
+    SourceMessage,
     device_path,
     report_refused_settings,
 )
@@ -146,11 +147,15 @@ def open_usb(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManage
     return open_opencv(camera, clock, say)
 
 
-def _refuse_node(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:  # noqa: ARG001
+def _refuse_node(
+    camera: RigCamera,
+    clock: Clock,  # noqa: ARG001
+    say: Say,  # noqa: ARG001
+) -> AbstractContextManager[Iterator[Frame | None]]:
     """Refuse the camera of a node that is opened without its rig."""
     raise IpsysError(
-        f"camera {camera.name}: {camera.source} is the camera of a node, which this step cannot open; use the "
-        "commands record, live, measure, align or calibrate"
+        f"camera {camera.name}: {camera.source} is the camera of a node, which this step cannot open; use the"
+        " commands record, live, measure, align or calibrate"
     )
 
 
@@ -244,7 +249,9 @@ def usb_advice(rig: Rig) -> list[str]:
     return advise(list_demands(find_cameras(), rig))
 
 
-def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:
+def open_source(
+    camera: RigCamera, clock: Clock, say: Say
+) -> AbstractContextManager[Iterator[Frame | SourceMessage | None]]:
     """Open a camera of any kind; an :data:`~ipsys_log.capture.frames.Open`.
 
     Raises

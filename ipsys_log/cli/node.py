@@ -56,8 +56,8 @@ def node(
 ) -> None:
     """Record one camera of this host, and send its frames to the centre, until Ctrl-C.
 
-    The centre is a recording on another machine, such as ipsys live, whose rig has the source zenoh:NAME. If the
-    centre or the network is away, the node records on, and sends the missing frames afterwards."""
+    The centre is a recording on another machine, such as ipsys live, whose rig has the source zenoh:NAME. If
+    the centre or the network is away, the node records on, and sends the missing frames afterwards."""
     allow_interrupt("stopped before the first frame was recorded; no log was written")
     from ipsys_log.capture.nodes.centre import is_of_node
     from ipsys_log.capture.nodes.network import read_network
@@ -70,8 +70,8 @@ def node(
     lab = prepare_lab(rig, [camera], None, with_lenses=False)
     if is_of_node(lab.cameras[0]):
         raise IpsysError(
-            f"{rig}: camera {camera} has the source {lab.cameras[0].source}, which belongs to the centre; give "
-            "the device of this host, such as usb:/dev/video0, in a rig file of the node"
+            f"{rig}: camera {camera} has the source {lab.cameras[0].source}, which belongs to the centre; "
+            "give the device of this host, such as usb:/dev/video0, in a rig file of the node"
         )
     network = read_network(lab.rig.nodes, lab.folder, centre, certificates)
     network.files_of(camera)

@@ -99,6 +99,7 @@ def test_line_has_the_greatest_distance_by_linear_programming(seed: int) -> None
     best = linprog(
         [1, -1, 0], np.vstack([below, above]), np.concatenate([-lower[:, 1], upper[:, 1]]), bounds=bounds
     )
+    assert best.x is not None
     low, high, drift = best.x
     assert line.bound_ns / MS == pytest.approx((high - low) / 2, abs=1e-4)
     assert (line.offset_ns - base) / MS == pytest.approx((high + low) / 2, abs=0.02)

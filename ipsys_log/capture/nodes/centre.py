@@ -1,16 +1,15 @@
 """The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
 
-All cameras of a recording share one session. The centre asks each node for its state ten times a second, and for
-frames that did not arrive, with the lowest priority. Everything that arrives waits in a queue with a limit; a
-dropped frame is missing, so the node sends it again.
+All cameras of a recording share one session. The centre asks each node for its state ten times a second, and
+for frames that did not arrive, with the lowest priority. Everything that arrives waits in a queue with a
+limit; a dropped frame is missing, so the node sends it again.
 """
 
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import TracebackType
@@ -21,13 +20,11 @@ from ipsys_log.capture.nodes.network import NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import (
     FrameHeader,
-    FrameRequest,
     NodeState,
     frames_key,
     missing_key,
     state_key,
 )
-from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
 from ipsys_log.rig.file import check_name
 from ipsys_log.units import NS_PER_S
@@ -42,7 +39,7 @@ _MOST_WAITING_BYTES = 64 << 20
 _TURN_S = 0.1
 # The first exchanges follow each other faster: together they find the offset.
 _FIRST_TURN_S, _FIRST_EXCHANGES = 0.02, 40
-_FIRST_ANSWER_S = 10.0
+_FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S
 _ANSWER_S, _FRAMES_S = 3.0, 20.0
 
@@ -120,15 +117,15 @@ class Centre:
         link = self._links.get(camera.name)
         if link is None:
             stream = NodeStream(camera, self._version)
-            link = self._links[camera.name] = _Link(
-                self._session, camera, self._nodes[camera.name], stream, clock
-            )
-            link.await_node(self._network)
+            link = _Link(self._session, camera, self._nodes[camera.name], stream, clock)
+            link.await_node(self._network, say)
+            self._links[camera.name] = link
+            say(f"camera {camera.name}: its node answers; {stream.describe_clock()}")
         link.heard_ns = clock.now_ns()
         yield link.items()
 
     def choose_opener(self, other: Open) -> Open:
-        """Return the function that opens the cameras of nodes, and any ``other`` camera with this function."""
+        """Return the function that opens the cameras of nodes, and with ``other`` all other cameras."""
 
         def choose(camera: RigCamera, clock: Clock, say: Say) -> Any:
             return self.open(camera, clock, say) if is_of_node(camera) else other(camera, clock, say)
@@ -146,31 +143,42 @@ class _Link:
         self._arrived = threading.Condition()
         self._waiting: deque[_Arrival] = deque()
         self._waiting_bytes = 0
+        # The number of answers, and items from before the opening.
         self._exchanges = 0
+        self._early: list[Frame | SourceMessage] = []
         self._state_asked_ns = 0
         self._asks_frames = False
         self._subscriber = session.declare_subscriber(frames_key(node), self._receive)
 
-    def await_node(self, network: NodeNetwork) -> None:
-        """Wait for the first answer of the node.
+    def await_node(self, network: NodeNetwork, say: Say) -> None:
+        """Wait for the first answers of the node; ``say`` reports a longer wait.
 
         Raises
         ------
         SourceError
             No node answers.
         """
-        end_ns = self._clock.now_ns() + round(_FIRST_ANSWER_S * NS_PER_S)
-        while not self._waiting_states():
-            if self._clock.now_ns() > end_ns:
-                raise SourceError(
-                    f"camera {self._camera.name}: no node {self._node} answers at {network}; start it on its "
-                    f"host: ipsys node lab.toml --camera {self._node}"
-                )
+        start_ns, is_said = self._clock.now_ns(), False
+        while not (self._exchanges >= _OPENING_EXCHANGES and self._stream.is_known):
+            waited_s = (self._clock.now_ns() - start_ns) / NS_PER_S
+            if waited_s > _FIRST_ANSWER_S:
+                break
+            if waited_s > _WAIT_UNSAID_S and not is_said and not self._exchanges:
+                is_said = True
+                say(f"camera {self._camera.name}: waits for node {self._node} at {network}")
+            arrival = self._take()
+            self._early += [] if arrival is None else arrival.take()
             self._ask_state()
-            time.sleep(_FIRST_TURN_S)
+        if not self._stream.is_known:
+            raise SourceError(
+                f"camera {self._camera.name}: no node {self._node} answers at {network}; start it on its "
+                f"host: ipsys node lab.toml --camera {self._node}"
+            )
 
     def items(self) -> Iterator[Frame | SourceMessage | None]:
         """Yield the frames and the messages about them."""
+        yield from self._early
+        self._early.clear()
         while True:
             self._ask_state()
             self._ask_frames()
@@ -183,10 +191,6 @@ class _Link:
             yield from arrival.take()
             if self._stream.has_ended:
                 return
-
-    def _waiting_states(self) -> bool:
-        with self._arrived:
-            return any(not arrival.size for arrival in self._waiting)
 
     def _take(self) -> _Arrival | None:
         turn_s = _FIRST_TURN_S if self._exchanges < _FIRST_EXCHANGES else _TURN_S

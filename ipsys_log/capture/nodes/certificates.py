@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import socket
 import ssl
+from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["CENTRE", "Certificates", "check_certificates", "refuse_centre"]
+__all__ = ["CENTRE", "Certificates", "check_centre", "check_certificates"]
 
 # The name of the centre in its certificate; the name of a node is that of its camera.
 CENTRE = "centre"
-_CONNECT_S = 3.0
+_CONNECT_S, _REFUSAL_S = 3.0, 0.3
 _GUIDE = "docs/nodes.md shows how to make it"
 
 
@@ -51,11 +52,13 @@ def check_certificates(files: Certificates, name: str) -> None:
         subject = _own_subject(files)
     except ssl.SSLCertVerificationError as error:
         raise IpsysError(
-            f"{files.certificate}: is not accepted by {files.authority.name} ({error.verify_message}); {_GUIDE}"
+            f"{files.certificate}: is not accepted by {files.authority.name} ({error.verify_message}); "
+            f"{_GUIDE}"
         ) from error
     except ssl.SSLError as error:
         raise IpsysError(
-            f"{files.certificate}: does not fit {files.key.name}, or a file is damaged ({_reason(error)}); {_GUIDE}"
+            f"{files.certificate}: does not fit {files.key.name}, or a file is damaged ({_reason(error)}); "
+            f"{_GUIDE}"
         ) from error
     except OSError as error:
         raise IpsysError(f"{files.key}: cannot be read: {error.strerror}") from error
@@ -77,7 +80,8 @@ def _own_subject(files: Certificates) -> str:
                 waiting.remove(side)
             except ssl.SSLWantReadError:
                 continue
-    names = dict(pair for row in (client.getpeercert() or {}).get("subject", ()) for pair in row)  # type: ignore[misc]
+    certificate: Any = client.getpeercert() or {}
+    names = dict(pair for row in certificate.get("subject", ()) for pair in row)
     return str(names.get("commonName", ""))
 
 
@@ -90,8 +94,10 @@ def _context(files: Certificates, protocol: int) -> ssl.SSLContext:
     return context
 
 
-def refuse_centre(host: str, port: int, files: Certificates) -> str | None:
-    """Connect to the centre once; return None if it answers with a valid certificate, else the reason.
+def check_centre(host: str, port: int, files: Certificates) -> str | None:
+    """Connect to the centre once; return None if it answers, else the reason why it does not.
+
+    The errors of Zenoh name no reason, so this connection comes before those of Zenoh.
 
     Raises
     ------
@@ -101,27 +107,32 @@ def refuse_centre(host: str, port: int, files: Certificates) -> str | None:
     context = _context(files, ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = True
     try:
-        with (
-            socket.create_connection((host, port), _CONNECT_S) as plain,
-            context.wrap_socket(plain, server_hostname=host) as secure,
-        ):
-            secure.settimeout(_CONNECT_S / 10)
-            # The centre refuses the certificate of this host only after its own handshake.
-            secure.recv(1)
-    except TimeoutError as error:
-        return None if "handshake" not in str(error) and "timed out" in str(error) else str(error)
+        with socket.create_connection((host, port), _CONNECT_S) as plain:
+            _shake_hands(context, plain, host)
     except ssl.SSLCertVerificationError as error:
         raise IpsysError(
-            f"centre {host}:{port}: its certificate is not accepted by {files.authority} "
+            f"centre {host}:{port}: its certificate is not accepted with {files.authority} "
             f"({error.verify_message}); {_GUIDE}"
         ) from error
+    except ssl.SSLEOFError:
+        return "ended the connection"
     except ssl.SSLError as error:
         raise IpsysError(
             f"centre {host}:{port}: does not accept {files.certificate} ({_reason(error)}); {_GUIDE}"
         ) from error
+    except TimeoutError:
+        return "timed out"
     except OSError as error:
-        return error.strerror or str(error)
+        return (error.strerror or str(error)).lower()
     return None
+
+
+def _shake_hands(context: ssl.SSLContext, plain: socket.socket, host: str) -> None:
+    """Connect with certificates; the centre refuses that of this host only after its own handshake."""
+    with context.wrap_socket(plain, server_hostname=host) as secure:
+        secure.settimeout(_REFUSAL_S)
+        with suppress(TimeoutError):
+            secure.recv(1)
 
 
 def _reason(error: ssl.SSLError) -> str:

@@ -1,9 +1,9 @@
 """The network of nodes and centre: the address of the centre, and the sessions of Zenoh.
 
-The centre listens, and the nodes connect to it. Sessions search no others (scouting is off), and these sessions
-are apart from those of streams to robots. With certificates, both sides prove their names. The access rules of
-both sides name the keys of each camera: a node can write only those of its own camera, and only the centre can
-ask a node.
+The centre listens, and the nodes connect to it. Sessions search no others (scouting is off), and these
+sessions are apart from those of streams to robots. With certificates, both sides prove their names. The
+access rules of both sides name the keys of each camera: a node can write only those of its own camera, and
+only the centre can ask a node.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def read_network(
         certificates = folder / named
     if certificates is None and not _is_loopback(host):
         raise IpsysError(
-            f"{where} {address}: is another machine, so nodes and centre need certificates; write certificates "
-            '= "FOLDER" into [nodes]; docs/nodes.md shows how to make them'
+            f"{where} {address}: is another machine, so nodes and centre need certificates; write "
+            'certificates = "FOLDER" into [nodes]; docs/nodes.md shows how to make them'
         )
     return NodeNetwork(host, int(port), certificates)
 
@@ -172,14 +172,14 @@ def _rules(camera: str, data_flow: str, ask_flow: str) -> list[dict[str, Any]]:
 
 
 def _open(
-    zenoh: Any,
+    library: Any,
     settings: dict[str, Any],
     files: Certificates | None,
     rules: list[dict[str, Any]],
     subjects: list[dict[str, Any]],
     policies: list[dict[str, Any]],
     network: NodeNetwork,
-) -> Any:
+) -> zenoh.Session:
     settings = {
         **settings,
         "mode": "peer",
@@ -200,13 +200,14 @@ def _open(
     }
     if files is not None:
         settings["transport/link/tls"] = _tls(files)
-    config = zenoh.Config()
+    config = library.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
+        session: Any = library.open(config)
+    except library.ZError as error:
         raise IpsysError(f"[nodes] centre {network}: the connection cannot be opened ({error})") from error
+    return session  # type: ignore[no-any-return]
 
 
 def _tls(files: Certificates) -> dict[str, Any]:
@@ -230,7 +231,7 @@ def _check_free(network: NodeNetwork) -> None:
         socket.create_server((network.host, network.port), family=family).close()
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            text = f"port {network.port} is in use, perhaps by another ipsys; end that program, or change the port"
+            text = f"port {network.port} is in use, perhaps by another ipsys; end that program, or change it"
         elif error.errno == errno.EACCES:
             text = f"port {network.port} is not allowed; give one from 1024 to {_LARGEST_PORT}"
         else:

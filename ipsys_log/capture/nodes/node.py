@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Say
-from ipsys_log.capture.nodes.certificates import refuse_centre
+from ipsys_log.capture.nodes.certificates import check_centre
 from ipsys_log.capture.nodes.network import NodeNetwork, open_node_session
 from ipsys_log.capture.nodes.wire import (
     FrameHeader,
@@ -96,7 +96,7 @@ class Node:
         files = self._network.files_of(self._camera)
         reason = None
         if files is not None:
-            reason = refuse_centre(self._network.host, self._network.port, files)
+            reason = check_centre(self._network.host, self._network.port, files)
         self._session = open_node_session(self._network, self._camera)
         self._session.declare_queryable(state_key(self._camera), self._answer_state)
         self._session.declare_queryable(missing_key(self._camera), self._enqueue_request)
@@ -104,8 +104,8 @@ class Node:
             thread.start()
         if reason is not None:
             self._say(
-                f"centre {self._network} does not answer ({reason}); the node records, and sends the frames to a "
-                "centre that starts later"
+                f"centre {self._network} does not answer ({reason}); the node records, and sends the frames "
+                "to a centre that starts later"
             )
         return self
 
@@ -227,7 +227,7 @@ class Node:
                     self._answer_frames(query, request)
 
     def _answer_frames(self, query: Any, request: FrameRequest) -> None:
-        for number in range(request.first, request.first + min(request.count, _MOST_FRAMES)):
+        for number in range(request.first, min(request.end, request.first + _MOST_FRAMES)):
             if number >= self._count or self._stopped.is_set():
                 return
             frame = self._find(number) or _Recorded(number, 0, "jpeg", b"")

@@ -1,8 +1,8 @@
 """The frames of one node at the centre: their times, the missing ones, and the sessions of the node.
 
-This module has no network and no clock. Frames of JPEG are passed on as they arrive, late ones after newer ones.
-A video cannot be decoded in another order, so its packets are passed on in their order: the newer ones wait at the
-node.
+This module has no network and no clock. Frames of JPEG are passed on as they arrive, late ones after newer
+ones. A video cannot be decoded in another order, so its packets are passed on in their order: the newer ones
+wait at the node.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ _FRAMES_PER_REQUEST = 16
 _ESTIMATE_EVERY_NS = NS_PER_S
 # A frame that the node has counted for this time, and that has not arrived, is missing.
 _ON_THE_WAY_NS = NS_PER_S
-# A frame cannot be older on arrival, nor younger: the clock of the node has jumped, and no exchange shows it yet.
+# A frame cannot be older on arrival, nor younger: the clock of the node has jumped, and no exchange shows it
+# yet.
 _OLDEST_NS, _YOUNGEST_NS = 10 * NS_PER_S, -NS_PER_S // 10
 # One gap names at most this number of frames: an hour at 100 frames/s.
 _MOST_MISSING = 360_000
@@ -65,7 +66,9 @@ class NodeStream:
     def has_ended(self) -> bool:
         """Return whether the source of the node has ended and all of its frames have arrived."""
         state = self._state
-        return state is not None and state.has_ended and not self._missing and self._expected >= state.count
+        return (
+            state is not None and state.has_ended and not self._missing and self._expected >= state.recorded
+        )
 
     @property
     def missing_count(self) -> int:
@@ -75,6 +78,16 @@ class NodeStream:
     @property
     def _expected(self) -> int:
         return self._first if self._next is None else self._next
+
+    def describe_clock(self) -> str:
+        """Return a text about the clock of the node."""
+        line = self._history.line
+        if line is None:
+            return "its clock is not known yet"
+        offset_s = line.offset_ns / NS_PER_S
+        return (
+            f"its clock is {abs(offset_s):.6f} s {'behind' if offset_s >= 0 else 'ahead of'} this machine's"
+        )
 
     def state_request(self) -> StateRequest:
         """Return the next request for the state of the node."""
@@ -91,7 +104,7 @@ class NodeStream:
             first, count = (first, count + 1) if count else (number, 1)
             if count == _FRAMES_PER_REQUEST:
                 break
-        return FrameRequest(self._session, first, count)
+        return FrameRequest(self._session, first, first + count)
 
     def take_state(self, state: NodeState, sent_ns: int, back_ns: int) -> Items:
         """Take the answer of a node to a request; yield messages about it.
@@ -114,14 +127,14 @@ class NodeStream:
         if jump_ns is not None:
             yield self._event(
                 "clock_jumped",
-                f"camera {self._camera.name}: the clock of its node jumped by {jump_ns / NS_PER_S:+.3f} s; the "
-                "times of its frames are converted with the new offset",
+                f"camera {self._camera.name}: the clock of its node jumped by {jump_ns / NS_PER_S:+.3f} s; "
+                "the times of its frames are converted with the new offset",
                 back_ns,
             )
         if back_ns - self._estimated_ns >= _ESTIMATE_EVERY_NS or jump_ns is not None:
             self._estimated_ns = back_ns
             yield from self._estimate(back_ns)
-        yield from self._find_tail(state.count, back_ns)
+        yield from self._find_tail(state.recorded, back_ns)
 
     def take_frame(self, header: FrameHeader, data: bytes, now_ns: int, is_late: bool) -> Items:
         """Take a frame; yield it if it is new and its turn has come, and messages about gaps.
@@ -135,19 +148,20 @@ class NodeStream:
         if header.session != self._session or not (number in self._missing or number >= self._expected):
             return
         frame = self._frame(header, data)
-        if self._next is None and not is_decodable_start(frame):
+        # A recording that begins in the middle of a video begins with a keyframe.
+        if self._next is None and self._first > 0 and not is_decodable_start(frame):
             self._first = number + 1
             return
+        is_certain = is_late or self._is_plausible(frame, now_ns)
         if number >= self._expected:
             yield from self._find_gap(number, now_ns)
             self._next = number + 1
-            is_certain = is_late or self._is_plausible(frame, now_ns)
             if not is_certain or (header.format in _VIDEO and self._missing):
                 self._is_unsure = self._is_unsure or not is_certain
                 self._missing[number] = None
                 self._gap_count += 1
                 return
-        elif header.format in _VIDEO and number != next(iter(self._missing)):
+        elif not is_certain or (header.format in _VIDEO and number != next(iter(self._missing))):
             return
         was_missing = number in self._missing
         self._missing.pop(number, None)
@@ -162,8 +176,8 @@ class NodeStream:
         del self._missing[header.number]
         yield self._event(
             "node_frames_lost",
-            f"camera {self._camera.name}: frame {header.number} is lost, because its node cannot read it; the "
-            "disk of the node is full or has failed",
+            f"camera {self._camera.name}: frame {header.number} is lost, because its node cannot read it; the"
+            " disk of the node is full or has failed",
             now_ns,
         )
         if not self._missing:
@@ -178,8 +192,8 @@ class NodeStream:
         is_second = sent_ns == self._asked_ns and state.session != self._session
         if is_second or state.session in self._former:
             raise SourceError(
-                f"camera {self._camera.name}: two nodes send as camera {self._camera.name}; end one of them, or "
-                "give it another --camera"
+                f"camera {self._camera.name}: two nodes send as camera {self._camera.name}; end one of them, "
+                "or give it another --camera"
             )
 
     def _begin(self, state: NodeState, now_ns: int) -> Items:
@@ -190,7 +204,7 @@ class NodeStream:
             if self._missing:
                 text += f"; {len(self._missing)} frames before are only in the log of the node"
             yield self._event("node_restarted", text, now_ns)
-        self._first = 0 if self._session else state.count
+        self._first = 0 if self._session else state.recorded
         self._session, self._next = state.session, None
         self._history, self._counts = ClockHistory(), deque()
         self._missing, self._gap_count = {}, 0
@@ -198,7 +212,8 @@ class NodeStream:
     def _frame(self, header: FrameHeader, data: bytes) -> Frame:
         time_ns = self._history.to_centre_ns(header.time_ns)
         if time_ns is not None:
-            # The node has given the middle of the exposure. The reader of the camera adds this distance again.
+            # The node has given the middle of the exposure. The reader of the camera adds this distance
+            # again.
             time_ns -= mid_exposure_ns(0, self._camera)
         return Frame(data, header.format, time_ns)
 
@@ -224,15 +239,15 @@ class NodeStream:
         self._gap_count = len(self._missing) if is_new else self._gap_count + number - first
         yield self._event(
             "node_gap",
-            f"camera {self._camera.name}: frames {first} to {number - 1} of its node are missing; the node sends "
-            "them again",
+            f"camera {self._camera.name}: frames {first} to {number - 1} of its node are missing; the node "
+            "sends them again",
             now_ns,
         )
 
     def _close_gap(self, now_ns: int) -> Items:
         yield self._event(
             "node_gap_filled",
-            f"camera {self._camera.name}: all frames of its node have arrived, {self._gap_count} of them late",
+            f"camera {self._camera.name}: all frames of its node have arrived, {self._gap_count} late",
             now_ns,
         )
         self._gap_count = 0

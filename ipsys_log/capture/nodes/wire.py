@@ -1,7 +1,8 @@
 """The messages between the nodes and the centre: their keys, and their conversion to bytes.
 
-A node sends each frame with a header. The centre asks a node for its state, which is also an exchange of times,
-and for frames that did not arrive. All messages are untrusted: a message that is not valid reads as None.
+A node sends each frame with a header. The centre asks a node for its state, which is also an exchange of
+times, and for frames that did not arrive. All messages are untrusted: a message that is not valid reads as
+None.
 """
 
 from __future__ import annotations
@@ -118,14 +119,14 @@ class StateRequest(NamedTuple):
 class NodeState(NamedTuple):
     """The answer of a node: its version, its session, and the times of the exchange by its clock.
 
-    ``count`` is the number of its frames so far. ``has_ended``: the source of the frames has ended.
+    ``recorded`` is the number of its frames so far. ``has_ended``: the source of the frames has ended.
     """
 
     version: str
     session: str
     received_ns: int
     replied_ns: int
-    count: int
+    recorded: int
     has_ended: bool
 
     def encode(self) -> bytes:
@@ -147,11 +148,11 @@ class NodeState(NamedTuple):
 
 
 class FrameRequest(NamedTuple):
-    """A request for ``count`` frames of a session, from the number ``first`` on."""
+    """A request for frames of a session, from the number ``first`` to the number before ``end``."""
 
     session: str
     first: int
-    count: int
+    end: int
 
     def encode(self) -> bytes:
         """Return the request as JSON."""
@@ -185,8 +186,8 @@ def _types(kind: Any) -> dict[str, str]:
 def _is_valid(name: str, value: Any, kind: type) -> bool:
     if type(value) is not kind:
         return False
-    if name == "session":
-        return value == "" or _SESSION.fullmatch(value) is not None
-    if name == "version":
+    if isinstance(value, str):
+        if name == "session":
+            return value == "" or _SESSION.fullmatch(value) is not None
         return len(value) <= _LONGEST_VERSION and value.isprintable()
-    return kind is not int or 0 <= value < _LARGEST_INT
+    return isinstance(value, bool) or 0 <= value < _LARGEST_INT

@@ -1,0 +1,101 @@
+"""``ipsys node``: frames in both logs, and clear errors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.log.dataset import Session
+from tests.capture.nodes.lab_of_nodes import free_port, make_certificates
+from tests.conftest import Ipsys
+
+PATIENCE_S = 600
+RIG = """name = "lab"
+dictionary = "DICT_4X4_100"
+marker_length_m = 0.2
+
+[nodes]
+centre = "127.0.0.1:{port}"
+{more}
+[[cameras]]
+name = "red"
+source = "{source}"
+width = 480
+height = 270
+rate_hz = 10
+"""
+
+
+def write_rigs(folder: Path, source: str, more: str = "") -> int:
+    """Write the rig of the node and that of the centre; return the port of the centre."""
+    port = free_port()
+    for name, one in (("node", source), ("centre", "zenoh:red")):
+        (folder / f"{name}.toml").write_text(RIG.format(port=port, more=more, source=one))
+    return port
+
+
+def frames(log: Path) -> dict[int, tuple[str, bytes]]:
+    with Session([log]) as session:
+        messages = session.messages([session.images["red"]])
+        return {m.publish_time_ns: (m.payload.format, m.payload.data) for m in messages}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_certificates", [False, True])
+def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool) -> None:
+    """The camera of the node is the recording of a simulated camera, so it ends."""
+    more = ""
+    if with_certificates:
+        make_certificates(tmp_path / "lab", "127.0.0.1", "red")
+        more = 'certificates = "lab/certificates"\n'
+    write_rigs(tmp_path, "sim:red?stations=0", more)
+    ipsys = [sys.executable, "-m", "ipsys_log"]
+    with subprocess.Popen(
+        [*ipsys, "node", "node.toml", "--camera", "red", "-o", "red.mcap"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as node:
+        try:
+            centre = subprocess.run(
+                [*ipsys, "record", "--rig", "centre.toml", "-o", "centre.mcap", "--seconds", "3"],
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE_S,
+                check=False,
+            )
+        finally:
+            node.terminate()
+            said, _ = node.communicate(timeout=PATIENCE_S)
+    assert (centre.returncode, node.returncode) == (0, 0), centre.stderr + said
+    assert "receives the frames of camera red" in said
+    at_node, at_centre = frames(tmp_path / "red.mcap"), frames(tmp_path / "centre.mcap")
+    assert at_centre
+    assert set(at_centre.values()) <= set(at_node.values())
+    with Session([tmp_path / "centre.mcap"]) as session:
+        assert session.payloads(["/cameras/red/clock"])[0].camera == "red"
+
+
+def test_wrong_node_is_refused_with_one_line(tmp_path: Path, ipsys: Ipsys) -> None:
+    write_rigs(tmp_path, "sim:red?stations=0", 'certificates = "keys"\n')
+
+    def refusal(*arguments: str) -> str:
+        done = ipsys("node", *arguments)
+        assert done.code == 1
+        assert "Traceback" not in done.err
+        return done.err
+
+    node = str(tmp_path / "node.toml")
+    assert "name the camera of this host: ipsys node" in refusal(node)
+    assert "red.key: does not exist" not in refusal(node, "--camera", "red")
+    assert "authority.pem: does not exist; docs/nodes.md" in refusal(node, "--camera", "red")
+    assert "zenoh:red, which belongs to the centre" in refusal(
+        str(tmp_path / "centre.toml"), "--camera", "red"
+    )
+    assert "--centre far: is not an address" in refusal(node, "--camera", "red", "--centre", "far")
+    assert not list(tmp_path.glob("*.mcap"))

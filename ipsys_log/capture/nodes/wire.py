@@ -190,4 +190,4 @@ def _is_valid(name: str, value: Any, kind: type) -> bool:
         if name == "session":
             return value == "" or _SESSION.fullmatch(value) is not None
         return len(value) <= _LONGEST_VERSION and value.isprintable()
-    return isinstance(value, bool) or 0 <= value < _LARGEST_INT
+    return not isinstance(value, int) or 0 <= value < _LARGEST_INT

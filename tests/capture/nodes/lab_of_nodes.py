@@ -100,7 +100,7 @@ def sending(
 
 @dataclass
 class Received:
-    """What has arrived at the centre from one camera so far, and the error that ended it."""
+    """The items of one camera that have arrived at the centre, and the errors that ended it."""
 
     frames: list[Frame] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)

@@ -470,7 +470,9 @@ def live(
             ) as streams,
         ):
             sizes_px = {name: state.size_px for name, state in attached.states.items()}
-            settings = first_messages(lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns)
+            settings = first_messages(
+                lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns, attached.imported_run
+            )
             tracker.begin(attached.stop)
             sinks: list[Sink] = [tracker, *streams]
             return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=sinks)

@@ -32,8 +32,9 @@ class SourceError(IpsysError):
 class Frame(NamedTuple):
     """A frame as the camera sent it.
 
-    ``format`` is jpeg, png, h264 or h265. ``time_ns`` is the driver's stamp in UTC; None without a stamp.
-    ``missed`` is the number of frames lost directly before this frame, by the count of the driver.
+    ``format`` is jpeg, png, h264 or h265; or markers, if a node has detected them and sends no image.
+    ``time_ns`` is the driver's stamp in UTC; None without a stamp. ``missed`` is the number of frames lost
+    directly before this frame, by the count of the driver.
     """
 
     data: bytes

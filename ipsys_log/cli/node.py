@@ -9,11 +9,12 @@ import typer
 
 from ipsys_log.cli.console import remarks, say
 from ipsys_log.cli.open_cameras import Lab, check_target, open_cameras, prepare_lab
-from ipsys_log.cli.options import Force, log_option
+from ipsys_log.cli.options import Calibrations, Corners, Force, log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 
 if TYPE_CHECKING:
     from ipsys_log.capture.nodes.network import NodeNetwork
+    from ipsys_log.runs.options import Request
 
 __all__ = ["add_commands"]
 
@@ -48,6 +49,11 @@ def node(
             "--certificates", metavar="FOLDER", help="The folder of the certificates, instead of the rig's."
         ),
     ] = None,
+    detect: Annotated[
+        bool, typer.Option("--detect", help="Detect the markers here, and send only the markers.")
+    ] = False,
+    calibration: Calibrations = None,
+    corners: Corners = None,
     seconds: Annotated[
         Optional[float],  # noqa: UP045
         typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
@@ -59,15 +65,19 @@ def node(
     The centre is a recording on another machine, such as ipsys live, whose rig has the source zenoh:NAME. If
     the centre or the network is away, the node records on, and sends the missing frames afterwards."""
     allow_interrupt("stopped before the first frame was recorded; no log was written")
+    from ipsys_log.capture.live_plan import check_start
     from ipsys_log.capture.nodes.centre import is_of_node
     from ipsys_log.capture.nodes.network import read_network
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
+    from ipsys_log.runs.options import Request
 
     check_installed("node needs", "zenoh")
     if not camera:
         raise IpsysError(f"{rig}: name the camera of this host: ipsys node {rig} --camera NAME")
-    lab = prepare_lab(rig, [camera], None, with_lenses=False)
+    if corners is not None and not detect:
+        raise IpsysError(f"--corners {corners}: has no effect without --detect")
+    lab = prepare_lab(rig, [camera], calibration, with_lenses=detect)
     if is_of_node(lab.cameras[0]):
         raise IpsysError(
             f"{rig}: camera {camera} has the source {lab.cameras[0].source}, which belongs to the centre; "
@@ -77,7 +87,10 @@ def node(
     network.files_of(camera)
     target = output or _new_log(camera)
     check_target(target, force, lab.files)
-    _send(lab, network, target, seconds, force)
+    request = Request(corners=corners) if detect else None
+    if request is not None:
+        check_start(lab.rig, lab.names, lab.lenses, request, "detect")
+    _send(lab, network, target, seconds, request, force)
 
 
 def _new_log(camera: str) -> Path:
@@ -89,17 +102,27 @@ def _new_log(camera: str) -> Path:
     return Path(f"{camera}_{digits[:8]}_{digits[8:]}.mcap")
 
 
-def _send(lab: Lab, network: NodeNetwork, target: Path, seconds: float | None, force: bool) -> None:
-    """Record the camera and send its frames."""
+def _send(
+    lab: Lab,
+    network: NodeNetwork,
+    target: Path,
+    seconds: float | None,
+    request: Request | None,
+    force: bool,
+) -> None:
+    """Record the camera and send its frames, or with a request their markers."""
     from ipsys_log import __version__, pipeline
     from ipsys_log.capture.nodes.node import Node
 
     camera = lab.names[0]
     with (
         open_cameras(lab, target, seconds) as (cameras, settings, status),
-        Node(camera, network, __version__, target, cameras.clock, say) as sender,
+        Node(camera, network, __version__, target, cameras.clock, say, request is not None) as sender,
     ):
-        pipeline.record(cameras, settings, target, [status, sender], force)
+        if request is not None:
+            pipeline.live(cameras, settings, target, request, "detect", [status, sender], force)
+        else:
+            pipeline.record(cameras, settings, target, [status, sender], force)
         left = sender.finish(not cameras.is_stopped)
     if left:
         text = f"the centre {network} does not have {left} frames of camera {camera}; {target} has all frames"

@@ -183,7 +183,7 @@ def open_cameras(
         say(doing or f"recording into {output}; Ctrl-C to end")
         if panel:
             stack.enter_context(_on_screen(status))
-        yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
+        yield attached, first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run), status
     for line in () if doing else status.summary():
         console.print(line, markup=False)
 

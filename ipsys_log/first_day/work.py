@@ -248,7 +248,13 @@ def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
         fitting = fitting_lenses(lenses, sizes_px, job.say)
         room = free_room(folder.rig_file, expected_bytes_per_s(cameras, attached.states))
         job.say(room.describe(None))
-        yield OpenedLab(rig, fitting, attached, first_messages(rig, fitting, attached.now_ns), monitor)
+        yield OpenedLab(
+            rig,
+            fitting,
+            attached,
+            first_messages(rig, fitting, attached.now_ns, attached.imported_run),
+            monitor,
+        )
 
 
 def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from tests.capture.nodes.lab_of_nodes import free_port, make_certificates
 from tests.conftest import Ipsys
@@ -37,6 +41,20 @@ def write_rigs(folder: Path, source: str, more: str = "") -> int:
     return port
 
 
+@contextmanager
+def node_of(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """Start a node that records; it is killed if the test fails."""
+    arguments = ["node", "node.toml", "--camera", "red", "-o", "red.mcap", *options]
+    command = [sys.executable, "-m", "ipsys_log", *arguments]
+    with subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as node:
+        try:
+            yield node
+        finally:
+            node.kill()
+
+
 def frames(log: Path) -> dict[int, tuple[str, bytes]]:
     with Session([log]) as session:
         messages = session.messages([session.images["red"]])
@@ -45,34 +63,18 @@ def frames(log: Path) -> dict[int, tuple[str, bytes]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("with_certificates", [False, True])
-def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool) -> None:
-    """The camera of the node is the recording of a simulated camera, so it ends."""
+def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool, ipsys: Ipsys) -> None:
     more = ""
     if with_certificates:
         make_certificates(tmp_path / "lab", "127.0.0.1", "red")
         more = 'certificates = "lab/certificates"\n'
     write_rigs(tmp_path, "sim:red?stations=0", more)
-    ipsys = [sys.executable, "-m", "ipsys_log"]
-    with subprocess.Popen(
-        [*ipsys, "node", "node.toml", "--camera", "red", "-o", "red.mcap"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    ) as node:
-        try:
-            centre = subprocess.run(
-                [*ipsys, "record", "--rig", "centre.toml", "-o", "centre.mcap", "--seconds", "3"],
-                cwd=tmp_path,
-                capture_output=True,
-                text=True,
-                timeout=PATIENCE_S,
-                check=False,
-            )
-        finally:
-            node.terminate()
-            said, _ = node.communicate(timeout=PATIENCE_S)
-    assert (centre.returncode, node.returncode) == (0, 0), centre.stderr + said
+    with node_of(tmp_path) as node:
+        rig = ("--rig", tmp_path / "centre.toml")
+        centre = ipsys("record", *rig, "-o", tmp_path / "centre.mcap", "--seconds", 3)
+        node.terminate()
+        said, _ = node.communicate(timeout=PATIENCE_S)
+    assert (centre.code, node.returncode) == (0, 0), centre.err + said
     assert "receives the frames of camera red" in said
     at_node, at_centre = frames(tmp_path / "red.mcap"), frames(tmp_path / "centre.mcap")
     assert at_centre
@@ -99,3 +101,37 @@ def test_wrong_node_is_refused_with_one_line(tmp_path: Path, ipsys: Ipsys) -> No
     )
     assert "--centre far: is not an address" in refusal(node, "--camera", "red", "--centre", "far")
     assert not list(tmp_path.glob("*.mcap"))
+
+
+@pytest.mark.slow
+def test_live_from_markers_of_nodes_is_verified(
+    tmp_path: Path, lab_log: Path, calibration: Path, ipsys: Ipsys
+) -> None:
+    """The markers at the centre are those of the node, byte for byte; the frames stay at the node."""
+    write_rigs(tmp_path, "sim:red?stations=5")
+    with node_of(tmp_path, "--detect", "--calibration", str(lab_log)) as node:
+        lenses = ("--rig", tmp_path / "centre.toml", "--calibration", lab_log)
+        model = ("--model-from", calibration, "--seconds", 3)
+        live = ipsys("live", *lenses, *model, "-o", tmp_path / "centre.mcap")
+        assert live.code == 0, live.err
+        node.terminate()
+        said, _ = node.communicate(timeout=PATIENCE_S)
+    assert node.returncode == 0, said
+    with Session([tmp_path / "centre.mcap"]) as centre, Session([tmp_path / "red.mcap"]) as at_node:
+        assert centre.images == {}
+        arrived, made = (
+            [encode(replace(markers, timestamp=0)) for markers in session.payloads([topic])]
+            for session, topic in (
+                (centre, "/runs/nodes/cameras/red/markers"),
+                (at_node, "/runs/edges/cameras/red/markers"),
+            )
+        )
+        assert arrived
+        assert set(arrived) <= set(made)
+        assert len(centre.payloads(["/runs/poly/tracks"])) == len(arrived)
+    verified = ipsys("verify", tmp_path / "centre.mcap")
+    assert verified.code == 0, verified.out
+    assert "the replay is identical to the log" in verified.out
+    replayed = ipsys("replay", tmp_path / "centre.mcap", "--model-from", calibration)
+    assert replayed.code == 0, replayed.err
+    assert ipsys("verify", tmp_path / "red.mcap").code == 0

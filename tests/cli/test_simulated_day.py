@@ -226,7 +226,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
         day(stage, "session.mcap")
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
     day("check", "s.mcap")
-    # These have tests of their own: a page, public data, weeks of logs, programs of robots, and a second host.
+    # These have tests of their own: a page, public data, weeks of logs, programs of robots, and nodes.
     day.commands |= {"setup", "import", "drift", "drive", "node"}
     assert day.commands == {name for names in panels().values() for name in names}
 

@@ -14,6 +14,7 @@ from ipsys_log.capture.frames import Clock, Say
 from ipsys_log.capture.nodes.certificates import check_centre
 from ipsys_log.capture.nodes.network import NodeNetwork, open_node_session
 from ipsys_log.capture.nodes.wire import (
+    MARKERS_FORMAT,
     FrameHeader,
     FrameRequest,
     NodeState,
@@ -24,8 +25,9 @@ from ipsys_log.capture.nodes.wire import (
     state_key,
 )
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.growing_images import GrowingImages
-from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
+from ipsys_log.log.codec import encode
+from ipsys_log.log.growing_channel import GrowingChannel
+from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Node"]
@@ -63,6 +65,7 @@ class Node:
     log : the log with the frames.
     clock : the clock of the frames.
     say : called with a text about the connection.
+    sends_markers : send the markers of each frame instead of the frame.
 
     Raises
     ------
@@ -71,12 +74,22 @@ class Node:
     """
 
     def __init__(
-        self, camera: str, network: NodeNetwork, version: str, log: Path, clock: Clock, say: Say
+        self,
+        camera: str,
+        network: NodeNetwork,
+        version: str,
+        log: Path,
+        clock: Clock,
+        say: Say,
+        sends_markers: bool = False,
     ) -> None:
         self.session_name = new_session(secrets.token_bytes(_SESSION_BYTES))
         self._camera, self._network, self._version = camera, network, version
         self._clock, self._say = clock, say
-        self._images = GrowingImages(log, image_topic(camera))
+        self._log = log
+        self._sent: tuple[type, ...] = (Markers,) if sends_markers else (CompressedImage, CompressedVideo)
+        # The channel of the sent messages, after the first one.
+        self._channel: GrowingChannel | None = None
         self._session: Any = None
         self._count = self._received = 0
         self._has_ended = self._is_refused = False
@@ -119,15 +132,17 @@ class Node:
             if thread.ident is not None:
                 thread.join(_SILENT_NS / NS_PER_S)
         self._session.close()
-        self._images.close()
+        if self._channel is not None:
+            self._channel.close()
 
     def __call__(self, message: Message | None) -> None:
-        """Take a recorded message; send it if it is a frame."""
-        if message is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
+        """Take a recorded message; send it if it is a frame, or its markers."""
+        if message is None or not isinstance(message.payload, self._sent):
             return
-        payload = message.payload
-        frame = _Recorded(self._count, message.publish_time_ns, payload.format, payload.data)
+        frame = _recorded(self._count, message.payload)
         with self._changed:
+            if self._channel is None:
+                self._channel = GrowingChannel(self._log, message.topic)
             self._count += 1
             self._recent[frame.number] = frame
             self._recent_bytes += len(frame.data)
@@ -240,9 +255,13 @@ class Node:
         if frame is not None:
             return frame
         try:
-            payload = self._images.read(number)
+            payload = None if self._channel is None else self._channel.read(number)
         except (IpsysError, OSError):
             return None
-        if payload is None:
-            return None
-        return _Recorded(number, payload.timestamp, payload.format, payload.data)
+        return None if payload is None else _recorded(number, payload)
+
+
+def _recorded(number: int, payload: Any) -> _Recorded:
+    if isinstance(payload, Markers):
+        return _Recorded(number, payload.timestamp, MARKERS_FORMAT, encode(payload))
+    return _Recorded(number, payload.timestamp, payload.format, payload.data)

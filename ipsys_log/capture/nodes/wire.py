@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 __all__ = [
     "FORMATS",
+    "MARKERS_FORMAT",
     "FrameHeader",
     "FrameRequest",
     "NodeState",
@@ -27,7 +28,9 @@ __all__ = [
 _PREFIX = "ipsys"
 _HEADER = struct.Struct("<4s8sQqB")
 _MAGIC = b"ips1"
-FORMATS = ("jpeg", "png", "h264", "h265")
+# The format of the markers of a frame, which are sent instead of the frame.
+MARKERS_FORMAT = "markers"
+FORMATS = ("jpeg", "png", "h264", "h265", MARKERS_FORMAT)
 _SESSION = re.compile(r"[0-9a-f]{16}")
 _LONGEST_TEXT = 4096
 _LARGEST_INT = 1 << 62

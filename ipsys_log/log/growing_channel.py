@@ -1,4 +1,4 @@
-"""The images of one topic in a log that this process is still writing."""
+"""The messages of one topic in a log that this process is still writing."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.log.byte_source import LogBytes, open_for_reading
+from ipsys_log.log.chunks import unpack
 from ipsys_log.log.codec import decode
 from ipsys_log.log.records import (
     ENTRY,
@@ -22,13 +23,13 @@ from ipsys_log.log.records import (
     parse_chunk_head,
 )
 
-__all__ = ["GrowingImages"]
+__all__ = ["GrowingChannel"]
 
 
-class GrowingImages:
-    """The images of one topic, by their number in the order of the file; the file may grow meanwhile.
+class GrowingChannel:
+    """The messages of one topic, by their number in the order of the file; the file may grow meanwhile.
 
-    Images lie in uncompressed chunks. The index holds only complete chunks with their message indexes.
+    Only complete chunks with their message indexes are read.
 
     Parameters
     ----------
@@ -41,9 +42,9 @@ class GrowingImages:
         self._next = len(MAGIC)
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, str] = {}
-        self._chunk_data = 0
-        # The offsets of the messages in the file, in their order.
-        self._offsets: list[tuple[int, str]] = []
+        self._chunk = 0
+        # Of each message: the offset of its chunk in the file, its own in the chunk, and its schema.
+        self._places: list[tuple[int, int, str]] = []
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
@@ -51,21 +52,28 @@ class GrowingImages:
             self._view.close()
 
     def read(self, number: int) -> Any:
-        """Return the payload of an image; None if the file does not hold it yet.
+        """Return the payload of a message; None if the file does not hold it yet.
 
         Raises
         ------
         LogError
             The file cannot be read.
         """
-        if number >= len(self._offsets):
+        if number >= len(self._places):
             self._extend()
-        if number >= len(self._offsets):
+        if number >= len(self._places):
             return None
-        offset, schema = self._offsets[number]
+        chunk, offset, schema = self._places[number]
         view = self._open()
-        length = HEADER.unpack(view.read(offset, HEADER.size))[1]
-        return decode(schema, view.read(offset + MESSAGE.size, HEADER.size + length - MESSAGE.size))
+        head = parse_chunk_head(view, chunk)[1]
+        if head.compression:
+            data = unpack(view, chunk, head)
+            length = HEADER.unpack_from(data, offset)[1]
+            return decode(schema, data[offset + MESSAGE.size : offset + HEADER.size + length])
+        # Chunks of images are not compressed: the other images of the chunk need not be read.
+        start = head.data_offset + offset
+        length = HEADER.unpack(view.read(start, HEADER.size))[1]
+        return decode(schema, view.read(start + MESSAGE.size, HEADER.size + length - MESSAGE.size))
 
     def _open(self) -> LogBytes:
         if self._view is None:
@@ -86,7 +94,7 @@ class GrowingImages:
 
     def _add(self, view: LogBytes, record: RecordAt) -> None:
         if record.opcode == Opcode.CHUNK:
-            self._chunk_data = parse_chunk_head(view, record.offset)[1].data_offset
+            self._chunk = record.offset
         elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX):
             body = view.read(record.offset + HEADER.size, record.length - HEADER.size)
             if record.opcode == Opcode.SCHEMA:
@@ -103,4 +111,4 @@ class GrowingImages:
         _, _, channel, _ = INDEX_HEAD.unpack_from(data)
         if channel in self._channels:
             rows = sorted(ENTRY.iter_unpack(data[INDEX_HEAD.size :]))
-            self._offsets += [(self._chunk_data + offset, self._channels[channel]) for _, offset in rows]
+            self._places += [(self._chunk, offset, self._channels[channel]) for _, offset in rows]

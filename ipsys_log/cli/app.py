@@ -219,6 +219,7 @@ ipsys drive --model-from cal.mcap -o run.mcap --loss 0.05 --fail white=20:5
     "node": """
 ipsys node lab.toml --camera red         # on the host of this camera
 ipsys node lab.toml --camera red --centre 192.168.1.10:7449
+ipsys node lab.toml --camera red --detect     # send only the markers
 """,
     "simulate": """
 ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.log.codec import encode
+from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Rig, RigNodes
+from ipsys_log.rig.file import load_rig, rig_toml
 from tests.capture.nodes.lab_of_nodes import free_port, make_certificates
 from tests.conftest import Ipsys
 
@@ -81,6 +83,13 @@ def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool,
     assert set(at_centre.values()) <= set(at_node.values())
     with Session([tmp_path / "centre.mcap"]) as session:
         assert session.payloads(["/cameras/red/clock"])[0].camera == "red"
+
+
+def test_rig_file_keeps_the_network_of_nodes(tmp_path: Path) -> None:
+    rig = Rig("lab", "DICT_4X4_100", 0.2, nodes=RigNodes("192.168.1.10:7449", "certificates"))
+    (tmp_path / "lab.toml").write_text(rig_toml(rig))
+    assert load_rig(tmp_path / "lab.toml") == rig
+    assert decode(schema_name(Rig), encode(rig)) == rig
 
 
 def test_wrong_node_is_refused_with_one_line(tmp_path: Path, ipsys: Ipsys) -> None:

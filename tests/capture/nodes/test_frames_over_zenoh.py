@@ -61,7 +61,10 @@ def test_frames_arrive_unchanged_with_the_times_of_the_centre(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_frames_of_a_cut_network_arrive_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("closes", [True, False], ids=["connection ends", "silence"])
+def test_frames_of_a_cut_network_arrive_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closes: bool
+) -> None:
     """The frames come from the log of the node: its memory holds none."""
     monkeypatch.setattr(node_module, "_MOST_RECENT_BYTES", 0)
     network = local()
@@ -73,7 +76,7 @@ def test_frames_of_a_cut_network_arrive_later(tmp_path: Path, monkeypatch: pytes
     ):
         made = feed.record(10)
         received.wait_for_data(made)
-        relay.cut(closes=True)
+        relay.cut(closes)
         received.wait_for(lambda now: now.errors)  # the node does not answer
         assert "camera red: its node does not answer" in str(received.errors[0])
         made += feed.record(60)

@@ -62,7 +62,7 @@ class ClockLine(NamedTuple):
     """The clock of the centre as a line in the time of the node.
 
     ``offset_ns`` holds at ``node_ns``; ``drift`` is its change in s/s. The offset there lies within
-    ``bound_ns``, whatever the delays are.
+    ``bound_ns``, whatever the delays are, if the drift is at most 500e-6.
     """
 
     node_ns: int
@@ -106,11 +106,16 @@ def fit_clock(exchanges: list[Exchange]) -> ClockLine:
     )
     span_ns = reference.received_ns - exchanges[0].received_ns
     drift = _find_drift(lower_s, upper_s) if span_ns >= _DRIFT_SPAN_NS else 0.0
-    low_s, high_s = _offsets(lower_s, upper_s, drift)
-    offset_ns = base_ns + round((low_s + high_s) / 2 * NS_PER_S)
-    # A wrong drift can exchange the lines.
-    bound_ns = round(abs(high_s - low_s) / 2 * NS_PER_S)
-    return ClockLine(node_ns, offset_ns, drift, bound_ns, len(exchanges))
+    offset_s = float(np.mean(_offsets(lower_s, upper_s, drift)))
+    bound_ns = round(_bound_s(lower_s, upper_s, offset_s) * NS_PER_S)
+    return ClockLine(node_ns, base_ns + round(offset_s * NS_PER_S), drift, bound_ns, len(exchanges))
+
+
+def _bound_s(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64], offset_s: float) -> float:
+    """Return the greatest possible error of an offset, for all delays and for all drifts of computers."""
+    least_s = np.max(lower_s[:, 1] - _MOST_DRIFT * np.abs(lower_s[:, 0]))
+    most_s = np.min(upper_s[:, 1] + _MOST_DRIFT * np.abs(upper_s[:, 0]))
+    return float(max(most_s - offset_s, offset_s - least_s))
 
 
 def _offsets(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64], drift: float) -> tuple[float, float]:

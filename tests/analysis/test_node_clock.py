@@ -70,11 +70,20 @@ def test_offset_with_20_ms_of_jitter_is_within_1_ms(seed: int, offset_ns: int, d
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
-    seed=st.integers(0, 999), count=st.integers(1, 30), there_ms=st.floats(0, 30), back_ms=st.floats(0, 30)
+    seed=st.integers(0, 999),
+    count=st.integers(1, 300),
+    there_ms=st.floats(0, 30),
+    back_ms=st.floats(0, 30),
+    drift=st.floats(-400e-6, 400e-6),
 )
-def test_bound_holds_for_every_delay(seed: int, count: int, there_ms: float, back_ms: float) -> None:
-    rows = jittered(seed, count, 5 * MS, 0.0, (there_ms, back_ms), 20)
-    assert abs(error_ms(rows, 5 * MS, 0.0)) * MS <= fit_clock(rows).bound_ns + 2
+def test_bound_holds_for_every_delay_and_drift(
+    seed: int, count: int, there_ms: float, back_ms: float, drift: float
+) -> None:
+    rows = jittered(seed, count, 5 * MS, drift, (there_ms, back_ms), 20)
+    line = fit_clock(rows)
+    # The time of the centre, after the start, at which the clock of the node shows the time of the line.
+    ns = (line.node_ns - START_NS + 5 * MS) / (1 - drift)
+    assert abs(line.offset_ns - (START_NS - line.node_ns + ns)) <= line.bound_ns + 100
 
 
 def test_asymmetric_delay_gives_half_its_difference_as_error() -> None:
@@ -101,7 +110,7 @@ def test_line_has_the_greatest_distance_by_linear_programming(seed: int) -> None
     )
     assert best.x is not None
     low, high, drift = best.x
-    assert line.bound_ns / MS == pytest.approx((high - low) / 2, abs=1e-4)
+    assert line.bound_ns / MS >= (high - low) / 2 - 1e-4
     assert (line.offset_ns - base) / MS == pytest.approx((high + low) / 2, abs=0.02)
     assert line.drift * 1e6 == pytest.approx(drift, abs=2)
 

@@ -449,7 +449,7 @@ def live(
 
     def track(tracker: Tracker) -> list[Outcome]:
         from ipsys_log import pipeline
-        from ipsys_log.capture.devices import check_devices, check_sources, open_source
+        from ipsys_log.capture.devices import check_devices, check_sources, source_opener
         from ipsys_log.capture.frames import Clock
         from ipsys_log.capture.live_plan import check_start
         from ipsys_log.capture.multiplexer import LiveCameras
@@ -474,7 +474,8 @@ def live(
             say(line)
         topic = TRACKS.topic_of(model_run(wanted_models(request)[0]))
         with (
-            LiveCameras(wanted, open_source, Clock(), say) as attached,
+            source_opener(lab, wanted, Path(rig).parent) as opener,
+            LiveCameras(wanted, opener, Clock(), say) as attached,
             open_streams(
                 streamed,
                 {topic},
@@ -484,7 +485,9 @@ def live(
             ) as streams,
         ):
             sizes_px = {name: state.size_px for name, state in attached.states.items()}
-            settings = first_messages(lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns)
+            settings = first_messages(
+                lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns, attached.imported_run
+            )
             tracker.begin(attached.stop)
             sinks: list[Sink] = [tracker, *streams]
             return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=sinks)

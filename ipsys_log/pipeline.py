@@ -48,7 +48,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
-from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
+from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel, channel_of
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
@@ -60,7 +60,7 @@ from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import evaluated_models, wanted_models
-from ipsys_log.runs.stream import WiredStage, in_threads, run
+from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
 from ipsys_log.runs.workers import LocalWorkers
 from ipsys_log.sinks.sink import Consumer, Consumers, Sink
 
@@ -324,13 +324,14 @@ def _put_through(
 
     The results are shown with the ``events`` that were written meanwhile, and before their latencies.
     """
+    computed = {Route(channel, wired.run) for wired in stages for channel in wired.stage.writes}
     try:
         for message in _through(stages, frames, ledger):
             if message is TICK:
                 _show_all(show, events(), None)
                 continue
             entry = None
-            if run_of_topic(message.topic) is not None:  # all other messages are written already
+            if _route_of(message) in computed:  # all other messages are written already
                 entry = ledger.entry(message)
                 log.put(message)
             _show_all(show, events(), message)
@@ -342,6 +343,13 @@ def _put_through(
     except IpsysError as fault:
         return fault
     return None
+
+
+def _route_of(message: Message) -> Route | None:
+    """Return the channel and the run of a message; None for a message outside of all runs."""
+    run_name = run_of_topic(message.topic)
+    channel = channel_of(message.topic, type(message.payload)) if run_name is not None else None
+    return None if channel is None else Route(channel, run_name)
 
 
 def _show_all(show: Consumers, events: Iterable[Message], *messages: Message | None) -> None:

@@ -67,7 +67,7 @@ class Ledger:
             message.publish_time_ns,
             str(message.camera),
             received_ns,
-            times_ns["detected", ""],
+            times_ns.get(("detected", ""), received_ns),  # markers of a node arrive detected
             times_ns["located", run],
             times_ns["fused", run],
             self._now_ns(),

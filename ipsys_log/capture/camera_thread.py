@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, mid_exposure_ns
+from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage, mid_exposure_ns
+from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import frame_payload
 from ipsys_log.capture.video_packets import find_size, is_decodable_start
-from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, RigCamera, image_topic
+from ipsys_log.errors import LogError
+from ipsys_log.log.codec import decode, schema_name
+from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
+from ipsys_log.messages.channels import MARKERS
 from ipsys_log.rig.file import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["Arrival", "CameraReader", "CameraState", "ReaderContext"]
+__all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "ReaderContext"]
+
+# The run of markers that nodes have detected.
+NODES_RUN = "nodes"
 
 # Longest wait for the first frame of a camera.
 _FIRST_FRAME_S = 10.0
@@ -110,8 +117,9 @@ class CameraReader:
             The camera cannot be opened, or sends nothing.
         """
         self._is_open.wait()
-        simulated = str(self._camera.source).startswith("sim:")
-        begun = self._has_first_frame.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
+        # The camera of a node has its own recorder there, which may be starting.
+        is_slow = str(self._camera.source).startswith(("sim:", "zenoh:"))
+        begun = self._has_first_frame.wait(_DRAW_S if is_slow else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault
         if not begun:
@@ -154,6 +162,9 @@ class CameraReader:
             with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
                 self._is_open.set()
                 for frame in frames:
+                    if isinstance(frame, SourceMessage):
+                        self._pass_on(frame)
+                        continue
                     if shared.stopped.is_set():
                         break
                     if frame is not None:
@@ -167,6 +178,13 @@ class CameraReader:
             return error
         return None
 
+    def _pass_on(self, message: SourceMessage) -> None:
+        """Put another message of the source into the stream; show the text of an event."""
+        topic, payload = message
+        self._shared.put(Arrival(self._shared.clock.now_ns(), topic, payload.timestamp, payload))
+        if isinstance(payload, Event):
+            self._shared.say(payload.text)
+
     def _take(self, frame: Frame) -> None:
         state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()
         self._check_format(frame)
@@ -175,7 +193,6 @@ class CameraReader:
             self._lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
         state.up, state.format = True, frame.format
-        self._note_size(frame)
         time_ns = now_ns
         if frame.time_ns is None:
             self._report_late(now_ns)
@@ -183,8 +200,9 @@ class CameraReader:
             time_ns = mid_exposure_ns(frame.time_ns, camera)
             state.delay_s = (now_ns - time_ns) / NS_PER_S
         state.missed += frame.missed
-        payload = frame_payload(time_ns, camera.name, frame.data, frame.format)
-        if not self._shared.put(Arrival(now_ns, image_topic(camera.name), time_ns, payload, camera.name)):
+        topic, payload = self._payload(frame, time_ns)
+        self._note_size(frame, payload)
+        if not self._shared.put(Arrival(now_ns, topic, time_ns, payload, camera.name)):
             state.dropped += 1
             return
         state.frames += 1
@@ -201,6 +219,17 @@ class CameraReader:
             and not self._shared.stopped.is_set()
         ):
             pass
+
+    def _payload(self, frame: Frame, time_ns: int) -> tuple[str, Any]:
+        """Return the topic and the payload of a frame, or of the markers that a node sends instead."""
+        name = self._camera.name
+        if frame.format != MARKERS_FORMAT:
+            return image_topic(name), frame_payload(time_ns, name, frame.data, frame.format)
+        try:
+            markers = decode(schema_name(Markers), frame.data)
+        except LogError as error:
+            raise SourceError(f"camera {name}: its node sends damaged markers ({error})") from error
+        return MARKERS.topic_of(NODES_RUN, name), replace(markers, timestamp=time_ns)
 
     def _is_early(self, frame: Frame) -> bool:
         """Return whether a frame arrived before the recording began, or depends on a frame that did.
@@ -241,12 +270,13 @@ class CameraReader:
             self._say_once("camera_lost", f"{text}; ipsys tries again")
         raise SourceError(text)
 
-    def _note_size(self, frame: Frame) -> None:
+    def _note_size(self, frame: Frame, payload: Any) -> None:
         """Store the size of the images, and report a change; of a video, only the first size is read."""
         before = self.state.size_px
-        if before is not None and frame.format != "jpeg":
+        if before is not None and frame.format not in ("jpeg", MARKERS_FORMAT):
             return
-        size_px = find_size(frame)
+        is_detected = isinstance(payload, Markers)
+        size_px = (payload.width, payload.height) if is_detected else find_size(frame)
         if size_px is None or size_px == before:
             return
         self.state.size_px = size_px

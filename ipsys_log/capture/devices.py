@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -18,14 +19,18 @@ from ipsys_log.capture.frames import (
     Open,
     Say,
     SourceError,
+    SourceMessage,
     device_path,
     report_refused_settings,
 )
 from ipsys_log.capture.network import check_address, open_network
+from ipsys_log.capture.nodes.centre import Centre, is_of_node, node_of
+from ipsys_log.capture.nodes.network import read_network
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.capture.usb_bus import advise, list_demands
 from ipsys_log.capture.video_files import check_playback_source, open_playback
 from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.rig.file import HIDDEN, hide_password
 
@@ -36,6 +41,7 @@ __all__ = [
     "open_opencv",
     "open_source",
     "open_usb",
+    "source_opener",
     "usb_advice",
 ]
 
@@ -141,6 +147,18 @@ def open_usb(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManage
     return open_opencv(camera, clock, say)
 
 
+def _refuse_node(
+    camera: RigCamera,
+    clock: Clock,  # noqa: ARG001
+    say: Say,  # noqa: ARG001
+) -> AbstractContextManager[Iterator[Frame | None]]:
+    """Refuse the camera of a node that is opened without its rig."""
+    raise IpsysError(
+        f"camera {camera.name}: {camera.source} is the camera of a node, which this step cannot open; use the"
+        " commands record, live, measure, align or calibrate"
+    )
+
+
 # The functions by the text before the first colon of a source.
 OPENERS: dict[str, Open] = {
     "http": open_network,
@@ -152,7 +170,30 @@ OPENERS: dict[str, Open] = {
     "usb": open_usb,
     "sim": open_simulated,
     "file": open_playback,
+    "zenoh": _refuse_node,
 }
+
+
+@contextmanager
+def source_opener(rig: Rig, cameras: Sequence[RigCamera], folder: Path) -> Iterator[Open]:
+    """Yield the function that opens the cameras of a rig; all cameras of nodes share one session.
+
+    Parameters
+    ----------
+    folder : the folder of the rig file, in which the rig names certificates.
+
+    Raises
+    ------
+    IpsysError
+        Cameras are those of nodes, and this machine cannot listen for the nodes.
+    """
+    of_nodes = [camera for camera in cameras if is_of_node(camera)]
+    if not of_nodes:
+        yield open_source
+        return
+    check_installed(f"camera {of_nodes[0].name}: the source {of_nodes[0].source} needs", "zenoh")
+    with Centre(of_nodes, read_network(rig.nodes, folder), version("ipsys_log")) as centre:
+        yield centre.choose_opener(open_source)
 
 
 def check_devices(cameras: Iterable[RigCamera]) -> None:
@@ -190,6 +231,8 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
             parse_source(camera)
         elif _opener(camera) is open_playback:
             check_playback_source(camera)
+        elif is_of_node(camera):
+            node_of(camera)
         elif sys.platform == "linux" and not Path(device_path(source)).exists():
             raise IpsysError(
                 f"camera {camera.name}: device {device_path(source)!r} does not exist; 'ipsys cameras' "
@@ -206,7 +249,9 @@ def usb_advice(rig: Rig) -> list[str]:
     return advise(list_demands(find_cameras(), rig))
 
 
-def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:
+def open_source(
+    camera: RigCamera, clock: Clock, say: Say
+) -> AbstractContextManager[Iterator[Frame | SourceMessage | None]]:
     """Open a camera of any kind; an :data:`~ipsys_log.capture.frames.Open`.
 
     Raises

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
@@ -18,6 +18,7 @@ __all__ = [
     "Open",
     "Say",
     "SourceError",
+    "SourceMessage",
     "device_path",
     "mid_exposure_ns",
     "report_refused_settings",
@@ -31,14 +32,22 @@ class SourceError(IpsysError):
 class Frame(NamedTuple):
     """A frame as the camera sent it.
 
-    ``format`` is jpeg, png, h264 or h265. ``time_ns`` is the driver's stamp in UTC; None without a stamp.
-    ``missed`` is the number of frames lost directly before this frame, by the count of the driver.
+    ``format`` is jpeg, png, h264 or h265; or markers, if a node has detected them and sends no image.
+    ``time_ns`` is the driver's stamp in UTC; None without a stamp. ``missed`` is the number of frames lost
+    directly before this frame, by the count of the driver.
     """
 
     data: bytes
     format: str
     time_ns: int | None
     missed: int = 0
+
+
+class SourceMessage(NamedTuple):
+    """A message of a source other than a frame, such as an event; its ``timestamp`` is its time."""
+
+    topic: str
+    payload: Any
 
 
 # Reading two clocks one after the other gives a smaller difference.
@@ -83,8 +92,8 @@ Say = Callable[[str], None]
 # The function opens a camera with the settings of the rig, and returns an iterator of its frames. While no
 # frame arrives, the iterator yields None at least twice a second, so that its thread can end. The iterator
 # ends when no more frames can arrive, for example at the end of a file. When a camera is disconnected, the
-# iterator raises SourceError.
-Open = Callable[[RigCamera, Clock, Say], AbstractContextManager[Iterator[Frame | None]]]
+# iterator raises SourceError. A source may also yield other messages.
+Open = Callable[[RigCamera, Clock, Say], AbstractContextManager[Iterator[Frame | SourceMessage | None]]]
 
 
 def mid_exposure_ns(stamp_ns: int, camera: RigCamera) -> int:

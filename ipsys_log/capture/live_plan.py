@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.camera_thread import NODES_RUN, CameraState
+from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
-from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
+from ipsys_log.messages.channels import (
+    CALIBRATIONS,
+    CAMERA_POINTS,
+    MARKERS,
+    MODEL,
+    RUN_EVENTS,
+    Channel,
+    channel_of,
+)
 from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import needs_height
 from ipsys_log.runs.execute import LiveRun, copy_messages
@@ -47,7 +56,7 @@ class LivePlan(NamedTuple):
 class _LiveView:
     """The view of a stage on live cameras: only the rig and the intrinsics are recorded so far.
 
-    ``model`` is the model that the stage applies.
+    ``model`` is the model that the stage applies. ``imported`` are the runs that arrive instead of images.
     """
 
     cameras: Collection[str]
@@ -56,6 +65,7 @@ class _LiveView:
     inputs: Mapping[Channel, str]
     model: Model | None
     rig: Rig | None = None
+    imported: Mapping[Channel, str] = field(default_factory=dict)
 
     def calibrations(self) -> dict[str, CameraCalibration]:
         return {str(message.camera): message.payload for message in self.messages(CALIBRATIONS)}
@@ -78,8 +88,8 @@ class _LiveView:
     def last_ns(self, *channels: Channel) -> int:
         return max((message.publish_time_ns for message in self.messages(*channels)), default=0)
 
-    def newest(self, _channel: Channel, /) -> str:
-        return ""
+    def newest(self, channel: Channel, /) -> str:
+        return self.imported.get(channel, "")
 
     def copied(self, _channel: Channel, /) -> Iterator[tuple[str, Any]]:
         return iter(())
@@ -102,7 +112,27 @@ def plan_live(
     copied = _copied(request, until)
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
-    return LivePlan(request, copied, *_wire(cameras, settings, lenses, request, copied, until))
+    wired = _wire(cameras, settings, lenses, request, copied, until, _sends_markers(cameras))
+    return LivePlan(request, copied, *wired)
+
+
+def _sends_markers(cameras: Collection[str]) -> bool:
+    """Return whether the cameras send markers instead of frames.
+
+    Raises
+    ------
+    IpsysError
+        Some cameras send markers, and others frames.
+    """
+    states = cameras.items() if isinstance(cameras, Mapping) else ()
+    names = [name for name, state in states if state.format == MARKERS_FORMAT]
+    if names and len(names) < len(cameras):
+        others = ", ".join(name for name in cameras if name not in names)
+        raise IpsysError(
+            f"camera {', '.join(names)} sends markers, but camera {others} sends frames; start all nodes with"
+            " --detect, or none"
+        )
+    return bool(names)
 
 
 def check_start(
@@ -190,6 +220,11 @@ def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
         A camera sends video: its frames cannot be decoded without the frames before them.
     """
     for name, state in cameras.items():
+        if state.format == MARKERS_FORMAT:
+            raise IpsysError(
+                f"camera {name} sends only markers, but ipsys measure keeps frames: start its node without "
+                "--detect"
+            )
         if state.format in ("h264", "h265"):
             raise IpsysError(
                 f"camera {name} sends {state.format}, but ipsys measure can keep short parts only of MJPEG: "
@@ -204,14 +239,23 @@ def _wire(
     request: Request,
     copied: Sequence[tuple[Task, Model]],
     until: str | None,
+    sends_markers: bool,
 ) -> tuple[list[LiveRun], list[WiredStage]]:
     """Return the runs of a live recording, and its stages, each wired to the runs that it reads."""
     runs: list[LiveRun] = []
     stages: list[WiredStage] = []
 
+    imported = {MARKERS: NODES_RUN} if sends_markers else {}
+    # Stages that read images see no camera.
+    pictured = () if sends_markers else cameras
+
     def add(stage: Stage, inputs: dict[Channel, str], model: Model | None) -> None:
         options = request.options(model.name if model else None)
-        plan = stage.plan(_LiveView(cameras, lenses, settings, inputs, model), options)
+        view = _LiveView(pictured, lenses, settings, inputs, model, imported=imported)
+        plan = stage.plan(view, options)
+        if isinstance(plan, str) and sends_markers:
+            inputs.update({channel: plan for channel in stage.writes if channel is not RUN_EVENTS})
+            return
         assert isinstance(plan, Plan), f"{stage.name} cannot run live"
         assert plan.step is not None
         stages.append(wire(stage, plan.run, inputs, plan.step(plan.run)))

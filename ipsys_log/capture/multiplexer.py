@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from ipsys_log.capture.camera_thread import Arrival, CameraReader, ReaderContext
+from ipsys_log.capture.camera_thread import NODES_RUN, Arrival, CameraReader, ReaderContext
 from ipsys_log.capture.frames import Clock, Open, Say, SourceError
+from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 
@@ -114,6 +115,17 @@ class LiveCameras:
         """
         self._reason = reason or self._reason
         self._ending = True
+
+    @property
+    def imported_run(self) -> str | None:
+        """The run of the markers that nodes send instead of frames; None if no camera sends markers."""
+        sends_markers = any(state.format == MARKERS_FORMAT for state in self.states.values())
+        return NODES_RUN if sends_markers else None
+
+    @property
+    def is_stopped(self) -> bool:
+        """Return whether :meth:`stop` was called."""
+        return self._ending
 
     def __iter__(self) -> Generator[Message | None, None, None]:
         """Yield messages; requesting the next message acknowledges the previous write.

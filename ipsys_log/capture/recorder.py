@@ -26,6 +26,7 @@ from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
+    IMPORTED,
     RIG_TOPIC,
     STAMP_UNRELIABLE,
     CameraCalibration,
@@ -35,9 +36,10 @@ from ipsys_log.messages import (
     Measurement,
     Message,
     Rig,
+    Run,
     calibration_topic,
 )
-from ipsys_log.runs.output import serialize, write_message
+from ipsys_log.runs.output import record_message, serialize, write_message
 
 __all__ = [
     "CameraSource",
@@ -297,13 +299,25 @@ def fitting_lenses(
 
 
 def first_messages(
-    rig: Rig, lenses: Mapping[str, CameraCalibration], now_ns: Callable[[], int]
+    rig: Rig,
+    lenses: Mapping[str, CameraCalibration],
+    now_ns: Callable[[], int],
+    imported_run: str | None = None,
 ) -> list[Message]:
-    """Return the first messages of a log: the rig, and the intrinsics by camera."""
+    """Return the first messages of a log: the rig, the intrinsics by camera, and the record of a run.
+
+    Parameters
+    ----------
+    imported_run : the run of markers that other hosts have detected.
+    """
     time_ns = now_ns()
     messages = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
     for camera, lens in sorted(lenses.items()):
         time_ns = now_ns()
         stamped = replace(lens, timestamp=time_ns)
         messages.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
+    if imported_run is not None:
+        time_ns = now_ns()
+        record = Run(time_ns, imported_run, IMPORTED, {"format": "node"})
+        messages.append(record_message(record, time_ns))
     return messages

@@ -30,6 +30,7 @@ from ipsys_log.cli import (
     markers,
     measure,
     merge,
+    node,
     plan,
     publish,
     record,
@@ -57,6 +58,7 @@ _PLACED: dict[str, tuple[str, ...]] = {
     "Many logs": ("batch", "catalogue"),
     "Publish a dataset": ("pack", "score"),
     _STAGES: (),
+    "Cameras of other hosts": ("node",),
     "Without cameras": ("simulate", "drive", "import"),
 }
 
@@ -222,6 +224,11 @@ ipsys drive --model-from cal.mcap -o run.mcap --model poly --model best
 ipsys drive --model-from cal.mcap -o three.mcap --robots 3 --lockstep
 ipsys drive --model-from cal.mcap -o run.mcap --loss 0.05 --fail white=20:5
 """,
+    "node": """
+ipsys node lab.toml --camera red         # on the host of this camera
+ipsys node lab.toml --camera red --centre 192.168.1.10:7449
+ipsys node lab.toml --camera red --detect     # send only the markers
+""",
     "simulate": """
 ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4
 """,
@@ -278,7 +285,7 @@ _MODULES = (
     *(first_day, setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
     *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, merge, compare, publish, drive),
-    *(batch, catalogue),
+    *(batch, catalogue, node),
 )
 for module in _MODULES:
     module.add_commands(app)

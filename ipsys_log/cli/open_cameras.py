@@ -44,12 +44,13 @@ _PLACE_S = 1.5
 
 
 class Lab(NamedTuple):
-    """The cameras to open: the rig, its cameras, their intrinsics by name, and the input files."""
+    """The cameras to open: the rig, its cameras, their intrinsics by name, the input files and the folder."""
 
     rig: Rig
     cameras: list[RigCamera]
     lenses: dict[str, CameraCalibration]
     files: list[tuple[str, Path]]
+    folder: Path
 
     @property
     def names(self) -> list[str]:
@@ -74,7 +75,7 @@ def prepare_lab(
     from ipsys_log.capture.devices import check_devices, check_sources, usb_advice
 
     described, cameras, lenses = load_lab(rig, calibration, only or (), with_lenses)
-    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration))
+    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration), rig.parent)
     check_devices(lab.cameras)
     check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
@@ -158,7 +159,7 @@ def open_cameras(
     IpsysError
         A camera cannot be opened, or its frames do not fit its intrinsics.
     """
-    from ipsys_log.capture.devices import open_source
+    from ipsys_log.capture.devices import source_opener
     from ipsys_log.capture.disk import expected_bytes_per_s, free_room
     from ipsys_log.capture.frames import Clock
     from ipsys_log.capture.live_check import CameraMonitor
@@ -168,7 +169,8 @@ def open_cameras(
 
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(lab.names)):
-            attached = stack.enter_context(LiveCameras(lab.cameras, open_source, Clock(), say))
+            opener = stack.enter_context(source_opener(lab.rig, lab.cameras, lab.folder))
+            attached = stack.enter_context(LiveCameras(lab.cameras, opener, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
         stack.enter_context(_stop_after(attached.stop, seconds, until_stopped))
@@ -181,7 +183,7 @@ def open_cameras(
         say(doing or f"recording into {output}; Ctrl-C to end")
         if panel:
             stack.enter_context(_on_screen(status))
-        yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
+        yield attached, first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run), status
     for line in () if doing else status.summary():
         console.print(line, markup=False)
 

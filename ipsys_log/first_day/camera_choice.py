@@ -139,7 +139,7 @@ def take_picture(camera: RigCamera, say: Say, is_stopped: Callable[[], bool]) ->
         for frame in islice(frames, _MOST_WAITS):
             if is_stopped():
                 return None
-            if frame is not None and (picture := _picture(frame)) is not None:
+            if isinstance(frame, Frame) and (picture := _picture(frame)) is not None:
                 return picture
     return None
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ipsys_log import api, pipeline
 from ipsys_log.calibration.calibrate import CalibrationResult
-from ipsys_log.capture.devices import check_devices, check_sources, open_source
+from ipsys_log.capture.devices import check_devices, check_sources, source_opener
 from ipsys_log.capture.disk import expected_bytes_per_s, free_room
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.live_check import CameraMonitor
@@ -113,11 +113,14 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
     IpsysError
         The camera has a fault, or the pictures do not determine its intrinsics.
     """
-    _, cameras = load_cameras(folder.rig_file, [search.camera])
+    rig, cameras = load_cameras(folder.rig_file, [search.camera])
     check_sources(cameras)
     shown = [show_board(camera, entry.board) for camera in cameras]
     job.say(f"opening {search.camera}")
-    with LiveCameras(shown, open_source, Clock(), job.say) as attached:
+    with (
+        source_opener(rig, shown, folder.rig_file.parent) as opener,
+        LiveCameras(shown, opener, Clock(), job.say) as attached,
+    ):
         job.on_stop(attached.stop)
         newest = _NewestImage(search.look)
         with newest:
@@ -241,13 +244,23 @@ def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
     check_devices(cameras)
     check_sources(cameras)
     job.say(f"opening {', '.join(camera.name for camera in cameras)}")
-    with LiveCameras(cameras, open_source, Clock(), job.say) as attached, CameraMonitor(rig) as monitor:
+    with (
+        source_opener(rig, cameras, folder.rig_file.parent) as opener,
+        LiveCameras(cameras, opener, Clock(), job.say) as attached,
+        CameraMonitor(rig) as monitor,
+    ):
         job.on_stop(attached.stop)
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         fitting = fitting_lenses(lenses, sizes_px, job.say)
         room = free_room(folder.rig_file, expected_bytes_per_s(cameras, attached.states))
         job.say(room.describe(None))
-        yield OpenedLab(rig, fitting, attached, first_messages(rig, fitting, attached.now_ns), monitor)
+        yield OpenedLab(
+            rig,
+            fitting,
+            attached,
+            first_messages(rig, fitting, attached.now_ns, attached.imported_run),
+            monitor,
+        )
 
 
 def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:

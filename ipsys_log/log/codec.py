@@ -44,6 +44,7 @@ PAYLOADS: dict[str, type] = {
         f"ipsys.v1.{payload.__name__}": payload
         for payload in (
             messages.CameraPoints,
+            messages.ClockEstimate,
             messages.Cut,
             messages.Evaluation,
             messages.Event,

@@ -14,8 +14,10 @@ from ipsys_log.messages.channels import (
     RIG_TOPIC,
     TRUTH_TOPIC,
     calibration_topic,
+    clock_topic,
     image_topic,
 )
+from ipsys_log.messages.clocks import ClockEstimate
 from ipsys_log.messages.commands import (
     DRIVING,
     FINISHED,
@@ -63,6 +65,7 @@ from ipsys_log.messages.rig import (
     Rig,
     RigCamera,
     RigMarker,
+    RigNodes,
     RigStream,
 )
 from ipsys_log.messages.runs import IMPORTED, ChannelRead, ChannelWritten, Lens, Run
@@ -101,6 +104,7 @@ __all__ = [
     "ChannelCut",
     "ChannelRead",
     "ChannelWritten",
+    "ClockEstimate",
     "Color",
     "CompressedImage",
     "CompressedVideo",
@@ -145,6 +149,7 @@ __all__ = [
     "Rig",
     "RigCamera",
     "RigMarker",
+    "RigNodes",
     "RigStream",
     "RobotPath",
     "Run",
@@ -160,5 +165,6 @@ __all__ = [
     "WheelCommand",
     "WorldPoint",
     "calibration_topic",
+    "clock_topic",
     "image_topic",
 ]

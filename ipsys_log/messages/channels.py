@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from ipsys_log.messages.clocks import ClockEstimate
 from ipsys_log.messages.commands import RobotPath, WheelCommand
 from ipsys_log.messages.cuts import Cut
 from ipsys_log.messages.events import Event, Latency
@@ -28,6 +29,7 @@ __all__ = [
     "CALIBRATIONS",
     "CAMERA_POINTS",
     "CHANNELS",
+    "CLOCKS",
     "COMMANDS",
     "COMMANDS_TOPIC",
     "CUTS",
@@ -57,6 +59,7 @@ __all__ = [
     "Channel",
     "calibration_topic",
     "channel_of",
+    "clock_topic",
     "image_topic",
 ]
 
@@ -109,6 +112,7 @@ CALIBRATIONS = Channel(
     by_schema=True,
     lasting=True,
 )
+CLOCKS = Channel(name="clocks", topic="/cameras/{camera}/clock", payloads=(ClockEstimate,))
 MEASUREMENTS = Channel(
     name="measurements", topic="/measurements", payloads=(Measurement,), by_schema=True, lasting=True
 )
@@ -138,7 +142,7 @@ POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransfor
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
 
 CHANNELS: tuple[Channel, ...] = (
-    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS, MERGES),
+    *(RIG, IMAGES, CALIBRATIONS, CLOCKS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS, MERGES),
     *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
     *(SMOOTHED_TRACKS, RUN_EVENTS),
 )
@@ -163,6 +167,11 @@ def image_topic(camera: str) -> str:
 def calibration_topic(camera: str) -> str:
     """Return the topic of the intrinsics of a camera."""
     return CALIBRATIONS.topic_of(camera=camera)
+
+
+def clock_topic(camera: str) -> str:
+    """Return the topic of the estimates of the clock of a camera's node."""
+    return CLOCKS.topic_of(camera=camera)
 
 
 def channel_of(topic: str, payload: type | None) -> Channel | None:

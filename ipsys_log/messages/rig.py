@@ -14,6 +14,7 @@ __all__ = [
     "Rig",
     "RigCamera",
     "RigMarker",
+    "RigNodes",
     "RigStream",
 ]
 
@@ -100,6 +101,18 @@ class RigStream:
 
 
 @dataclass(frozen=True, slots=True)
+class RigNodes:
+    """The connection of nodes, which are hosts with cameras, to the centre, which records.
+
+    ``centre`` is the address of the centre, as ``HOST:PORT``; None: only this machine. ``certificates`` names
+    the folder of the certificates.
+    """
+
+    centre: str | None = None
+    certificates: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
     """The lab, as in ``lab.toml`` and in the channel ``/rig`` (see :mod:`ipsys_log.rig.file`)."""
 
@@ -115,6 +128,7 @@ class Rig:
     marker_height_sigma_m: float | None = None
     stream: RigStream | None = None
     reference_markers: tuple[ReferenceMarker, ...] = ()
+    nodes: RigNodes | None = None
 
     @property
     def all_markers(self) -> tuple[RigMarker | ReferenceMarker, ...]:

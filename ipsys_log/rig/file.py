@@ -21,6 +21,7 @@ from ipsys_log.messages import (
     Rig,
     RigCamera,
     RigMarker,
+    RigNodes,
     RigStream,
 )
 from ipsys_log.rig.checks import check_units
@@ -146,6 +147,8 @@ def rig_toml(rig: Rig) -> str:
         lines += ["", "[floor]", *toml_rows(rig.floor)]
     if rig.stream is not None:
         lines += ["", "[stream]", *toml_rows(rig.stream)]
+    if rig.nodes is not None:
+        lines += ["", "[nodes]", *toml_rows(rig.nodes)]
     for key in _ITEMS:
         for item in getattr(rig, key):
             lines += ["", f"[[{key}]]", *toml_rows(item)]
@@ -226,6 +229,8 @@ def load_rig(path: Path) -> Rig:
         table["floor"] = _build(Floor, table["floor"], f"{path}: [floor]")
     if "stream" in table:
         table["stream"] = _build(RigStream, table["stream"], f"{path}: [stream]")
+    if "nodes" in table:
+        table["nodes"] = _build(RigNodes, table["nodes"], f"{path}: [nodes]")
     rig = check_rig(_build(Rig, table, str(path)), str(path))
     check_units(rig, str(path))
     return rig

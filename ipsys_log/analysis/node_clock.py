@@ -1,0 +1,187 @@
+"""Offset and drift between the clocks of two hosts, from exchanges of messages.
+
+The centre sends a message at `sent_ns` by its clock. The node receives it at `received_ns` and answers at
+`replied_ns`, both by the clock of the node; the answer arrives at `back_ns` by the clock of the centre. No
+message arrives before it was sent. So each exchange bounds the offset (centre minus node) from below and from
+above::
+
+    sent_ns - received_ns  <=  offset  <=  back_ns - replied_ns
+
+A line in the time of the node must separate the lower bounds from the upper ones. The estimate is the middle
+of the line pair that has the greatest distance: jitter moves most bounds away from the lines, and the
+exchanges with the least delay decide. A constant difference between the delays of both directions cannot be
+observed. Half of it is an error of the offset; it is always less than the bound of the estimate.
+
+References: F. Cristian, Probabilistic clock synchronization, Distributed Computing 3 (1989) 146-158; S. B.
+Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM
+1999.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["ClockHistory", "ClockLine", "Exchange", "fit_clock"]
+
+# Crystals of computers differ by less, also at extreme temperatures.
+_MOST_DRIFT = 500e-6
+# A shorter time does not determine the drift beside the jitter.
+_DRIFT_SPAN_NS = 20 * NS_PER_S
+# The temperature changes the drift within minutes.
+_WINDOW_NS = 60 * NS_PER_S
+_STEPS = 60
+# A greater contradiction between an exchange and the estimate is a jump of the clock.
+_JUMP_NS = NS_PER_S // 100
+
+
+# Later estimates change slowly, so they are made once a second only.
+_FEW, _REFIT_NS = 50, NS_PER_S
+
+
+class Exchange(NamedTuple):
+    """The times of one exchange, in ns: the first and the last by the centre, the others by the node."""
+
+    sent_ns: int
+    received_ns: int
+    replied_ns: int
+    back_ns: int
+
+    @property
+    def round_trip_ns(self) -> int:
+        """The time on the way, in both directions."""
+        return (self.back_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
+
+
+class ClockLine(NamedTuple):
+    """The clock of the centre as a line in the time of the node.
+
+    ``offset_ns`` holds at ``node_ns``; ``drift`` is its change in s/s. The offset there lies within
+    ``bound_ns``, whatever the delays are, if the drift is at most 500e-6.
+    """
+
+    node_ns: int
+    offset_ns: int
+    drift: float
+    bound_ns: int
+    exchanges: int
+
+    def to_centre_ns(self, node_ns: int) -> int:
+        """Convert a time of the node to the time of the centre.
+
+        Examples
+        --------
+        >>> ClockLine(1_000, 50, 1e-3, 5, 2).to_centre_ns(3_000)
+        3052
+        """
+        return node_ns + self.offset_ns + round(self.drift * (node_ns - self.node_ns))
+
+
+def fit_clock(exchanges: list[Exchange]) -> ClockLine:
+    """Return the clock of the centre from exchanges with a node.
+
+    Parameters
+    ----------
+    exchanges : at least one. The drift is 0 if they span less than 20 s.
+
+    Examples
+    --------
+    >>> fit_clock([Exchange(100, 1010, 1020, 130), Exchange(200, 1104, 1106, 214)])
+    ClockLine(node_ns=1105, offset_ns=-898, drift=0.0, bound_ns=6, exchanges=2)
+    """
+    reference = exchanges[-1]
+    node_ns = (reference.received_ns + reference.replied_ns) // 2
+    base_ns = reference.sent_ns - reference.received_ns
+    lower_s, upper_s = (
+        np.array([(at_ns - node_ns, bound_ns - base_ns) for at_ns, bound_ns in bounds]) / NS_PER_S
+        for bounds in (
+            [(row.received_ns, row.sent_ns - row.received_ns) for row in exchanges],
+            [(row.replied_ns, row.back_ns - row.replied_ns) for row in exchanges],
+        )
+    )
+    span_ns = reference.received_ns - exchanges[0].received_ns
+    drift = _find_drift(lower_s, upper_s) if span_ns >= _DRIFT_SPAN_NS else 0.0
+    offset_s = float(np.mean(_offsets(lower_s, upper_s, drift)))
+    bound_ns = round(_bound_s(lower_s, upper_s, offset_s) * NS_PER_S)
+    return ClockLine(node_ns, base_ns + round(offset_s * NS_PER_S), drift, bound_ns, len(exchanges))
+
+
+def _bound_s(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64], offset_s: float) -> float:
+    """Return the greatest possible error of an offset, for all delays and for all drifts of computers."""
+    least_s = np.max(lower_s[:, 1] - _MOST_DRIFT * np.abs(lower_s[:, 0]))
+    most_s = np.min(upper_s[:, 1] + _MOST_DRIFT * np.abs(upper_s[:, 0]))
+    return float(max(most_s - offset_s, offset_s - least_s))
+
+
+def _offsets(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64], drift: float) -> tuple[float, float]:
+    """Return the offsets of the highest lower line and of the lowest upper line, in s, for a drift."""
+    return (
+        float(np.max(lower_s[:, 1] - drift * lower_s[:, 0])),
+        float(np.min(upper_s[:, 1] - drift * upper_s[:, 0])),
+    )
+
+
+def _find_drift(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64]) -> float:
+    """Return the drift with the greatest distance of the lines: it is a concave function of the drift."""
+    low, high = -_MOST_DRIFT, _MOST_DRIFT
+    for _ in range(_STEPS):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        distances = [np.subtract(*_offsets(lower_s, upper_s, drift)[::-1]) for drift in (left, right)]
+        low, high = (left, high) if distances[0] < distances[1] else (low, right)
+    return (low + high) / 2
+
+
+class ClockHistory:
+    """The clock of one session of a node, with its jumps.
+
+    Attributes
+    ----------
+    line : the newest estimate; None before the first exchange.
+    """
+
+    def __init__(self) -> None:
+        self.line: ClockLine | None = None
+        self._exchanges: deque[Exchange] = deque()
+        # The lines before each jump, with the range of node times in which they held.
+        self._former: list[tuple[int, int, ClockLine]] = []
+        self._start_ns = 0
+
+    def add(self, exchange: Exchange) -> int | None:
+        """Add an exchange; return the size of a jump of the node's clock before it, in ns, or None."""
+        jump_ns = self._jump_ns(exchange)
+        if self.line is None or jump_ns is not None:
+            if self.line is not None:
+                self._former.append((self._start_ns, self._exchanges[-1].replied_ns, self.line))
+            self._exchanges.clear()
+            self._start_ns = exchange.received_ns
+        self._exchanges.append(exchange)
+        while exchange.received_ns - self._exchanges[0].received_ns > _WINDOW_NS:
+            self._exchanges.popleft()
+        few = len(self._exchanges) <= _FEW
+        if self.line is None or few or exchange.received_ns - self.line.node_ns >= _REFIT_NS:
+            self.line = fit_clock(list(self._exchanges))
+        return jump_ns
+
+    def to_centre_ns(self, node_ns: int) -> int | None:
+        """Convert a time of the node by the estimate that held then; None before the first exchange."""
+        if self.line is None:
+            return None
+        rows = [*self._former, (self._start_ns, self._exchanges[-1].replied_ns, self.line)]
+        *_, line = min(rows, key=lambda row: max(row[0] - node_ns, node_ns - row[1], 0))
+        return line.to_centre_ns(node_ns)
+
+    def _jump_ns(self, exchange: Exchange) -> int | None:
+        if self.line is None:
+            return None
+        expected_ns = self.line.to_centre_ns(exchange.received_ns) - exchange.received_ns
+        room_ns = _JUMP_NS + round(_MOST_DRIFT * abs(exchange.received_ns - self.line.node_ns))
+        low_ns, high_ns = exchange.sent_ns - exchange.received_ns, exchange.back_ns - exchange.replied_ns
+        room_ns = min(room_ns, _JUMP_NS * 10)
+        if low_ns - room_ns <= expected_ns <= high_ns + room_ns:
+            return None
+        return expected_ns - (low_ns + high_ns) // 2

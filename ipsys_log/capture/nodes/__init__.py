@@ -1,0 +1,1 @@
+"""Cameras of other hosts, the nodes, over Zenoh."""

@@ -1,0 +1,283 @@
+"""The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
+
+All cameras of a recording share one session. The centre asks each node for its state ten times a second, and
+for frames that did not arrive, with the lowest priority. Everything that arrives waits in a queue with a
+limit; a dropped frame is missing, so the node sends it again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage
+from ipsys_log.capture.nodes.network import NodeNetwork, open_centre_session
+from ipsys_log.capture.nodes.stream import NodeStream
+from ipsys_log.capture.nodes.wire import (
+    FrameHeader,
+    NodeState,
+    frames_key,
+    missing_key,
+    state_key,
+)
+from ipsys_log.messages import RigCamera
+from ipsys_log.rig.file import check_name
+from ipsys_log.units import NS_PER_S
+
+if TYPE_CHECKING:
+    import zenoh
+
+__all__ = ["Centre", "is_of_node", "node_of"]
+
+_SCHEME = "zenoh:"
+_MOST_WAITING_BYTES = 64 << 20
+_TURN_S = 0.1
+# The first exchanges follow each other faster: together they find the offset.
+_FIRST_TURN_S, _FIRST_EXCHANGES = 0.02, 40
+_FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
+_SILENT_NS = 5 * NS_PER_S
+_ANSWER_S, _FRAMES_S = 3.0, 20.0
+
+
+def is_of_node(camera: RigCamera) -> bool:
+    """Return whether a node sends the frames of a camera."""
+    return str(camera.source).startswith(_SCHEME)
+
+
+def node_of(camera: RigCamera) -> str:
+    """Return the name of the node of a camera.
+
+    Raises
+    ------
+    IpsysError
+        The name is not valid.
+
+    Examples
+    --------
+    >>> node_of(RigCamera("red", source="zenoh:red"))
+    'red'
+    """
+    return check_name(str(camera.source).removeprefix(_SCHEME), f"camera {camera.name}: the node")
+
+
+class _Arrival(NamedTuple):
+    """Something from a node: its time, its bytes, and the function of the stream that takes it."""
+
+    size: int
+    take: Callable[[], Iterator[Frame | SourceMessage]]
+
+
+class Centre:
+    """The session that receives the frames of nodes. A context manager.
+
+    Parameters
+    ----------
+    cameras : cameras whose source is a node.
+    network : the address and the certificates.
+    version : the version of ipsys here; a node with another version is refused.
+
+    Raises
+    ------
+    IpsysError
+        On entering: the centre cannot listen.
+    """
+
+    def __init__(self, cameras: Sequence[RigCamera], network: NodeNetwork, version: str) -> None:
+        self._nodes = {camera.name: node_of(camera) for camera in cameras}
+        self._network, self._version = network, version
+        self._session: zenoh.Session | None = None
+        self._links: dict[str, _Link] = {}
+
+    def __enter__(self) -> Self:
+        self._session = open_centre_session(self._network, list(self._nodes.values()))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    @contextmanager
+    def open(
+        self, camera: RigCamera, clock: Clock, say: Say
+    ) -> Iterator[Iterator[Frame | SourceMessage | None]]:
+        """Open the camera of a node; an :data:`~ipsys_log.capture.frames.Open`.
+
+        Raises
+        ------
+        SourceError
+            No node answers, the node has another version, or two nodes have the name.
+        """
+        link = self._links.get(camera.name)
+        if link is None:
+            stream = NodeStream(camera, self._version)
+            link = _Link(self._session, camera, self._nodes[camera.name], stream, clock)
+            link.await_node(self._network, say)
+            self._links[camera.name] = link
+            say(f"camera {camera.name}: its node answers; {stream.describe_clock()}")
+        link.heard_ns = clock.now_ns()
+        yield link.items()
+
+    def choose_opener(self, other: Open) -> Open:
+        """Return the function that opens the cameras of nodes, and with ``other`` all other cameras."""
+
+        def choose(camera: RigCamera, clock: Clock, say: Say) -> Any:
+            return self.open(camera, clock, say) if is_of_node(camera) else other(camera, clock, say)
+
+        return choose
+
+
+class _Link:
+    """The connection to one node: its subscription, its requests, and the queue of arrivals."""
+
+    def __init__(self, session: Any, camera: RigCamera, node: str, stream: NodeStream, clock: Clock) -> None:
+        self.heard_ns = clock.now_ns()
+        self._session, self._camera, self._node = session, camera, node
+        self._stream, self._clock = stream, clock
+        self._arrived = threading.Condition()
+        self._waiting: deque[_Arrival] = deque()
+        self._waiting_bytes = 0
+        # The number of answers, and items from before the opening.
+        self._exchanges = 0
+        self._early: list[Frame | SourceMessage] = []
+        self._state_asked_ns = 0
+        self._asks_frames = False
+        self._subscriber = session.declare_subscriber(frames_key(node), self._receive)
+
+    def await_node(self, network: NodeNetwork, say: Say) -> None:
+        """Wait for the first answers of the node; ``say`` reports a longer wait.
+
+        Raises
+        ------
+        SourceError
+            No node answers.
+        """
+        start_ns, is_said = self._clock.now_ns(), False
+        while not (self._exchanges >= _OPENING_EXCHANGES and self._stream.is_known):
+            waited_s = (self._clock.now_ns() - start_ns) / NS_PER_S
+            if waited_s > _FIRST_ANSWER_S:
+                break
+            if waited_s > _WAIT_UNSAID_S and not is_said and not self._exchanges:
+                is_said = True
+                say(f"camera {self._camera.name}: waits for node {self._node} at {network}")
+            arrival = self._take()
+            self._early += [] if arrival is None else arrival.take()
+            self._ask_state()
+        if not self._stream.is_known:
+            raise SourceError(
+                f"camera {self._camera.name}: no node {self._node} answers at {network}; start it on its "
+                f"host: ipsys node lab.toml --camera {self._node}"
+            )
+
+    def items(self) -> Iterator[Frame | SourceMessage | None]:
+        """Yield the frames and the messages about them."""
+        yield from self._early
+        self._early.clear()
+        while True:
+            self._ask_state()
+            self._ask_frames()
+            arrival = self._take()
+            if arrival is None:
+                if self._clock.now_ns() - self.heard_ns > _SILENT_NS:
+                    raise SourceError(f"camera {self._camera.name}: its node does not answer")
+                yield None
+                continue
+            yield from arrival.take()
+            if self._stream.has_ended:
+                return
+
+    def _take(self) -> _Arrival | None:
+        turn_s = _FIRST_TURN_S if self._exchanges < _FIRST_EXCHANGES else _TURN_S
+        with self._arrived:
+            if not self._waiting:
+                self._arrived.wait(turn_s)
+            arrival = self._waiting.popleft() if self._waiting else None
+            self._waiting_bytes -= arrival.size if arrival else 0
+            return arrival
+
+    def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
+        with self._arrived:
+            self.heard_ns = self._clock.now_ns()
+            if size and self._waiting_bytes + size > _MOST_WAITING_BYTES:
+                return
+            self._waiting_bytes += size
+            self._waiting.append(_Arrival(size, take))
+            self._arrived.notify_all()
+
+    def _receive(self, sample: Any, is_late: bool = False) -> None:
+        """Take a frame; Zenoh calls this in its thread."""
+        now_ns = self._clock.now_ns()
+        header = FrameHeader.decode(sample.attachment.to_bytes()) if sample.attachment is not None else None
+        if header is None:
+            return
+        data = sample.payload.to_bytes()
+        if data:
+            self._put(len(data), partial(self._stream.take_frame, header, data, now_ns, is_late))
+        elif is_late:
+            self._put(1, partial(self._stream.lose, header, now_ns))
+
+    def _ask_state(self) -> None:
+        """Ask the node for its state, if the last request is old enough."""
+        import zenoh
+
+        now_ns = self._clock.now_ns()
+        turn_s = _FIRST_TURN_S if self._exchanges < _FIRST_EXCHANGES else _TURN_S
+        if now_ns - self._state_asked_ns < turn_s * NS_PER_S:
+            return
+        self._state_asked_ns = sent_ns = self._clock.now_ns()
+
+        def receive(reply: Any) -> None:
+            back_ns = self._clock.now_ns()
+            state = NodeState.decode(reply.ok.payload.to_bytes()) if reply.ok is not None else None
+            if state is not None:
+                self._exchanges += 1
+                self._put(0, partial(self._stream.take_state, state, sent_ns, back_ns))
+
+        self._session.get(
+            state_key(self._node),
+            receive,
+            payload=self._stream.state_request().encode(),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+            timeout=_ANSWER_S,
+        )
+
+    def _ask_frames(self) -> None:
+        """Ask the node for missing frames, unless a request is under way."""
+        import zenoh
+
+        request = self._stream.frame_request()
+        if request is None or self._asks_frames or self._waiting_bytes > _MOST_WAITING_BYTES // 2:
+            return
+        self._asks_frames = True
+        self._session.get(
+            missing_key(self._node),
+            zenoh.handlers.Callback(self._receive_late, self._end_late),
+            payload=request.encode(),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.BACKGROUND,
+            timeout=_FRAMES_S,
+        )
+
+    def _receive_late(self, reply: Any) -> None:
+        if reply.ok is not None:
+            self._receive(reply.ok, is_late=True)
+
+    def _end_late(self) -> None:
+        """Allow the next request as soon as the stream has taken all frames of this one."""
+
+        def finish() -> Iterator[Frame | SourceMessage]:
+            self._asks_frames = False
+            return iter(())
+
+        self._put(0, finish)

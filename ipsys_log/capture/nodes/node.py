@@ -1,0 +1,267 @@
+"""The node: it sends the frames that its recorder has written, and sends again what did not arrive."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections import OrderedDict, deque
+from pathlib import Path
+from queue import Empty, Full, Queue
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from ipsys_log.capture.frames import Clock, Say
+from ipsys_log.capture.nodes.certificates import check_centre
+from ipsys_log.capture.nodes.network import NodeNetwork, open_node_session
+from ipsys_log.capture.nodes.wire import (
+    MARKERS_FORMAT,
+    FrameHeader,
+    FrameRequest,
+    NodeState,
+    StateRequest,
+    frames_key,
+    missing_key,
+    new_session,
+    state_key,
+)
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
+from ipsys_log.log.growing_channel import GrowingChannel
+from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Node"]
+
+# Frames that wait to be sent, and the newest frames, which need not be read from the disk.
+_MOST_WAITING_BYTES, _MOST_RECENT_BYTES = 32 << 20, 64 << 20
+_MOST_REQUESTS = 4
+_MOST_FRAMES = 64
+_TURN_S = 0.1
+# The node of a finished recording waits for a centre that still asks.
+_SILENT_NS = 3 * NS_PER_S
+_SESSION_BYTES = 8
+
+
+class _Recorded(NamedTuple):
+    """A recorded frame."""
+
+    number: int
+    time_ns: int
+    format: str
+    data: bytes
+
+
+class Node:
+    """The sender of one camera: a consumer of its recording. A context manager.
+
+    The recorder writes each frame before the node sends it. If the network is too slow, frames are not sent;
+    the centre asks for them later.
+
+    Parameters
+    ----------
+    camera : the name of the camera and of the node.
+    network : the address of the centre, and the certificates.
+    version : the version of ipsys here.
+    log : the log with the frames.
+    clock : the clock of the frames.
+    say : called with a text about the connection.
+    sends_markers : send the markers of each frame instead of the frame.
+
+    Raises
+    ------
+    IpsysError
+        On entering: a certificate is missing or not accepted.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        network: NodeNetwork,
+        version: str,
+        log: Path,
+        clock: Clock,
+        say: Say,
+        sends_markers: bool = False,
+    ) -> None:
+        self.session_name = new_session(secrets.token_bytes(_SESSION_BYTES))
+        self._camera, self._network, self._version = camera, network, version
+        self._clock, self._say = clock, say
+        self._log = log
+        self._sent: tuple[type, ...] = (Markers,) if sends_markers else (CompressedImage, CompressedVideo)
+        # The channel of the sent messages, after the first one.
+        self._channel: GrowingChannel | None = None
+        self._session: Any = None
+        self._count = self._received = 0
+        self._has_ended = self._is_refused = False
+        self._asked_ns: int | None = None
+        self._changed = threading.Condition()
+        self._waiting: deque[_Recorded] = deque()
+        self._waiting_bytes = self._recent_bytes = 0
+        self._recent: OrderedDict[int, _Recorded] = OrderedDict()
+        self._requests: Queue[Any] = Queue(_MOST_REQUESTS)
+        self._stopped = threading.Event()
+        self._threads = [
+            threading.Thread(target=work, name=f"node {camera}", daemon=True)
+            for work in (self._send_all, self._answer_all)
+        ]
+
+    def __enter__(self) -> Self:
+        files = self._network.files_of(self._camera)
+        reason = None
+        if files is not None:
+            reason = check_centre(self._network.host, self._network.port, files)
+        self._session = open_node_session(self._network, self._camera)
+        self._session.declare_queryable(state_key(self._camera), self._answer_state)
+        self._session.declare_queryable(missing_key(self._camera), self._enqueue_request)
+        for thread in self._threads:
+            thread.start()
+        if reason is not None:
+            self._say(
+                f"centre {self._network} does not answer ({reason}); the node records, and sends the frames "
+                "to a centre that starts later"
+            )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopped.set()
+        with self._changed:
+            self._changed.notify_all()
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join(_SILENT_NS / NS_PER_S)
+        self._session.close()
+        if self._channel is not None:
+            self._channel.close()
+
+    def __call__(self, message: Message | None) -> None:
+        """Take a recorded message; send it if it is a frame, or its markers."""
+        if message is None or not isinstance(message.payload, self._sent):
+            return
+        frame = _recorded(self._count, message.payload)
+        with self._changed:
+            if self._channel is None:
+                self._channel = GrowingChannel(self._log, message.topic)
+            self._count += 1
+            self._recent[frame.number] = frame
+            self._recent_bytes += len(frame.data)
+            while self._recent_bytes > _MOST_RECENT_BYTES:
+                self._recent_bytes -= len(self._recent.popitem(last=False)[1].data)
+            self._waiting.append(frame)
+            self._waiting_bytes += len(frame.data)
+            while self._waiting_bytes > _MOST_WAITING_BYTES:
+                self._waiting_bytes -= len(self._waiting.popleft().data)
+            self._changed.notify_all()
+
+    def finish(self, has_ended: bool) -> int:
+        """Wait until the centre has all frames, as long as it asks; return the number that it does not have.
+
+        Parameters
+        ----------
+        has_ended : the source has ended; otherwise the node was stopped, and may start again.
+        """
+        self._has_ended = has_ended
+        while not self._stopped.wait(_TURN_S):
+            now_ns = self._clock.now_ns()
+            if (
+                self._asked_ns is None
+                or now_ns - self._asked_ns > _SILENT_NS
+                or self._received >= self._count
+            ):
+                break
+        return self._count - self._received
+
+    def _send_all(self) -> None:
+        import zenoh
+
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._stopped.is_set())
+                if self._stopped.is_set():
+                    return
+                frame = self._waiting.popleft()
+                self._waiting_bytes -= len(frame.data)
+            self._session.put(
+                frames_key(self._camera),
+                frame.data,
+                attachment=self._header(frame),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+
+    def _header(self, frame: _Recorded) -> bytes:
+        return FrameHeader(self.session_name, frame.number, frame.time_ns, frame.format).encode()
+
+    def _answer_state(self, query: Any) -> None:
+        """Answer a request for the state; Zenoh calls this in its thread."""
+        received_ns = self._clock.now_ns()
+        with query:
+            request = StateRequest.decode(query.payload.to_bytes()) if query.payload is not None else None
+            if request is None:
+                return
+            self._note_centre(request, received_ns)
+            state = NodeState(
+                self._version,
+                self.session_name,
+                received_ns,
+                self._clock.now_ns(),
+                self._count,
+                self._has_ended,
+            )
+            query.reply(state_key(self._camera), state.encode(), express=True)
+
+    def _note_centre(self, request: StateRequest, now_ns: int) -> None:
+        if self._asked_ns is None:
+            self._say(f"the centre {self._network} receives the frames of camera {self._camera}")
+        self._asked_ns = now_ns
+        if request.session == self.session_name:
+            self._received = request.received
+        if request.version != self._version and not self._is_refused:
+            self._is_refused = True
+            self._say(
+                f"the centre {self._network} has ipsys {request.version}, but this machine has ipsys "
+                f"{self._version}; install one version on both"
+            )
+
+    def _enqueue_request(self, query: Any) -> None:
+        try:
+            self._requests.put_nowait(query)
+        except Full:
+            query.drop()
+
+    def _answer_all(self) -> None:
+        """Answer requests for missing frames, one after the other."""
+        while not self._stopped.is_set():
+            try:
+                query = self._requests.get(timeout=_TURN_S)
+            except Empty:
+                continue
+            with query:
+                request = FrameRequest.decode(query.payload.to_bytes()) if query.payload is not None else None
+                if request is not None and request.session == self.session_name:
+                    self._answer_frames(query, request)
+
+    def _answer_frames(self, query: Any, request: FrameRequest) -> None:
+        for number in range(request.first, min(request.end, request.first + _MOST_FRAMES)):
+            if number >= self._count or self._stopped.is_set():
+                return
+            frame = self._find(number) or _Recorded(number, 0, "jpeg", b"")
+            query.reply(missing_key(self._camera), frame.data, attachment=self._header(frame))
+
+    def _find(self, number: int) -> _Recorded | None:
+        """Return a recorded frame, from memory or from the log; None if the log does not hold it."""
+        with self._changed:
+            frame = self._recent.get(number)
+        if frame is not None:
+            return frame
+        try:
+            payload = None if self._channel is None else self._channel.read(number)
+        except (IpsysError, OSError):
+            return None
+        return None if payload is None else _recorded(number, payload)
+
+
+def _recorded(number: int, payload: Any) -> _Recorded:
+    if isinstance(payload, Markers):
+        return _Recorded(number, payload.timestamp, MARKERS_FORMAT, encode(payload))
+    return _Recorded(number, payload.timestamp, payload.format, payload.data)

@@ -1,0 +1,242 @@
+"""Frames of nodes over a session of Zenoh: bytes, times, gaps, certificates and refusals."""
+
+from __future__ import annotations
+
+import json
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from ipsys_log.capture.frames import Clock, SourceError
+from ipsys_log.capture.nodes import node as node_module
+from ipsys_log.capture.nodes.centre import Centre
+from ipsys_log.capture.nodes.network import NodeNetwork, read_network
+from ipsys_log.capture.nodes.wire import FrameHeader, frames_key
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import RigCamera, RigNodes
+from tests.capture.nodes.lab_of_nodes import (
+    Received,
+    ShiftedClock,
+    free_port,
+    make_certificates,
+    receiving,
+    sending,
+)
+from tests.capture.nodes.tcp_relay import Relay
+
+HOUR_NS = 3600 * 1_000_000_000
+
+
+def cameras(*names: str) -> list[RigCamera]:
+    return [RigCamera(name, source=f"zenoh:{name}") for name in names or ("red",)]
+
+
+def local() -> NodeNetwork:
+    return NodeNetwork("127.0.0.1", free_port())
+
+
+@pytest.mark.slow
+def test_frames_arrive_unchanged_with_the_times_of_the_centre(tmp_path: Path) -> None:
+    """The clock of the node is an hour ahead of that of the centre."""
+    network, clock = local(), Clock()
+    with (
+        sending(tmp_path, network, clock=ShiftedClock(clock, HOUR_NS)) as feed,
+        Centre(cameras(), network, "0.1.0") as centre,
+    ):
+        feed.record(5)  # before the recording of the centre
+        with receiving(centre, clock=clock) as received:
+            made = feed.record(20)
+            received.wait_for_data(made)
+            assert sorted(frame.data for frame in received.frames) == sorted(made)
+            for estimate in received.estimates:
+                assert abs(estimate.offset_ns + HOUR_NS) <= estimate.bound_ns + 1
+            for frame in received.frames:
+                assert frame.time_ns is not None
+                # The bound above is the exact test; here, no time is wrong by the offset.
+                assert abs(feed.times_ns[frame.data] - HOUR_NS - frame.time_ns) < HOUR_NS / 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closes", [True, False], ids=["connection ends", "silence"])
+def test_frames_of_a_cut_network_arrive_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closes: bool
+) -> None:
+    """The frames come from the log of the node: its memory holds none."""
+    monkeypatch.setattr(node_module, "_MOST_RECENT_BYTES", 0)
+    network = local()
+    with (
+        Relay(network.port, jitter_s=0.002) as relay,
+        sending(tmp_path, NodeNetwork("127.0.0.1", relay.port)) as feed,
+        Centre(cameras(), network, "0.1.0") as centre,
+        receiving(centre) as received,
+    ):
+        made = feed.record(10)
+        received.wait_for_data(made)
+        relay.cut(closes)
+        received.wait_for(lambda now: now.errors)  # the node does not answer
+        assert "camera red: its node does not answer" in str(received.errors[0])
+        made += feed.record(60)
+        relay.mend()
+        made += feed.record(5)
+        received.wait_for_data(made)
+        assert sorted(frame.data for frame in received.frames) == sorted(made)
+        received.wait_for(lambda now: now.kinds()[-1:] == ["node_gap_filled"])
+        assert set(received.kinds()) == {"node_gap", "node_gap_filled"}
+        assert feed.node.finish(has_ended=True) == 0
+
+
+@pytest.mark.slow
+def test_node_that_starts_again_sends_its_new_session(tmp_path: Path) -> None:
+    network = local()
+    with Centre(cameras(), network, "0.1.0") as centre, ExitStack() as resources:
+        with sending(tmp_path, network) as feed:
+            received = resources.enter_context(receiving(centre))
+            made = feed.record(3)
+            received.wait_for_data(made)
+        with sending(tmp_path, network, clock=ShiftedClock(Clock(), -HOUR_NS)) as feed:
+            again = feed.record(4)
+            received.wait_for(lambda now: len(now.frames) == 7)
+            assert sorted(frame.data for frame in received.frames[:3]) == made
+            assert sorted(frame.data for frame in received.frames[3:]) == sorted(again)
+            assert "node_restarted" in received.kinds()
+            for frame in received.frames[3:]:
+                assert frame.time_ns is not None
+                assert abs(feed.times_ns[frame.data] + HOUR_NS - frame.time_ns) < HOUR_NS / 60
+
+
+@pytest.mark.slow
+def test_certificates_limit_each_node_to_its_own_camera(tmp_path: Path) -> None:
+    folder = make_certificates(tmp_path / "lab", "127.0.0.1", "red", "white")
+    network = NodeNetwork("127.0.0.1", free_port(), folder)
+    with (
+        Centre(cameras("red", "white"), network, "0.1.0") as centre,
+        sending(tmp_path, network, "red") as red,
+        sending(tmp_path, network, "white") as white,
+        receiving(centre, "red") as from_red,
+        receiving(centre, "white") as from_white,
+    ):
+        made_red, made_white = red.record(2), white.record(2)
+        from_white.wait_for_data(made_white)
+        from_red.wait_for_data(made_red)
+        with zenoh.open(foreign_session(network, "white")) as foreign:
+
+            def is_through(now: Received) -> bool:
+                for name, session, data in (
+                    ("red", red.node.session_name, b"false"),
+                    ("white", white.node.session_name, b"own"),
+                ):
+                    header = FrameHeader(session, 2, white.clock.now_ns(), "jpeg")
+                    foreign.put(frames_key(name), data, attachment=header.encode())
+                return b"own" in {frame.data for frame in now.frames}
+
+            from_white.wait_for(is_through)
+            later = red.record(3)
+            from_red.wait_for_data(later)
+            assert sorted(frame.data for frame in from_red.frames) == sorted(made_red + later)
+        # Without a certificate of the lab, no session begins.
+        assert refused(network)
+
+
+def foreign_session(network: NodeNetwork, name: str | None) -> zenoh.Config:
+    """Return a configuration without rules of its own, with the certificate of a name, or with none."""
+    config = zenoh.Config()
+    folder = network.certificates
+    tls: dict[str, Any] = {"root_ca_certificate": f"{folder}/authority.pem"}
+    if name is not None:
+        tls |= {"enable_mtls": True, "connect_private_key": f"{folder}/{name}.key"}
+        tls |= {"connect_certificate": f"{folder}/{name}.pem"}
+    for key, value in {
+        "mode": "peer",
+        "listen/endpoints": [],
+        "connect/endpoints": [network.endpoint],
+        "connect/timeout_ms": 2000,
+        "connect/exit_on_failure": True,
+        "scouting/gossip/enabled": False,
+        "scouting/multicast/enabled": False,
+        "transport/link/tls": tls,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def refused(network: NodeNetwork) -> bool:
+    try:
+        zenoh.open(foreign_session(network, None)).close()  # type: ignore[no-untyped-call]
+    except zenoh.ZError:
+        return True
+    return False
+
+
+@pytest.mark.slow
+def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path) -> None:
+    network = local()
+    with (
+        Centre(cameras(), network, "0.1.0") as centre,
+        sending(tmp_path, network, version="0.2.0"),
+        pytest.raises(SourceError, match=r"has ipsys 0\.2\.0, but this machine has ipsys 0\.1\.0"),
+        centre.open(cameras()[0], Clock(), lambda text: None),
+    ):
+        pass
+    network = local()
+    with (
+        Centre(cameras(), network, "0.1.0") as centre,
+        sending(tmp_path, network),
+        sending(tmp_path, network),
+        receiving(centre) as received,
+    ):
+        received.wait_for(lambda now: now.errors)
+        assert "two nodes send as camera red" in str(received.errors[0])
+
+
+@pytest.mark.slow
+def test_centre_without_a_node_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.capture.nodes.centre._FIRST_ANSWER_S", 0.5)
+    with (
+        Centre(cameras(), local(), "0.1.0") as centre,
+        pytest.raises(
+            SourceError, match=r"no node red answers at 127\.0\.0\.1:\d+; start it on its host: ipsys"
+        ),
+        centre.open(cameras()[0], Clock(), lambda text: None),
+    ):
+        pass
+
+
+def test_port_in_use_and_foreign_address_are_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(IpsysError, match=rf"\[nodes\] centre 127.0.0.1:{port}: port {port} is in use"):
+            Centre(cameras(), NodeNetwork("127.0.0.1", port), "0.1.0").__enter__()
+    text = r"\[nodes\] centre 192\.0\.2\.7:7449: is another machine, so nodes and centre need certificates"
+    with pytest.raises(IpsysError, match=text):
+        read_network(RigNodes("192.0.2.7:7449"), Path())
+    with pytest.raises(IpsysError, match="--centre 7449: is not an address; write HOST:PORT"):
+        read_network(None, Path(), "7449")
+    assert read_network(RigNodes("[::1]:7449"), Path()).endpoint == "tcp/[::1]:7449"
+    assert read_network(RigNodes("10.0.0.1:7449", "keys"), Path("lab")).certificates == Path("lab/keys")
+
+
+def test_wrong_certificates_are_named(tmp_path: Path) -> None:
+    folder = make_certificates(tmp_path / "lab", "127.0.0.1", "red")
+    other = make_certificates(tmp_path / "other", "127.0.0.1", "red")
+
+    def refusal(name: str) -> str:
+        with pytest.raises(IpsysError) as error:
+            NodeNetwork("127.0.0.1", 1, folder).files_of(name)
+        assert "\n" not in str(error.value)
+        return str(error.value).replace(f"{folder}/", "")
+
+    assert NodeNetwork("127.0.0.1", 1, folder).files_of("red") is not None
+    assert refusal("white") == "white.pem: does not exist; docs/nodes.md shows how to make it"
+    for suffix in ("pem", "key"):
+        (folder / f"white.{suffix}").write_bytes((folder / f"red.{suffix}").read_bytes())
+    assert "white.pem: is the certificate of 'red', not of 'white'" in refusal("white")
+    (folder / "white.key").write_bytes((other / "red.key").read_bytes())
+    assert "white.pem: does not fit white.key" in refusal("white")
+    (folder / "white.pem").write_bytes((other / "red.pem").read_bytes())
+    assert "white.pem: is not accepted by authority.pem" in refusal("white")
+    (folder / "white.pem").write_bytes(b"garbage")
+    assert "a file is damaged" in refusal("white")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
+import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from ipsys_log.errors import IpsysError
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-__all__ = ["Workers", "open_workers"]
+__all__ = ["Workers", "dask_setup", "open_workers"]
 
 _LOOPBACK = "127.0.0.1"
 _CONNECT_TIMEOUT_S = 15.0
@@ -33,6 +34,7 @@ _CONFIG: Mapping[str, Any] = {
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
+    "distributed.worker.preload": [__name__],  # calls dask_setup()
 }
 
 
@@ -108,6 +110,11 @@ def _local_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
         Client(cluster) as client,
     ):
         yield Workers(client, cluster.scheduler_address, client.dashboard_link, count)
+
+
+def dask_setup(_worker: object) -> None:
+    """Prepare a worker process of this machine: Ctrl-C is for the driver, which ends the workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _parse_limit(text: str | None) -> int | None:

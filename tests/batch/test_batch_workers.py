@@ -113,6 +113,24 @@ def test_killed_workers_cost_only_the_log_that_ends_them(tmp_path: Path, replaye
         assert log.read_bytes() == expected, log.name
 
 
+def test_interrupt_ends_all_workers_and_keeps_whole_logs(tmp_path: Path) -> None:
+    """Send Ctrl-C to all processes of the batch, as a terminal does."""
+    logs = copies(tmp_path, *(f"{number}.mcap" for number in range(8)))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ipsys_log", "batch", "replay", *map(str, logs), "--workers", "2"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("dashboard: ")
+    os.killpg(process.pid, signal.SIGINT)
+    errors = process.communicate(timeout=PATIENCE_S)[1]
+    assert process.returncode == 128 + signal.SIGINT
+    assert errors == "ipsys: interrupted; complete results are kept; nothing else is changed\n"
+    assert all(result.state != BROKEN for result in api.check(*logs))
+
+
 def test_full_disk_on_one_worker_leaves_its_log_whole(tmp_path: Path, replayed: bytes) -> None:
     with small_disk(tmp_path / "small", 1) as small:
         (full,) = copies(small, "full.mcap")

@@ -24,6 +24,7 @@ from ipsys_log.runs.output import append_messages
 from tests.conftest import ROOT, Ipsys
 
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
+SMALL_LAB = ROOT / "sample_logs" / "small_lab.mcap"
 PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
 
 
@@ -45,17 +46,22 @@ def rows_of(path: Path) -> dict[str, dict[str, Any]]:
 
 def test_row_has_the_contents_of_its_log(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
     target = tmp_path / "catalogue.parquet"
+    (folder / "images.mcap").symlink_to(SMALL_LAB)
     update = update_catalogue(folder, target)
-    assert (update.logs, update.read, set(update.errors)) == (3, 3, {"broken.mcap"})
-    row = rows_of(target)["2026/golden.mcap"]
-    info = json.loads(ipsys("info", GOLDEN, "--json").out)
+    assert (update.logs, update.read, set(update.errors)) == (4, 4, {"broken.mcap"})
+    row = rows_of(target)["images.mcap"]
+    info = json.loads(ipsys("info", SMALL_LAB, "--json").out)
     assert row["duration_s"] == info["duration_s"]
     assert row["start_utc"].isoformat(" ").startswith(info["start"])
-    cameras = {camera["camera"]: camera for camera in row["cameras"]}
-    for name, camera in info["cameras"].items():
+    assert [camera["camera"] for camera in row["cameras"]] == sorted(info["cameras"])
+    for found in row["cameras"]:
+        camera = info["cameras"][found["camera"]]
         channel = info["channels"][camera["images"]]
-        found = [cameras[name][key] for key in ("images", "gaps", "calibrated")]
-        assert found == [channel["messages"], channel["gaps"], camera["calibration"] is not None]
+        assert found["images"] == channel["messages"]
+        assert found["calibrated"] == (camera["calibration"] is not None)
+        for key in ("rate_hz", "gaps", "longest_gap_s"):
+            assert found[key] == channel[key], key
+    row = rows_of(target)["2026/golden.mcap"]
     states = [
         (one["run"], one["stage"], one["state"]) for one in json.loads(ipsys("runs", GOLDEN, "--json").out)
     ]

@@ -9,7 +9,7 @@ from typing import Any
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.log.byte_source import LogBytes, open_for_reading
+from ipsys_log.log.byte_source import FileBytes, open_for_reading
 from ipsys_log.log.chunks import unpack
 from ipsys_log.log.codec import decode
 from ipsys_log.log.records import (
@@ -38,7 +38,7 @@ class GrowingChannel:
 
     def __init__(self, path: Path, topic: str) -> None:
         self._path, self._topic = path, topic
-        self._view: LogBytes | None = None
+        self._view: FileBytes | None = None
         self._next = len(MAGIC)
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, str] = {}
@@ -75,9 +75,9 @@ class GrowingChannel:
         length = HEADER.unpack(view.read(start, HEADER.size))[1]
         return decode(schema, view.read(start + MESSAGE.size, HEADER.size + length - MESSAGE.size))
 
-    def _open(self) -> LogBytes:
+    def _open(self) -> FileBytes:
         if self._view is None:
-            self._view = LogBytes(self._path, open_for_reading(self._path), 0, 0)
+            self._view = FileBytes(self._path, open_for_reading(self._path), 0, 0)
         return self._view
 
     def _extend(self) -> None:
@@ -92,7 +92,7 @@ class GrowingChannel:
             self._add(view, record)
             self._next += record.length
 
-    def _add(self, view: LogBytes, record: RecordAt) -> None:
+    def _add(self, view: FileBytes, record: RecordAt) -> None:
         if record.opcode == Opcode.CHUNK:
             self._chunk = record.offset
         elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX):

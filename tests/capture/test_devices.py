@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.capture import devices
 from ipsys_log.capture.devices import check_devices, check_sources, open_source
-from ipsys_log.capture.frames import Clock, SourceError
+from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
 
@@ -80,7 +80,7 @@ def test_decoded_images_are_encoded_once_without_stamps(attached: list[AttachedC
     (device,) = attached
     assert device.released
     for number, frame in enumerate(came):
-        assert frame is not None
+        assert isinstance(frame, Frame)
         assert (frame.format, frame.time_ns) == ("jpeg", None)
         decoded = simplejpeg.decode_jpeg(frame.data, colorspace="BGR")
         assert np.abs(decoded.astype(int) - (20 * number, 100, 200)).max() <= 3

@@ -227,7 +227,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
     day("check", "s.mcap")
     day("catalogue", ".", "-o", "catalogue.parquet")
-    # These have tests of their own: a page, public data, weeks of logs, programs of robots, workers, and nodes.
+    # These have tests of their own: a page, public data, weeks of logs, robots, workers, and nodes.
     day.commands |= {"setup", "import", "drift", "drive", "batch", "node"}
     assert day.commands == {name for names in panels().values() for name in names}
 

@@ -39,8 +39,8 @@ class PlayedLog:
         """Update the state of a camera by a message: its frames, its delay, and its losses."""
         payload = message.payload
         if isinstance(payload, NewSession):
-            for known in self.states.values():
-                known.up, known.delay_s = True, None
+            for begun in self.states.values():
+                begun.up, begun.delay_s = True, None
         name = payload.camera if isinstance(payload, (Event, Latency)) else message.camera
         state = self.states.get(str(name))
         if state is None:

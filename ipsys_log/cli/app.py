@@ -57,8 +57,8 @@ _PLACED: dict[str, tuple[str, ...]] = {
     ),
     "Many logs": ("batch", "catalogue"),
     "Publish a dataset": ("pack", "score"),
+    "Cameras on other hosts": ("node",),
     _STAGES: (),
-    "Cameras of other hosts": ("node",),
     "Without cameras": ("simulate", "drive", "import"),
 }
 

@@ -149,7 +149,7 @@ ENTRIES: tuple[StageEntry, ...] = (
 def load_stage(name: str) -> Stage:
     """Load the row of one stage by its name, without those of the other stages."""
     entry = next(entry for entry in ENTRIES if entry.name == name)
-    stage: Stage = import_module(f"{__name__}.{entry.module}").STAGE
+    stage: Stage = import_module(f"ipsys_log.stages.{entry.module}").STAGE
     return stage
 
 

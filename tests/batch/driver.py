@@ -1,0 +1,43 @@
+"""Program for the tests of batches: run a work of ``tests.batch.works`` on logs, with local or other workers.
+
+It is a separate process, so that no thread or socket of Dask stays in the process of the tests. Its argument
+is JSON; it prints the results as JSON, or the error.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from ipsys_log.batch.execution import run_batch
+from ipsys_log.batch.settings import WorkerSettings
+from ipsys_log.batch.tasks import BatchTask
+from ipsys_log.batch.workers import open_workers
+from ipsys_log.errors import IpsysError
+from tests.batch.works import PATIENCE_S, replay_and_note
+
+
+def main(text: str) -> None:
+    request = json.loads(text)
+    logs = [Path(log) for log in request["logs"]]
+    settings = WorkerSettings(
+        **{
+            name: Path(value) if name.startswith("tls") else value
+            for name, value in request["workers"].items()
+        }
+    )
+    try:
+        with open_workers(settings, len(logs)) as workers:
+            workers.client.wait_for_workers(1, timeout=PATIENCE_S)
+            task = BatchTask(replay_and_note, {"notes": Path(request["notes"])})
+            results = [asdict(result) for result in run_batch(workers, task, logs)]
+    except IpsysError as error:
+        sys.stdout.write(json.dumps({"error": str(error)}))
+        return
+    sys.stdout.write(json.dumps({"results": results}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

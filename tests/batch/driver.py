@@ -10,6 +10,7 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ipsys_log.batch.execution import run_batch
 from ipsys_log.batch.settings import WorkerSettings
@@ -22,12 +23,10 @@ from tests.batch.works import PATIENCE_S, replay_and_note
 def main(text: str) -> None:
     request = json.loads(text)
     logs = [Path(log) for log in request["logs"]]
-    settings = WorkerSettings(
-        **{
-            name: Path(value) if name.startswith("tls") else value
-            for name, value in request["workers"].items()
-        }
-    )
+    given: dict[str, Any] = {
+        name: Path(value) if name.startswith("tls") else value for name, value in request["workers"].items()
+    }
+    settings = WorkerSettings(**given)
     try:
         with open_workers(settings, len(logs)) as workers:
             workers.client.wait_for_workers(1, timeout=PATIENCE_S)

@@ -46,8 +46,8 @@ _HTML = (
 )
 _HELP = (
     "Write an HTML page on a session: its accuracy, its recording and its runs.\n\n"
-    "The page needs no network. Without calibration points, it has no accuracy. For a log of ipsys drive, it has "
-    f"the errors of the robots, and figure 12 of the paper.{MORE}"
+    "The page needs no network. Without calibration points, it has no accuracy. For a log of ipsys drive, "
+    f"it has the errors of the robots, and figure 12 of the paper.{MORE}"
 )
 
 

@@ -43,7 +43,7 @@ class GrowingChannel:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, str] = {}
         self._chunk = 0
-        # For each message: the offset of its chunk in the file, its own in the chunk, and its schema.
+        # For each message, the offset of its chunk in the file, its own in the chunk, and its schema.
         self._places: list[tuple[int, int, str]] = []
 
     def close(self) -> None:

@@ -148,8 +148,9 @@ def play(source: str, name: str = "red", clock: Clock | None = None) -> list[tup
     """Return the frames and their delay after their stamps."""
     clock = clock or Clock()
     with open_source(RigCamera(name, source=source), clock, lambda _: None) as frames:
-        came = (frame for frame in frames if isinstance(frame, Frame))
-        return [(clock.now_ns() - (frame.time_ns or 0), frame) for frame in came]
+        return [
+            (clock.now_ns() - (frame.time_ns or 0), frame) for frame in frames if isinstance(frame, Frame)
+        ]
 
 
 class SleptClock(Clock):

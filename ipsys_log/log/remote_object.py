@@ -6,6 +6,7 @@ by a look at size and time after the request. A request that fails for a reason 
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ _FINAL = (
     ValueError,
 )
 _NO_CREDENTIALS = "NoCredentialsError"  # of botocore, which is imported only for its URLs
+_FLAT = ("s3", "s3a", "gs", "gcs")  # stores without folders, whose file systems list by a prefix
 _BUGS = (TypeError, AttributeError, NameError, AssertionError)
 # The fields of an entry of fsspec that tell a version; each file system has some of them.
 _VERSION_FIELDS = (
@@ -121,10 +123,27 @@ def list_objects(pattern: LogUrl) -> list[LogUrl]:
         Nothing matches, or the store cannot be listed.
     """
     filesystem, path = _filesystem(pattern)
-    matches = _repeat(pattern, lambda: filesystem.glob(path, detail=False))
+    find = _find_flat if pattern.scheme in _FLAT else _find_by_folder
+    matches = _repeat(pattern, lambda: find(filesystem, path))
     if not matches:
         raise LogError(f"{pattern}: no object matches; check the pattern and the permission to list")
     return [LogUrl(pattern.url, str(match)) for match in sorted(matches)]
+
+
+def _find_by_folder(filesystem: Any, path: str) -> list[str]:
+    return list(filesystem.glob(path, detail=False))
+
+
+def _find_flat(filesystem: Any, path: str) -> list[str]:
+    """List all objects that begin as the pattern does, page by page, and select those that match.
+
+    A glob of fsspec would list each folder of such a store, with three requests for each of them.
+    """
+    from fsspec.utils import glob_translate
+
+    folder, _, start = re.split(r"[*?\[]", path, maxsplit=1)[0].rpartition("/")
+    matches = re.compile(glob_translate(path)).fullmatch
+    return [str(name) for name in filesystem.find(folder, prefix=start) if matches(str(name))]
 
 
 def _filesystem(url: LogUrl) -> tuple[Any, str]:

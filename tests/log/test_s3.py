@@ -90,6 +90,8 @@ def test_pattern_matches_more_objects_than_one_page_has(bucket: Any, ipsys: Ipsy
     (store,) = get_backend("s3")["123456789012"].values()
     for key in (*keys, "2027-0001/lab.mcap"):  # without a request for each
         store.put_object("logs", key, b"")
+    put(bucket, "2026-0001/other.mcap", b"")
+    put(bucket, "2026-0001/deep/lab.mcap", b"")
     logs = find_logs(["s3://logs/2026-*/lab.mcap"])
     assert [str(log) for log in logs] == [f"s3://logs/{key}" for key in keys]
     done = ipsys("du", "s3://logs/2028-*/lab.mcap")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message
+from ipsys_log.messages import Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.messages.resets import Resets
 from ipsys_log.runs.execute import compute_messages
@@ -99,8 +99,8 @@ def part(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _task(session: Session, **options: str) -> Task:
-    task = plan_stage(writer_of(MARKERS), session, {"reset_s": "1", **options}, {})
+def _task(session: Session, rig: Rig | None = None, **options: str) -> Task:
+    task = plan_stage(writer_of(MARKERS), session, {"reset_s": "1", **options}, {}, rig)
     assert isinstance(task, Task)
     return task
 
@@ -112,7 +112,9 @@ def _rows(messages: Iterator[Message]) -> list[Row]:
 @pytest.mark.parametrize("corners", ["edges", "stock"])
 def test_pieces_in_any_order_give_the_bytes_of_one_process(corners: str, part: Path) -> None:
     with Session([part]) as session:
-        task = _task(session, corners=corners)
+        # Markers that are not in the rig give events, each of them once for all pieces.
+        (rig,) = session.payloads(["/rig"])
+        task = _task(session, replace(rig, markers=(RigMarker(77),)), corners=corners)
         alone = _rows(compute_messages(task, session, "edges", lambda *_: None))
         plan = plan_pieces(task, session)
         assert plan is not None
@@ -123,6 +125,7 @@ def test_pieces_in_any_order_give_the_bytes_of_one_process(corners: str, part: P
     sent = pickle.loads(pickle.dumps((plan.run, plan.pieces[::-1])))
     results = [pickle.loads(pickle.dumps(compute_piece_of_logs(sent[0], piece))) for piece in sent[1]]
     assert _rows(merge_pieces(wired, plan, results[::-1])) == alone
+    assert any(topic.endswith("/events") for topic, *_ in alone)
 
 
 def test_piece_does_not_depend_on_the_frames_before_it(part: Path, tmp_path: Path) -> None:

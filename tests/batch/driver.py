@@ -23,10 +23,14 @@ from tests.batch.works import PATIENCE_S, replay_and_note
 def main(text: str) -> None:
     request = json.loads(text)
     logs = [Path(log) for log in request["logs"]]
-    given: dict[str, Any] = {
-        name: Path(value) if name.startswith("tls") else value for name, value in request["workers"].items()
-    }
-    settings = WorkerSettings(**given)
+    given: dict[str, Any] = request["workers"]
+    settings = WorkerSettings(
+        scheduler=given.get("scheduler"),
+        workers=given.get("workers"),
+        tls_ca=_path(given.get("tls_ca")),
+        tls_cert=_path(given.get("tls_cert")),
+        tls_key=_path(given.get("tls_key")),
+    )
     try:
         with open_workers(settings, len(logs)) as workers:
             workers.client.wait_for_workers(1, timeout=PATIENCE_S)
@@ -36,6 +40,10 @@ def main(text: str) -> None:
         sys.stdout.write(json.dumps({"error": str(error)}))
         return
     sys.stdout.write(json.dumps({"results": results}))
+
+
+def _path(text: str | None) -> Path | None:
+    return None if text is None else Path(text)
 
 
 if __name__ == "__main__":

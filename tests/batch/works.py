@@ -10,7 +10,7 @@ from pathlib import Path
 from ipsys_log.batch.tasks import LogResult, replay_log
 
 # A generous limit: a wait ends with an event.
-PATIENCE_S = 600.0
+PATIENCE_S = 1800.0
 DEADLY = "deadly.mcap"
 HELD = "held.mcap"
 

@@ -77,8 +77,8 @@ def test_row_has_the_contents_of_its_log(folder: Path, tmp_path: Path, ipsys: Ip
             for evaluation in session.payloads(session.topics(EVALUATION, run)):
                 assert evaluation.model in row["models"]
                 for one in evaluation.cameras:
-                    named = evaluation.model, one.camera, one.scheme or "held_out", "2d"
-                    assert one.against != "tape" or means[named] == one.error_2d.mean_m
+                    errors_of = evaluation.model, one.camera, one.scheme or "held_out", "2d"
+                    assert one.against != "tape" or means[errors_of] == one.error_2d.mean_m
 
 
 def test_broken_log_is_a_row_with_its_error(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:

@@ -46,6 +46,7 @@ pair_rows = st.dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(rows=st.lists(marker_rows, min_size=1, unique_by=lambda row: row[:3]))
 def test_imported_detections_export_the_same_table(

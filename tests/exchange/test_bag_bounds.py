@@ -61,6 +61,7 @@ def write_bag(folder: Path, data: bytes, kind: str) -> Path:
 KINDS = ["BZ2", "LZ4", "message", "file"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_compressed_bag_has_the_images_of_its_topics(kind: str, tmp_path: Path, ipsys: Ipsys) -> None:
     done = ipsys("import", "ros", write_bag(tmp_path, jpeg(), kind), "-o", tmp_path / "log.mcap")
@@ -86,6 +87,7 @@ def test_bomb_in_a_bag_is_refused_with_one_line(kind: str, tmp_path: Path, ipsys
     assert not (tmp_path / "log.mcap").exists()
 
 
+@pytest.mark.slow
 def test_tables_of_a_mat_file_are_bounded_together(tmp_path: Path) -> None:
     """Each table has 16 MB of zeros in 16 kB."""
     size = (16 << 20) - 128

@@ -46,7 +46,8 @@ pair_rows = st.dictionaries(
 )
 
 
-@settings(max_examples=30)
+@pytest.mark.slow
+@settings(max_examples=10)
 @given(rows=st.lists(marker_rows, min_size=1, unique_by=lambda row: row[:3]))
 def test_imported_detections_export_the_same_table(
     tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[int, str, int, list[float], int | None]]
@@ -79,7 +80,7 @@ def test_imported_detections_export_the_same_table(
         path.unlink()
 
 
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(rows=pair_rows, world=st.lists(st.lists(lengths_m, min_size=3, max_size=3), min_size=3, max_size=3))
 def test_imported_pairs_export_the_same_table(
     tmp_path_factory: pytest.TempPathFactory,

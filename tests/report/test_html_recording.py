@@ -102,6 +102,7 @@ def test_recording_page_fits_a_screen(page: str, width: int, tmp_path: Path) -> 
     assert len(seen.images) == 3
 
 
+@pytest.mark.slow
 def test_report_command_writes_the_page(ipsys: Ipsys, recording: Path) -> None:
     done = ipsys("report", recording)
     assert done.code == 0, done.err

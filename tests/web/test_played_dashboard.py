@@ -16,6 +16,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import LATENCY, TRACKS
 from ipsys_log.player import Player
 from ipsys_log.sinks.playback import PlaybackOptions
+from ipsys_log.web.dashboard.pictures import EVERY_NS
+from ipsys_log.web.dashboard.played_log import PlayedLog
 from ipsys_log.web.dashboard.sources import dashboard_of_player
 from tests.cli.test_stream_command import started, stop
 from tests.conftest import Ipsys
@@ -92,6 +94,18 @@ def test_paused_page_has_the_pictures_of_its_instant(recorded: Path) -> None:
         assert reader.until("status", lambda data: data["playback"]["is_paused"])
         addresses = [one["picture"] for one in tiles["cameras"]]
         assert [Caller(url).ask("GET", f"/{one}")[0] for one in addresses] == [200] * len(addresses)
+        player.stop()
+
+
+def test_pictures_follow_the_rate_and_all_are_shown_in_a_pause(tmp_path: Path) -> None:
+    options = PlaybackOptions(start_paused=True)
+    with Player([write_tracks(tmp_path / "x.mcap")], options=options, has_dashboard=True) as player:
+        assert player.scene is not None
+        played = PlayedLog(player, player.scene)
+        assert played.picture_every_ns() == 0
+        player.rate = 2.0
+        player.resume()
+        assert played.picture_every_ns() == 2 * EVERY_NS
         player.stop()
 
 

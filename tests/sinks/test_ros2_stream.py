@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
+from itertools import count
 from math import pi
 from typing import Any
 
@@ -252,8 +253,14 @@ def test_second_stream_uses_the_router_that_answers() -> None:
         config.insert_json5(key, value)
     with closing(zenoh.open(config)), streaming(port) as (stream, _), listening(stream, "/tf") as listener:
         assert stream.describe() == f"ROS 2 domain 0: every node that reaches the router on port {port}"
-        stream.consume(iter([tracks(0, track("ada", 1.0))]))
-        listener.messages("/tf")
+        numbers = count()
+
+        def arrives() -> bool:
+            """Send a pose: the router tells the stream of a subscriber at any time."""
+            stream.consume(iter([tracks(next(numbers), track("ada", 1.0))]))
+            return bool(listener.samples)
+
+        wait_for(arrives)
         with pytest.raises(IpsysError, match=f"--ros2: another ipsys is on port {port} already"):
             Ros2Stream(port, 0, None, PoseSource((), lambda: 0, 1), lambda: 0, lambda *_: None, {})
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ipsys_log.calibration.lens_models import LensModel, project_points, project_with_slopes
 
@@ -187,6 +186,8 @@ def _diagonals(matrices: Array) -> Array:
 
 
 def _apply_step(fit: LensFit, lens_step: Array, pose_steps: Array) -> LensFit:
+    from scipy.spatial.transform import Rotation
+
     turns = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix()
     return LensFit(fit.intrinsics + lens_step, turns @ fit.rotations, fit.positions_m + pose_steps[:, 3:])
 

@@ -16,7 +16,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.rig.file import hide_password
+from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "ReaderContext"]

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, SourceError, report_refused_settings
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
 from ipsys_log.messages import RigCamera
-from ipsys_log.rig.file import hide_password
+from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:

@@ -65,7 +65,8 @@ def init(
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.lab_files import write_new
-    from ipsys_log.rig.file import HIDDEN, example_toml
+    from ipsys_log.passwords import HIDDEN
+    from ipsys_log.rig.file import example_toml
 
     if simulated:
         if log is not None:

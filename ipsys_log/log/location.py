@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
+from ipsys_log.passwords import hide_password
 from ipsys_log.plain_text import plain_text
-from ipsys_log.rig.file import hide_password
 
 __all__ = ["LogLocation", "LogUrl", "file_beside", "find_logs", "is_one_of", "parse_location"]
 

@@ -24,17 +24,16 @@ from ipsys_log.messages import (
     RigNodes,
     RigStream,
 )
+from ipsys_log.passwords import hide_password
 from ipsys_log.rig.checks import check_units
 
 __all__ = [
-    "HIDDEN",
     "STAMPS",
     "check_name",
     "check_rig",
     "check_rig_cameras",
     "check_robots",
     "example_toml",
-    "hide_password",
     "hide_passwords",
     "load_rig",
     "rig_toml",
@@ -55,18 +54,6 @@ _LONGEST_LINE = 120  # characters of a line that an error repeats
 
 # Meaning of the time that a driver gives to a frame: start or end of the exposure.
 STAMPS = ("start", "end")
-
-# Text that replaces a password in public texts.
-HIDDEN = "***"
-# A host with a dot and its port, and then a path or query: no user and password.
-_PORT = r"(?![^/?@:\[]*\.[^/?@:\[]*:[0-9]+(?:/[^@?]*)?(?:\?|$))"
-# A password ends at the last @, because it may contain any character. A name without a password may be a
-# token. A password may also be a part of the query.
-_PASSWORDS = (
-    re.compile(rf"(?<=://){_PORT}(?P<before>[^/?@:\[]*:).*(?=@)"),
-    re.compile(r"(?<=://)(?P<before>)[^/?@:\[]+(?=@)"),
-    re.compile(r"(?P<before>(?:(?:pas|pw|psw|token|auth|secret)[\w-]*|key)=)[^&]+", re.IGNORECASE),
-)
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _ITEMS = {
@@ -153,21 +140,6 @@ def rig_toml(rig: Rig) -> str:
         for item in getattr(rig, key):
             lines += ["", f"[[{key}]]", *toml_rows(item)]
     return "\n".join(lines) + "\n"
-
-
-def hide_password(address: str) -> str:
-    """Return an address without its password, for messages and logs.
-
-    Examples
-    --------
-    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
-    'rtsp://admin:***@10.0.0.7:554/live'
-    >>> hide_password("http://10.0.0.7:80/video?user=admin&pwd=secret")
-    'http://10.0.0.7:80/video?user=admin&pwd=***'
-    """
-    for password in _PASSWORDS:
-        address = password.sub(rf"\g<before>{HIDDEN}", address)
-    return address
 
 
 def hide_passwords(rig: Rig) -> Rig:

@@ -35,7 +35,7 @@ def test_replay_without_work_imports_no_scipy(replayed_lab: Path) -> None:
     code, modules = _command("replay", replayed_lab)
     assert code == 0
     assert "ipsys_log.pipeline" in modules
-    assert not modules & {"scipy", "sklearn", "pandas", "matplotlib", "ipsys_log.api"}
+    assert not modules & {"scipy", "sklearn", "pandas", "matplotlib"}
     assert replayed_lab.read_bytes() == before
 
 

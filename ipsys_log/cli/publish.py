@@ -126,5 +126,5 @@ def score(
         for table in score_tables(result):
             console.print()
             console.print(table)
-    if not result.as_stated:
+    if result.as_stated is False:
         raise typer.Exit(1)

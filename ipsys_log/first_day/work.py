@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ipsys_log import api, pipeline
@@ -253,7 +253,8 @@ def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         fitting = fitting_lenses(lenses, sizes_px, job.say)
         room = free_room(folder.rig_file, expected_bytes_per_s(cameras, attached.states))
-        job.say(room.describe(None))
+        # Devices that only view the page see this, too: the path of the folder is not for them.
+        job.say(replace(room, folder=Path(room.folder.name)).describe(None))
         yield OpenedLab(
             rig,
             fitting,

@@ -172,14 +172,14 @@ def _write_texts(
 ) -> list[Member]:
     """Write all files beside the logs; return all files of the pack, with manifest and checksums."""
     with Session(logs) as session:
-        rig, from_images = _newest_rig(session), bool(session.images)
+        rig, width_px = _newest_rig(session), _image_width(session)
         day = datetime.fromtimestamp(session.end_ns // NS_PER_S, UTC).date().isoformat()
         facts = readme_text(card, session, rig, scores, blurred)
     log_names = [f"{LOGS}/{log.name}" for log in logs]
     texts = {
         README: facts,
         RIG_FILE: rig_toml(rig),
-        SCORES: json_text(scores_json(scores, from_images)),
+        SCORES: json_text(scores_json(scores, width_px)),
     }
     _write(folder, texts)
     members = [describe_member(folder, name) for name in (*texts, *log_names)]
@@ -190,6 +190,12 @@ def _write_texts(
     members.append(describe_member(folder, CHECKSUMS))
     check_unique((member.name for member in members), str(folder))
     return members
+
+
+def _image_width(session: Session) -> int | None:
+    """Return the width of the narrowest images, from the intrinsics; None without images."""
+    lenses = (session.payloads([session.calibrations[camera]])[-1] for camera in session.images)
+    return min((lens.width for lens in lenses), default=None)
 
 
 def _newest_rig(session: Session) -> Rig:

@@ -68,9 +68,9 @@ class ScoreResult:
     other_versions: tuple[str, ...] = ()
 
     @property
-    def as_stated(self) -> bool:
-        """Return whether all repeated scores come out as stated."""
-        return all(comparison.as_stated for comparison in self.comparisons)
+    def as_stated(self) -> bool | None:
+        """Return whether all repeated scores come out as stated; None if none was repeated."""
+        return all(comparison.as_stated for comparison in self.comparisons) if self.comparisons else None
 
 
 def score(

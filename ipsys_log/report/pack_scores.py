@@ -177,7 +177,7 @@ def score_json(result: ScoreResult) -> dict[str, Any]:
     """Return the result of a re-scoring as plain data, in mm."""
     return {
         "title": result.title,
-        "as_stated": result.as_stated if result.comparisons else None,
+        "as_stated": result.as_stated,
         "comparisons": [
             {
                 "stated": asdict(comparison.stated),

@@ -211,7 +211,7 @@ def test_pack_with_images_detects_markers_again(replayed_log: Path, packed: Path
     for name in ("whole.zip", "half"):
         result = score(tmp_path / name)
         assert result.as_stated
-        assert {one.stated.tolerance_mm for one in result.comparisons} == {0.5}
+        assert {one.stated.tolerance_mm for one in result.comparisons} == {2.0}  # 960 px wide
 
 
 def test_images_without_markers_are_named(lab_log: Path, packed: Path, tmp_path: Path) -> None:
@@ -312,6 +312,7 @@ def test_own_model_of_python_is_ranked(packed: Path) -> None:
     assert result.as_stated
     assert {one.stated.model for one in result.comparisons} == {"rigid"}
     assert {one.model for one in result.own} == {"mine"}
+    assert ipsys_log.score(packed / "dataset", own={"mine": PolynomialRegression}).as_stated is None
 
 
 # The first cases need no run of the pipeline.

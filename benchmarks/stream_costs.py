@@ -122,8 +122,8 @@ def hand_over_rows(rounds: int, count: int) -> list[Row]:
             for way in (True, False)
         )
         ratios = tuple(a / b for a, b in zip(queued, prompt, strict=True))
-        rows.append(Row(f"to the last stream, queues / publishing thread, {title}", ratios))
-        rows.append(Row(f"to the last stream, in the publishing thread, {title}", prompt, "ms"))
+        rows.append(Row(f"queues / prompt, to the last stream, {title}", ratios))
+        rows.append(Row(f"prompt, to the last stream, {title}", prompt, "ms"))
     return rows
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import runpy
 
+import pytest
+
 from tests.conftest import ROOT
 
 _SCRIPT = runpy.run_path(str(ROOT / "scripts" / "draw-architecture"))
@@ -15,6 +17,7 @@ def test_drawing_equals_the_imports_of_the_source() -> None:
     assert drawn == _SCRIPT["TARGET"].read_text(), "run scripts/draw-architecture"
 
 
+@pytest.mark.slow
 def test_drawing_with_one_more_import_differs() -> None:
     modules = _SCRIPT["read_imports"](_SCRIPT["PACKAGE"])
     more = [("messages", {"cli"}), *modules]

@@ -185,6 +185,7 @@ def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
     assert set(apart.values()) == {"no record of the run"}
 
 
+@pytest.mark.slow
 def test_models_and_evaluations_are_computed_again(lab_log: Path, calibration: Path, tmp_path: Path) -> None:
     def apart(log: Path) -> dict[str, bool]:
         return {one.topic: one.equal for one in verify([lab_log, log], None, lambda stage, done, total: None)}

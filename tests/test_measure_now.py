@@ -187,6 +187,7 @@ def test_measured_points_survive_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: 
             assert len(inside) > 5
 
 
+@pytest.mark.slow
 def test_kill_before_the_first_point_leaves_rig_and_intrinsics(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:

@@ -197,6 +197,7 @@ def test_replay_in_place_equals_replay_into_a_new_log(ipsys: Ipsys, lab: Path, t
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, beside).values())
 
 
+@pytest.mark.slow
 def test_corrected_marker_length_makes_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab)
     rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
@@ -223,6 +224,7 @@ def test_equal_rig_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> N
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
 
 
+@pytest.mark.slow
 def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab)
     with Session([lab]) as session:

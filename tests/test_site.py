@@ -196,6 +196,7 @@ def test_reference_has_every_public_name(pages: dict[Path, SiteParser], site: Pa
     assert [name for name in ipsys_log.__all__ if f"ipsys_log.{name}" not in anchors] == []
 
 
+@pytest.mark.slow
 def test_quoted_errors_are_those_of_the_program() -> None:
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     rows = page.partition("## Error messages")[2].splitlines()

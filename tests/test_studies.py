@@ -160,6 +160,7 @@ def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path:
         )
 
 
+@pytest.mark.slow
 def test_a_wrong_side_is_found_named_and_put_right(ipsys: Ipsys, tmp_path: Path) -> None:
     def other_side(points: np.ndarray, tape: np.ndarray) -> None:
         tape[13, 1] = 2 * labs.A[1] - tape[13, 1]

@@ -28,6 +28,7 @@ def squared_errors(
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", first_fast(1, ["fisheye", "pinhole", "pinhole8"]))
 def test_few_pictures_errors_are_as_stated(name: str) -> None:
     """Seven images may agree by chance; the error of a jackknife of seven is then up to 6 sigma."""

@@ -57,6 +57,7 @@ def units(data: bytes, name: str) -> list[int]:
 
 
 # FFmpeg 5 writes no H.265 into FLV; the tests of files cover the form of MP4.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options", "container"),
     first_fast(1, [("h264", X264, "mpegts"), ("h264", X264, "flv"), ("h265", X265, "mpegts")]),
@@ -90,6 +91,7 @@ def count_pictures(name: str, frames: list[Frame]) -> int:
     return len(pictures) + len(decoder.decode(None))
 
 
+@pytest.mark.slow
 def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
     make_jpegs(tmp_path, 30)
     video = encode(tmp_path, "v.mp4", *X264)

@@ -195,3 +195,17 @@ def test_cameras_command_lists_the_bus_load(
     assert len(plain["cameras"]) == 4
     assert plain["cameras"][3]["plug"]["port"] == "2.4"
     assert len(plain["advice"]) == 1
+
+
+def test_cameras_that_fit_in_no_mode_need_another_bus() -> None:
+    """Thirty cameras do not fit at the lowest rate, and not at the smallest size."""
+    many = [demand._replace(camera=f"c{n:02}") for n, demand in enumerate(cameras(1) * 30)]
+    (line,) = advise(many)
+    assert line.endswith(": plug one camera into another bus")
+
+
+def test_camera_outside_of_usb_has_no_demand(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
+    plug_in(0, "4")
+    (found,) = find_cameras(tmp_path)
+    assert list_demands([found._replace(plug=None)], None) == []
+    assert list_demands([found._replace(modes=())], None) == []

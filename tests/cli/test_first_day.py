@@ -189,6 +189,7 @@ def test_file_name_gets_a_missing_suffix_and_a_message(
     assert not (tmp_path / "monday").exists()
 
 
+@pytest.mark.slow
 def test_live_align_names_the_kept_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("align", "--rig", rig, "--seconds", "1")

@@ -171,6 +171,7 @@ def test_command_of_an_added_stage_gets_its_parameters(whole: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_replay_command_runs_an_added_stage(log: Path) -> None:
     stages = json.loads(ipsys_with_damping("replay", log, "--json"))["stages"]
     assert [stage["stage"] for stage in stages] == [*names(None), "damp"]

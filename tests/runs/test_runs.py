@@ -122,6 +122,7 @@ def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path
     assert runs_of(ipsys, "replay", paper, high, low)["fuse"] == ("low", False)
 
 
+@pytest.mark.slow
 def test_run_contains_only_consistent_results(ipsys: Ipsys, replayed: Path, tmp_path: Path) -> None:
     renamed = runs_of(ipsys, "replay", replayed, "--rig", robots(tmp_path, replayed, "ada"))
     # Other robots change only fuse, which gets a new run ...
@@ -326,6 +327,7 @@ def test_the_truth_is_compared_only_where_it_is_known(ipsys: Ipsys, paper: Path)
         assert "truth" not in errors or errors["truth"]["3d"]["mean_cm"] < 2
 
 
+@pytest.mark.slow
 def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper, "--model", "poly")
     ipsys("replay", paper, "--model", "rigid")

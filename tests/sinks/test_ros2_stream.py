@@ -186,6 +186,7 @@ def test_node_and_publishers_are_in_the_graph() -> None:
     assert row.transform.translation.z == -0.1
 
 
+@pytest.mark.slow
 def test_stale_and_extrapolated_poses_are_withheld_and_diagnosed() -> None:
     outside = tracks(1, track("bob", 1.0, inside=False))
     with streaming() as (stream, _), listening(stream, "/tf", "/diagnostics") as listener:

@@ -1,0 +1,102 @@
+"""The map beside the cameras in a video: robots, predictions, trails and reference points at their pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ipsys_log.messages import Floor, ReferencePoint, Rig, Track, Tracks
+from ipsys_log.sinks.video.floor_map import FloorMap, MapLook, MapPart
+
+S = 1_000_000_000
+RED, BLUE = (250, 20, 20), (20, 20, 250)
+LOOK = MapLook((600, 600), 14, {"ada": RED, "bob": BLUE}, 1, S)
+PART = MapPart((0.0, 0.0), (4.0, 4.0))
+RIG = Rig(
+    "lab", "DICT_4X4_100", 0.2, reference_points=(ReferencePoint("A", 3.0, 1.0),), floor=Floor(4.0, 4.0)
+)
+ADA = Track("ada", 0, 1.0, 1.0, 0.0, 0.0)
+
+
+def colour_at(drawn: FloorMap, picture: np.ndarray, x_m: float, y_m: float) -> tuple[int, ...]:
+    """Return red, green and blue of the map at a point of the floor."""
+    x_px, y_px = np.round(drawn.to_px(np.array([[x_m, y_m]]))[0]).astype(int)
+    return tuple(picture[y_px, x_px, ::-1].tolist())
+
+
+def is_red(colour: tuple[int, ...]) -> bool:
+    return colour[0] > colour[2] + 60
+
+
+@pytest.fixture
+def floor_map() -> FloorMap:
+    return FloorMap(RIG, PART, LOOK)
+
+
+def test_robot_has_a_disc_and_an_arrow_ahead(floor_map: FloorMap) -> None:
+    floor_map.add(Tracks(S, (ADA,)), S)
+    picture = floor_map.draw(S)
+    assert colour_at(floor_map, picture, 1.0, 1.0) == RED
+    assert is_red(colour_at(floor_map, picture, 1.12, 1.0))
+    assert not is_red(colour_at(floor_map, picture, 0.8, 1.0))
+
+
+def test_robot_without_heading_has_no_arrow(floor_map: FloorMap) -> None:
+    floor_map.add(Tracks(S, (replace(ADA, heading_rad=None),)), S)
+    picture = floor_map.draw(S)
+    assert colour_at(floor_map, picture, 1.0, 1.0) == RED
+    assert not is_red(colour_at(floor_map, picture, 1.2, 1.0))
+
+
+def test_prediction_is_a_ring_without_a_trail(floor_map: FloorMap) -> None:
+    for step in range(3):
+        at = replace(ADA, x_m=1.0 + step, heading_rad=None, coasting_ns=S // 10)
+        floor_map.add(Tracks((step + 1) * S // 2, (at,)), (step + 1) * S // 2)
+    picture = floor_map.draw(3 * S // 2)
+    assert not is_red(colour_at(floor_map, picture, 3.0, 1.0))
+    assert not is_red(colour_at(floor_map, picture, 1.5, 1.0))
+
+
+def test_trail_has_a_gap_where_the_robot_was_not_seen(floor_map: FloorMap) -> None:
+    """Half a second between the first two sightings, and 3 s before the last one."""
+    for time_ns, x_m in ((S, 0.5), (3 * S // 2, 1.5), (9 * S // 2, 3.5)):
+        floor_map.add(Tracks(time_ns, (replace(ADA, x_m=x_m, heading_rad=None),)), time_ns)
+    picture = floor_map.draw(9 * S // 2)
+    assert is_red(colour_at(floor_map, picture, 1.0, 1.0))
+    assert not is_red(colour_at(floor_map, picture, 2.5, 1.0))
+    assert colour_at(floor_map, picture, 3.5, 1.0) == RED
+
+
+def test_robot_disappears_when_its_pose_is_old(floor_map: FloorMap) -> None:
+    floor_map.add(Tracks(S, (ADA,)), S)
+    assert not is_red(colour_at(floor_map, floor_map.draw(3 * S), 1.0, 1.0))
+    assert np.array_equal(floor_map.draw(60 * S), FloorMap(RIG, PART, LOOK).draw(60 * S))
+
+
+def test_unknown_robots_and_damaged_poses_are_not_drawn(floor_map: FloorMap) -> None:
+    floor_map.add(Tracks(S, (replace(ADA, robot="eve"), replace(ADA, x_m=float("nan")))), S)
+    assert np.array_equal(floor_map.draw(S), FloorMap(RIG, PART, LOOK).draw(S))
+
+
+def test_reference_point_is_a_cross_at_its_place(floor_map: FloorMap) -> None:
+    picture = floor_map.draw(S)
+    assert min(colour_at(floor_map, picture, 3.0, 1.0)) > 150
+    bare = FloorMap(None, PART, LOOK)
+    assert max(colour_at(bare, bare.draw(S), 3.0, 1.03)) < 80
+
+
+def test_ellipse_has_the_semi_axes_of_its_covariance(floor_map: FloorMap) -> None:
+    """The half axes of the 95 % region are 2.45 sigma: 0.49 m along x, 0.24 m along y."""
+    floor_map.add(
+        Tracks(
+            S, (replace(ADA, x_m=2.0, y_m=2.0, heading_rad=None, covariance_m2=np.diag([0.04, 0.01, 0.01])),)
+        ),
+        S,
+    )
+    picture = floor_map.draw(S)
+    assert is_red(colour_at(floor_map, picture, 2.47, 2.0))
+    assert not is_red(colour_at(floor_map, picture, 2.53, 2.0))
+    assert is_red(colour_at(floor_map, picture, 2.0, 2.22))
+    assert not is_red(colour_at(floor_map, picture, 2.0, 2.28))

@@ -16,6 +16,7 @@ __all__ = ["WAIT_LIMIT_S", "SteppedClock", "cameras", "playing"]
 
 WAIT_LIMIT_S = 240.0
 _READING_NS = 1000
+_START_NS = 1_700_000_000 * NS_PER_S
 
 
 def cameras(*names: str) -> list[RigCamera]:
@@ -64,7 +65,8 @@ class SteppedClock(Clock):
     def __init__(self, names: Sequence[str], rate_hz: float) -> None:
         super().__init__()
         self._names, self._step_ns = tuple(names), round(NS_PER_S / rate_hz)
-        self._start_ns = self._now_ns = super().now_ns()
+        # A fixed time: detection clears its memory at absolute times.
+        self._start_ns = self._now_ns = _START_NS
         self._seen: Counter[str] = Counter()
         self._changed = threading.Condition()
 

@@ -168,11 +168,12 @@ def test_full_disk_on_one_worker_leaves_its_log_whole(tmp_path: Path, replayed: 
 def program(*arguments: object, **environment: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run a program of Dask until the end of the block."""
     process = subprocess.Popen(
-        [sys.executable, "-m", *map(str, arguments)],
+        # The metadata of a package in the working directory would come before those of PYTHONPATH.
+        [sys.executable, "-P", "-m", *map(str, arguments)],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        env={**os.environ, **environment},
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
     )
     try:
         yield process

@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.records import Schema
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, encode
-from ipsys_log.log.contents import StoredChannel
+from ipsys_log.log.contents import Schema, StoredChannel
 from ipsys_log.log.shifted_times import check_shift, shift_time, shift_times
 from ipsys_log.messages import CompressedImage
 
@@ -64,7 +63,7 @@ def test_damaged_message_is_an_error(damage: bytes) -> None:
 
 
 def test_known_messages_in_another_encoding_are_refused() -> None:
-    schema = Schema(id=1, name=IMAGE, encoding="jsonschema", data=b"{}")
+    schema = Schema(IMAGE, "jsonschema", b"{}")
     channel = StoredChannel("/cameras/red/image", schema, "json", {}, 1)
     with pytest.raises(LogError, match="because their encoding is json; merge it as the first log"):
         check_shift(channel)

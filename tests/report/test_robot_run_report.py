@@ -81,6 +81,10 @@ def cart_messages() -> Iterator[Message]:
         if received is not None:
             command = replace(command, x_m=received[0], y_m=1.0, position_time=received[1])
         yield at(COMMANDS_TOPIC, time_ns, command)
+        if step < 2:  # a camera without intrinsics, which then sends nothing more
+            small = cv2.imencode(".jpg", np.zeros((90, 160, 3), dtype=np.uint8))[1].tobytes()
+            frame = CompressedImage(time_ns, "blue", small, "jpeg")
+            yield at("/cameras/blue/image", time_ns, frame, "blue")
         grey = cv2.imencode(".jpg", np.full((480, 640, 3), 90, dtype=np.uint8))[1].tobytes()
         yield at("/cameras/red/image", time_ns, CompressedImage(time_ns, "red", grey, "jpeg"), "red")
         corners = np.array([[300, 100], [320, 100], [320, 120], [300, 120]], dtype=np.float64)

@@ -11,6 +11,7 @@ from pathlib import Path
 from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import tape_sheet_path
+from ipsys_log.first_day.outlier_points import OutlierPoint, find_outlier_points
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, TRACKS
@@ -51,14 +52,16 @@ class LogFacts:
 class FitFacts:
     """The newest evaluation of the calibration logs.
 
-    ``answer`` are the sentences of ``ipsys replay``, ``mean_cm`` the mean position error. ``stale`` is the
-    reason if the evaluation is out of date; "" if it is current.
+    ``answer`` are the sentences of ``ipsys replay``, ``mean_cm`` the mean position error. ``outliers`` are
+    the points that contradict the fit. ``stale`` is the reason if the evaluation is out of date; "" if it is
+    current.
     """
 
     run: str
     stale: str
     answer: tuple[str, ...]
     mean_cm: float | None
+    outliers: tuple[OutlierPoint, ...]
 
 
 class LabFolder:
@@ -171,14 +174,15 @@ def _read_fit(paths: Sequence[Path]) -> FitFacts | None:
             newest = stages[-1]
             run = newest.run.run
             evaluations = session.payloads(session.topics(EVALUATION, run))
+        if not evaluations:
+            return None
+        accuracies = [Accuracy(run, evaluations[-1], None)]
+        outliers = find_outlier_points(paths, accuracies)
     except IpsysError:
         return None
-    if not evaluations:
-        return None
-    accuracies = [Accuracy(run, evaluations[-1], None)]
     stale = newest.state.partition(": ")[2] if newest.out_of_date else ""
     mean_cm = answer_json(accuracies).get("answer", {}).get("mean_cm")
-    return FitFacts(run, stale, _sentences(accuracies), mean_cm)
+    return FitFacts(run, stale, _sentences(accuracies), mean_cm, outliers)
 
 
 def _sentences(accuracies: Sequence[Accuracy]) -> tuple[str, ...]:

@@ -22,7 +22,8 @@ from ipsys_log.first_day.camera_choice import (
     take_picture,
 )
 from ipsys_log.first_day.jobs import Job, Jobs
-from ipsys_log.first_day.lab_folder import LabFolder, LogFacts
+from ipsys_log.first_day.lab_folder import FitFacts, LabFolder, LogFacts
+from ipsys_log.first_day.outlier_points import exclude_outlier
 from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
 from ipsys_log.rig.file import load_rig
@@ -108,7 +109,8 @@ class SetupSession:
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
                 "logs": [[log.path.name, log.points] for log in progress.logs if log.points],
             },
-            "answer": list(progress.fit.answer) if progress.fit else [],
+            "fit": None if progress.fit is None else _describe_fit(progress.fit),
+            "tracked": [log.path.name for log in progress.logs if log.tracked],
             "faults": [log.fault for log in progress.logs if log.fault],
             "job": None if job is None else {**job.describe(), "action": self._action_of(job)},
         }
@@ -182,6 +184,17 @@ class SetupSession:
             lambda job: work.calibrate(self._folder, search, pictures, entry, job),
         )
         return []
+
+    def exclude(self, log: str, point: str) -> None:
+        """Exclude a calibration point that contradicts the fit.
+
+        Raises
+        ------
+        IpsysError
+            There is no such log or point, or a job works.
+        """
+        self._check_idle()
+        exclude_outlier(self._folder.calibration_logs(), log, point)
 
     def start(self, action: str) -> None:
         """Start the job of an action.
@@ -301,3 +314,9 @@ class SetupSession:
         if sheet is None:
             raise IpsysError("the folder has no sheet lab_tape.csv; only the simulated lab has one")
         work.measure_sheet(self._folder, sheet, job)
+
+
+def _describe_fit(fit: FitFacts) -> dict[str, Any]:
+    """Return the result of the fit: one figure, the points to measure again, and the full answer."""
+    figure = "" if fit.mean_cm is None else f"Mean position error: {fit.mean_cm:.1f} cm"
+    return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}

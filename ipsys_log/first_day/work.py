@@ -180,6 +180,7 @@ def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManage
         check_start(lab.rig, list(lab.cameras.states), lab.lenses, Request(), _LAST_STAGE)
         scene = LiveScene(lab.rig, None, lab.cameras.states, lab.cameras.save)
         with show(scene):
+            job.say("open the measuring page")
             pipeline.measure(lab.cameras, lab.settings, log, Request(), [scene, lab.monitor])
 
 
@@ -223,6 +224,7 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
         ) as streams:
             view = LiveRecording(lab, log, copy_model(request, name)[1], run, tuple(streams))
             with show(view) as sink:
+                job.say("open the dashboard")
                 sinks: list[Sink] = [sink, *streams]
                 pipeline.live(cameras, lab.settings, log, request, None, [lab.monitor], sinks=sinks)
 

@@ -83,6 +83,10 @@ def _measured(intervals: Sequence[StationaryInterval], active: Sequence[Measurem
     return [next((m.id for m in active if interval.covers(m)), None) for interval in intervals]
 
 
+# A longer list of ids is not read.
+_MOST_NAMED = 8
+
+
 def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: int | None) -> dict[str, Any]:
     """Return the present views of the cameras, and the observations of the chosen marker.
 
@@ -96,6 +100,7 @@ def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: in
     return {
         "marker": marker_id,
         "visible": visible,
+        "measured": _measured_by_camera(scene, views),
         "state": observations.state if observations else "choose" if visible else "unseen",
         "text": _invitation(visible) if observations is None else observations.text,
         "cameras": [
@@ -116,9 +121,17 @@ def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: in
     }
 
 
+def _measured_by_camera(scene: MeasuringScene, views: Sequence[CameraView]) -> dict[str, int]:
+    """Return the number of valid points that each camera has seen."""
+    active = {measurement.id for measurement in active_measurements(scene.history())}
+    return {view.camera: sum(name in active for name, _, _ in view.measured) for view in views}
+
+
 def _invitation(visible: Sequence[int]) -> str:
     if not visible:
         return "no camera sees a marker: put one on the floor, face up"
+    if len(visible) > _MOST_NAMED:
+        return f"choose the marker: {len(visible)} are visible; tap it in the image, or choose its id"
     return f"choose the marker: {', '.join(map(str, visible))} are visible"
 
 
@@ -156,9 +169,14 @@ _FILES = {
 _KEPT = 30
 
 
-def build_app(scene: MeasuringScene) -> Starlette:
-    """Return the page of a scene, without a guard; its requests are under ``/api``."""
-    questions = _Questions(scene)
+def build_app(scene: MeasuringScene, setup: str | None = None) -> Starlette:
+    """Return the page of a scene, without a guard; its requests are under ``/api``.
+
+    Parameters
+    ----------
+    setup : the address of the setup page that shows this page; None: there is none.
+    """
+    questions = _Questions(scene, setup)
     return Starlette(
         routes=[
             *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
@@ -179,12 +197,13 @@ class _Questions:
     They are asynchronous, but wait only for the body of a request. So they answer one request at a time.
     """
 
-    def __init__(self, scene: MeasuringScene) -> None:
-        self._scene = scene
+    def __init__(self, scene: MeasuringScene, setup: str | None) -> None:
+        self._scene, self._setup = scene, setup
         self._pictures: dict[tuple[str, int], bytes] = {}
 
     async def scene(self, _: Request) -> Response:
-        return JSONResponse({**scene_json(self._scene), "history": history_json(self._scene)})
+        scene = scene_json(self._scene)
+        return JSONResponse({**scene, "setup": self._setup, "history": history_json(self._scene)})
 
     async def views(self, request: Request) -> Response:
         views = self._scene.views(self._stop(request.query_params.get("stop")))

@@ -1,11 +1,13 @@
 // The view of each camera: the marker close up or, after a tap, the whole image.
 import { element, make } from "./make.js";
 
-let shown = { cameras: [] };
+let shown = { cameras: [] }, choose;
 
 // New images do not replace the tiles, because a tile may have a tap or the focus. The tiles exist before the
 // first image, so that the elements below them do not move while the user taps.
-export async function drawCameras(where, view) {
+// pick: called with the id of a tapped marker, while no marker is chosen.
+export async function drawCameras(where, view, pick) {
+  choose = pick;
   const names = view.cameras.map((camera) => camera.name).join(" ");
   if (where.dataset.names !== names) {
     where.dataset.names = names;
@@ -25,9 +27,11 @@ async function load(source) {
 
 function tile(where) {
   const made = make("button", { type: "button", title: "Switch between close-up and whole image" }, element("svg", { role: "img" }), make("span"));
-  made.addEventListener("click", () => {
+  made.addEventListener("click", ({ target }) => {
+    const id = target.closest("[data-marker]")?.dataset.marker;
+    if (choose && shown.marker === null && id !== undefined && shown.visible.includes(Number(id))) return choose(Number(id));
     where.classList.toggle("whole");
-    drawCameras(where, shown);
+    drawCameras(where, shown, choose);
   });
   return made;
 }
@@ -49,6 +53,7 @@ function fill(made, camera, view, whole) {
   const outline = (one) => element("polygon", {
     points: one.corners_px.map((corner) => corner.map((value) => value + 0.5)).join(" "),
     class: one === chosen ? "chosen" : "",
+    "data-marker": one.id,
   });
   const picture = camera.picture ? [element("image", { href: camera.picture, width, height })] : [];
   svg.replaceChildren(...picture, ...camera.markers.map(outline));

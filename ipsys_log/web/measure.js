@@ -190,13 +190,22 @@ async function look() {
   const state = view.state, number = ++looks, answer = await ask(`views?${query}`);
   if (number !== looks) return;
   view = answer;
-  const drawn = drawCameras($("cameras"), view);
+  const drawn = drawCameras($("cameras"), view, stop === null ? choose : undefined);
   $("sight").textContent = upper(view.text);
   $("sight").className = `chip ${view.state}`;
   if (stop === null) offerMarkers();
+  count();
   await drawn;
   if (state !== view.state) soon();
 }
+
+// A tap on a marker in an image chooses it.
+const choose = guarded(async (id) => {
+  if (![...$("marker").options].some((option) => option.value === String(id))) return;
+  $("marker").value = String(id);
+  await look();
+  soon();
+});
 
 function offerMarkers() {
   const chosen = $("marker").value, ids = [...new Set([...view.visible.map(String), ...(chosen ? [chosen] : [])])];
@@ -233,6 +242,13 @@ function nextOpen() {
   return stop;
 }
 
+// The number of points, and how many of them each camera has seen.
+function count() {
+  const points = history.places.filter((place) => place.counts).length;
+  const by = Object.entries(view.measured ?? {}).map(([camera, seen]) => `${camera} ${seen}`);
+  $("count").textContent = points ? `: ${points} ${points === 1 ? "point" : "points"}${Object.values(view.measured ?? {}).some(Boolean) ? ` (${by.join(", ")})` : ""}` : "";
+}
+
 function list() {
   const rows = history.places.map((place) => {
     const where = place.point_m ? `at x ${cm(place.point_m[0] * 100)}, y ${cm(place.point_m[1] * 100)} cm` : place.counts ? "" : place.reason ? `withdrawn: ${place.reason}` : "withdrawn";
@@ -248,6 +264,7 @@ function list() {
     return make("li", {}, text, undo);
   });
   $("places").replaceChildren(...(rows.length ? rows : [make("li", { className: "none" }, "Nothing yet.")]));
+  count();
 }
 
 function refresh() {
@@ -285,6 +302,10 @@ async function watch() {
 
 guarded(async () => {
   ({ history, ...lab } = await ask("scene"));
+  if (lab.setup) {
+    $("setup").href = lab.setup;
+    $("setup").hidden = false;
+  }
   $("lab").textContent = lab.model ? `${lab.lab}, model ${lab.model}` : lab.lab;
   buildFields();
   list();

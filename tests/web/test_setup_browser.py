@@ -142,6 +142,8 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: 
         visit(browser, dashboard)
         visitor.inputs += 1
         visitor.wait("document.querySelectorAll('#floor .robot').length === 3")
+        # One device operates the setup and the dashboard.
+        says(browser, "#operation", "This device operates")
         visit(browser, url + "#live")
         visitor.tap("#stop")
         visitor.wait(JOB_ENDED)
@@ -176,8 +178,15 @@ def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, folder: Pat
         visitor.wait("document.querySelector('#open-measure')")
         visit(browser, url + "measure/")
         visitor.wait("document.querySelector('#sight').innerText.includes('are visible')")
+        # A tap on a marker in an image chooses it.
+        tap = "dispatchEvent(new MouseEvent('click', {bubbles: true}))"
+        visitor.wait("document.querySelector('#cameras [data-marker]')")
+        browser.run(f"document.querySelector('#cameras [data-marker]').{tap}")
+        visitor.wait("document.querySelector('#marker').value !== ''")
+        assert browser.run("document.querySelector('#setup').href") == url + "#points"
         visit(browser, url + "#points")
-        visitor.tap("#stop")
+        says(browser, "#panel", "0 points measured in this log so far")
+        visitor.tap("#finish")
         visitor.wait(JOB_ENDED)
         # Without a point, the step is not done.
         says(browser, "#panel", "0 points measured")

@@ -33,12 +33,16 @@ _FILES = {
 _KEPT = 30
 
 
-def build_dashboard(dashboard: Dashboard) -> Starlette:
+def build_dashboard(dashboard: Dashboard, setup: str | None = None) -> Starlette:
     """Return the page of a recording, without a guard.
 
     The guard marks the requests of devices that may write. Without a guard, all requests may write.
+
+    Parameters
+    ----------
+    setup : the address of the setup page that shows this page; None: there is none.
     """
-    answers = _Answers(dashboard)
+    answers = _Answers(dashboard, setup)
     return Starlette(
         routes=[
             *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
@@ -56,12 +60,13 @@ def build_dashboard(dashboard: Dashboard) -> Starlette:
 class _Answers:
     """The handlers of the requests; all run in the thread of the server."""
 
-    def __init__(self, dashboard: Dashboard) -> None:
-        self._dashboard, self._feed = dashboard, Feed(dashboard)
+    def __init__(self, dashboard: Dashboard, setup: str | None) -> None:
+        self._dashboard, self._feed, self._setup = dashboard, Feed(dashboard), setup
         self._pictures: dict[tuple[str, int], bytes | None] = {}
 
     async def scene(self, request: Request) -> Response:
-        return JSONResponse(self._dashboard.scene(request.scope.get(MAY_WRITE, True)))
+        scene = self._dashboard.scene(request.scope.get(MAY_WRITE, True))
+        return JSONResponse({**scene, "setup": self._setup})
 
     async def live(self, _: Request) -> Response:
         events = self._feed.stream(asyncio.get_running_loop().time, asyncio.sleep)

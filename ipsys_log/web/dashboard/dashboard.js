@@ -72,6 +72,10 @@ async function begin() {
   }
   const scene = await answer.json();
   $("lab").textContent = scene.floor.lab;
+  if (scene.setup) {
+    $("setup").href = scene.setup;
+    $("setup").hidden = false;
+  }
   if (scene.played) {
     document.title = "ipsys playback";
     $("kind").textContent = $("recording-title").textContent = "Playback";

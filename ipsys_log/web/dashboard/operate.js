@@ -7,7 +7,7 @@ const NOTICE_MS = 8000;
 export class Operation {
   constructor(may) {
     this.may = may;
-    this.seat = new Seat("ipsys-operator");
+    this.seat = new Seat("ipsys");
     this.segment = null;
     $("operate-panel").hidden = !may;
     if (!may) return;

@@ -13,6 +13,7 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.session import Pages, SetupSession
@@ -74,6 +75,7 @@ class SetupApp:
     def __init__(self, folder: LabFolder) -> None:
         self._measuring, self._dashboard = _Embedded(), _Embedded()
         self._seat = OperatorSeat()
+        self._measured: LiveScene | None = None
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
@@ -90,16 +92,27 @@ class SetupApp:
 
     @contextmanager
     def _show_measuring(self, scene: LiveScene) -> Iterator[None]:
-        with self._measuring.show(build_app(scene)):
-            yield
+        self._measured = scene
+        try:
+            with self._measuring.show(build_app(scene, setup="../#points")):
+                yield
+        finally:
+            self._measured = None
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
         lab = view.lab
         dashboard = dashboard_of_recording(
-            lab.cameras, lab.settings, lab.monitor.checks, view.log, view.model, view.run, view.streams
+            lab.cameras,
+            lab.settings,
+            lab.monitor.checks,
+            view.log,
+            view.model,
+            view.run,
+            view.streams,
+            self._seat,
         )
-        with self._dashboard.show(build_dashboard(dashboard)):
+        with self._dashboard.show(build_dashboard(dashboard, setup="../#live")):
             yield dashboard
 
     async def _state(self, request: Request) -> Response:
@@ -107,7 +120,17 @@ class SetupApp:
         state = await asyncio.to_thread(self.session.describe)
         pages = {"measure": self._measuring.app is not None, "live": self._dashboard.app is not None}
         may = request.scope.get(MAY_WRITE, True)
-        return JSONResponse({**state, "pages": pages, "may_operate": may, "operator": self._seat.number})
+        scene = self._measured
+        count = None if scene is None else len(active_measurements(scene.history()))
+        return JSONResponse(
+            {
+                **state,
+                "pages": pages,
+                "measured_now": count,
+                "may_operate": may,
+                "operator": self._seat.number,
+            }
+        )
 
     async def _picture(self, request: Request) -> Response:
         data = self.session.picture(request.path_params["kind"], request.path_params["name"])
@@ -141,6 +164,7 @@ class SetupApp:
             "cameras": lambda body: session.save_cameras(_texts(body, "names")),
             "intrinsics": lambda body: session.use_intrinsics(str(body.get("camera", ""))),
             "calibrate": lambda body: session.calibrate(str(body.get("camera", "")), _texts(body, "options")),
+            "exclude": lambda body: session.exclude(str(body.get("log", "")), str(body.get("point", ""))),
             "start": lambda body: session.start(str(body.get("action", ""))),
             "stop": lambda _: session.jobs.stop(),
         }

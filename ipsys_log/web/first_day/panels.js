@@ -15,7 +15,7 @@ function report(state) {
 export function shownPart(name, state) {
   const parts = {
     rig: state.rig, cameras: state.cameras, intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
-    points: state.points, accuracy: state.answer, live: null,
+    points: [state.points, state.measured_now], accuracy: [state.fit, state.points], live: state.tracked,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
   return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
@@ -158,32 +158,72 @@ function alignment(state, act) {
   ];
 }
 
+const paragraph = (textContent) => make("p", { textContent });
+
+// A button that ends the present job in order.
+const finish = (text, state, act) => button(text, () => act(() => change("stop")), "finish", { disabled: !state.may_change });
+
+const opener = (id, page, text) => make("a", { id, className: "button main", href: `${page}/`, target: "_blank", textContent: text });
+
 function points(state, act) {
   const { sheet, logs } = state.points;
-  const parts = [make("p", { textContent: "Put a marker on the floor, measure the distances from the two reference points with a tape, and enter them on the measuring page. Repeat this over the whole floor, also at other heights." })];
+  const count = state.measured_now;
+  const parts = [
+    paragraph("Put a marker of a robot on the floor. Measure its distances from the two reference points with a tape, and type them on the measuring page. Repeat this over the whole floor, also near its edges; put the marker on a box for some points."),
+    paragraph("15 to 20 points in the view of each camera give good results."),
+  ];
   const actions = make("div", { className: "actions" });
-  if (state.pages.measure) actions.append(make("a", { id: "open-measure", className: "button main", href: "measure/", target: "_blank", textContent: "Open the measuring page" }));
+  if (state.pages.measure) actions.append(opener("open-measure", "measure", "Open the measuring page"), finish("Finish measuring", state, act));
   else actions.append(starter("Start measuring", "measure", state, act, !sheet && logs.length === 0));
-  if (sheet) actions.append(starter(`Use the sheet ${sheet}`, "sheet", state, act, logs.length === 0));
+  if (sheet && !state.pages.measure) actions.append(starter(`Use the tape measurements in ${sheet}`, "sheet", state, act, logs.length === 0));
   parts.push(actions);
+  if (count !== null) parts.push(paragraph(`${count} ${count === 1 ? "point" : "points"} measured in this log so far.`));
   if (logs.length) {
-    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, count]) =>
-      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${count} points` }))))));
+    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, number]) =>
+      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${number} points` }))))));
+    parts.push(paragraph("The fit uses all these logs. Measuring again writes a new log."));
   }
   return parts;
 }
 
+function outlier(one, several, state, act) {
+  const name = several ? `${one.point} in ${one.log}` : one.point;
+  const exclude = button("Exclude", () => act(() => change("exclude", { log: one.log, point: one.point })), `exclude-${one.log}-${one.point}`.replace(/[^\w-]/g, "_"), { disabled: !state.may_change });
+  exclude.setAttribute("aria-label", `Exclude ${name}`);
+  const text = one.text || "no simple mistake explains it";
+  return make("li", { className: "warn outlier" }, make("span", { textContent: `${name}, error ${one.error_cm.toFixed(1)} cm: ${text}.` }), exclude);
+}
+
 function accuracy(state, act, step) {
-  return [
-    make("div", { className: "actions" }, starter(state.answer.length ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
-    ...lines(state.answer.map((text, n) => [n < 2 ? "strong" : "", text])),
+  const { fit } = state;
+  const parts = [
+    paragraph("The fit computes a model from the measured points: positions in the images become positions on the floor. Then it tells the error of the positions."),
+    make("div", { className: "actions" }, starter(fit ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
   ];
+  if (!fit) return parts;
+  if (fit.figure) parts.push(make("p", { className: "figure", textContent: fit.figure }));
+  if (fit.outliers.length) {
+    const several = new Set(state.points.logs.map(([name]) => name)).size > 1;
+    parts.push(make("h3", { textContent: fit.outliers.length === 1 ? "A point contradicts the others" : `${fit.outliers.length} points contradict the others` }),
+      paragraph("Measure it again in step 5, and exclude it here. An excluded point stays in the log."),
+      make("ul", { className: "lines" }, ...fit.outliers.map((one) => outlier(one, several, state, act))));
+  }
+  parts.push(make("details", {}, make("summary", { textContent: "Details" }), ...lines(fit.answer.map((text) => ["", text]))));
+  return parts;
 }
 
 function live(state, act, step) {
-  const open = make("a", { id: "open-live", className: "button main", href: "live/", target: "_blank", textContent: "Open the dashboard" });
-  return [
-    make("p", { textContent: "The robots are tracked and recorded until you press Stop. Other devices can open the dashboard, too." }),
-    make("div", { className: "actions" }, state.pages.live ? open : starter("Start the live view", "live", state, act, step.status !== "done")),
+  const parts = [
+    paragraph("The robots are tracked and recorded. The dashboard shows them; other devices can open it, too, if ipsys setup was started with --host 0.0.0.0."),
+    make("div", { className: "actions" }, ...(state.pages.live
+      ? [opener("open-live", "live", "Open the dashboard"), finish("Finish the recording", state, act)]
+      : [starter("Start the live view", "live", state, act, step.status !== "done")])),
   ];
+  const log = state.tracked.at(-1);
+  if (log) {
+    parts.push(make("h3", { textContent: "Your positions" }),
+      make("p", {}, "As a table: ", command(`ipsys export ${log} -o positions.csv`)),
+      make("p", {}, "As a picture that moves: ", command(`ipsys view ${log}`)));
+  }
+  return parts;
 }

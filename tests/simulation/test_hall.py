@@ -69,7 +69,8 @@ def test_geometric_session_has_the_cameras_of_the_grid() -> None:
     rig = next(message.payload for message in messages if isinstance(message.payload, Rig))
     check_rig(rig, "the rig of the hall")
     assert [camera.name for camera in rig.cameras] == ["a1", "a2", "b1", "b2", "c1", "c2"]
-    assert rig.floor is not None and (rig.floor.width_m, rig.floor.depth_m) == pytest.approx((10.0, 7.5))
+    assert rig.floor is not None
+    assert (rig.floor.width_m, rig.floor.depth_m) == pytest.approx((10.0, 7.5))
     seen = {m.camera for m in messages if isinstance(m.payload, Markers) and m.payload.markers}
     assert seen == {"a1", "a2", "b1", "b2", "c1", "c2"}
 

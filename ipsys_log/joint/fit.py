@@ -84,7 +84,7 @@ def fit_jointly(
         # The wobble of a robot acts on its corners by the poses, so that these come first.
         tilts = settings.wobble_sigma_rad, settings.wobble_time_s
         problem = problem.reweighted(state, *tilts)
-        state = solve(problem, state, progress, _ROUGH).state
+        state = solve(problem, state, progress, _ROUGH, observations.in_hall).state
         problem = problem.reweighted(state, *tilts)
     if not problem.layout.floor.count or not settings.floor_sigma_spread:
         return _solve(observations, settings, problem, state, progress)

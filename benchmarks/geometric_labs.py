@@ -25,8 +25,8 @@ from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import build_models
+from ipsys_log.joint.observations import Observations
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Measurement, Message, Pair, Rig
-from ipsys_log.simulation.cameras import FLOOR_M
 from ipsys_log.simulation.corner_noise import (
     WHITE_SHARE,
     corner_covariances,
@@ -55,6 +55,7 @@ __all__ = [
     "joint_locator",
     "make_session",
     "nodes_of",
+    "observe_session",
     "shares_by_place",
     "standing_robots",
 ]
@@ -188,7 +189,7 @@ def nodes_of(lab: GeometricLab) -> list[KnownSightings]:
     def place(poses: Array, side_m: float) -> Array:
         return lab.place(poses).corners_m(side_m)
 
-    size_m, height_m, length_m = (FLOOR_M, FLOOR_M), settings.drive_height_m, settings.marker_length_m
+    size_m, height_m, length_m = settings.floor_m, settings.drive_height_m, settings.marker_length_m
     return [
         grid_nodes(camera.lens, camera.camera_from_world, place, size_m, height_m, length_m)
         for camera in lab.cameras
@@ -230,7 +231,7 @@ def held_out_points(lab: GeometricLab, count: int) -> list[KnownSightings]:
     rng = np.random.default_rng([lab.settings.lab.seed, 1])
     poses = np.column_stack(
         [
-            rng.uniform(0.3, FLOOR_M - 0.3, (count, 2)),
+            rng.uniform(0.3, np.subtract(lab.settings.lab.floor_m, 0.3), (count, 2)),
             rng.choice(lab.settings.lab.heights_m, count),
             rng.uniform(-np.pi, np.pi, count),
         ]
@@ -302,8 +303,8 @@ def _by_table(name: str) -> Callable[[Session], Locator]:
     return calibrate
 
 
-def fit_session(session: Session) -> JointFit:
-    """Return the joint calibration of a session."""
+def observe_session(session: Session) -> Observations:
+    """Return the observations of a session for the joint calibration."""
     lab, lenses = session.lab, session.lab.calibrations
     payloads = [message.payload for message in session.messages]
     markers = {
@@ -312,7 +313,12 @@ def fit_session(session: Session) -> JointFit:
     }
     measured = [one for one in payloads if isinstance(one, Measurement) and "train" in one.splits]
     nominal = list(lenses) if lab.settings.intrinsics == "nominal" else []
-    return fit_jointly(gather_observations(session.rig, lenses, markers, measured, nominal))
+    return gather_observations(session.rig, lenses, markers, measured, nominal)
+
+
+def fit_session(session: Session) -> JointFit:
+    """Return the joint calibration of a session."""
+    return fit_jointly(observe_session(session))
 
 
 def joint_locator(fit: JointFit, session: Session) -> Locator:

@@ -137,7 +137,7 @@ def _tape_pulls(fit: JointFit, pulls: Array) -> Array:
     factorisation = fit.solution.factorisation
     whitened = factorisation.forward(by_local)
     free = factorisation.free
-    return np.asarray(pulls[:, free] @ factorisation.whitened.T @ whitened)
+    return np.asarray(pulls[:, free] @ factorisation.pull(whitened))
 
 
 def _clock_errors(fit: JointFit, lab: GeometricLab) -> list[tuple[float, float]]:

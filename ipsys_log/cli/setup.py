@@ -42,6 +42,15 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
 }
 
 
+_Grid = Annotated[
+    str | None,
+    typer.Option(
+        metavar="GRID",
+        help="Columns x rows of the cameras of a hall, such as 6x4; otherwise, the lab has three cameras.",
+    ),
+]
+
+
 def add_commands(app: typer.Typer) -> None:
     app.command()(init)
     app.command("simulate", help=simulate.__doc__)(_simulate_command())
@@ -106,17 +115,20 @@ def _rig_of(log: Path) -> str:
         return rig_toml(replace(rig_with_offsets(session), stream=None))
 
 
-def simulate(output: Path, **settings: Any) -> None:
+def simulate(output: Path, cameras: str | None, **settings: Any) -> None:
     """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
 
-    The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
+    The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m. With --cameras
+    6x4, it is a hall: 24 cameras, 5 m above a floor of 20 x 15 m."""
     from ipsys_log.runs.output import write_log
+    from ipsys_log.simulation.hall import hall_settings, parse_grid
     from ipsys_log.simulation.lab import simulate
     from ipsys_log.simulation.settings import LabSettings
 
+    lab = LabSettings(**settings) if cameras is None else hall_settings(*parse_grid(cameras), **settings)
     text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
     with say_kept(lambda _: text), progress_bar(frame_steps=("simulate",)) as progress:
-        counts = write_log(output, simulate(LabSettings(**settings), progress))
+        counts = write_log(output, simulate(lab, progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
     console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")
 
@@ -124,14 +136,25 @@ def simulate(output: Path, **settings: Any) -> None:
 def _simulate_command() -> Callable[..., None]:
     """Build the command of :func:`simulate` with an option for each setting."""
     keyword = inspect.Parameter.KEYWORD_ONLY
-    parameters = [inspect.Parameter("output", keyword, annotation=NewLog)]
+    parameters = [
+        inspect.Parameter("context", keyword, annotation=typer.Context),
+        inspect.Parameter("output", keyword, annotation=NewLog),
+        inspect.Parameter("cameras", keyword, default=None, annotation=_Grid),
+    ]
     for name, (default, text) in SETTINGS.items():
         annotation = Annotated[type(default), typer.Option(help=text)]  # type: ignore[valid-type]
         parameters.append(inspect.Parameter(name, keyword, default=default, annotation=annotation))
 
-    def command(**given: Any) -> None:
-        simulate(**given)
+    def command(context: typer.Context, **given: Any) -> None:
+        # A hall has other defaults than the lab of the paper, so only options of the user count.
+        chosen = {name: given[name] for name in SETTINGS if _is_chosen(context, name)}
+        simulate(given["output"], given["cameras"], **chosen)
 
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in parameters}
     return command
+
+
+def _is_chosen(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"

@@ -15,7 +15,7 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State, make_layout
 from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
-from ipsys_log.joint.problem import Problem
+from ipsys_log.joint.problem import Problem, find_blocks
 from ipsys_log.joint.refusals import check_observations, check_spread
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 # The field of the floor reaches this far beyond the outermost place of a marker.
 _BEYOND_M = 1.0
+# The largest area of the field, in squares of its correlation length: 62 m^2 at the usual length.
+_MOST_LENGTHS = 250
 # Before the wobble of robots is known from their poses, a step need not be so exact.
 _ROUGH = 0.3
 # The same before the unevenness of the floor is known.
@@ -82,7 +84,7 @@ def fit_jointly(
         # The wobble of a robot acts on its corners by the poses, so that these come first.
         tilts = settings.wobble_sigma_rad, settings.wobble_time_s
         problem = problem.reweighted(state, *tilts)
-        state = solve(problem, state, progress, _ROUGH).state
+        state = solve(problem, state, progress, _ROUGH, observations.in_hall).state
         problem = problem.reweighted(state, *tilts)
     if not problem.layout.floor.count or not settings.floor_sigma_spread:
         return _solve(observations, settings, problem, state, progress)
@@ -155,16 +157,19 @@ def _build(
     turns = np.stack([camera_pose.camera_from_world for camera_pose in placed])
     positions_m, headings_rad = _point_starts(observations, placed)
     state = State(values, turns, positions_m, level_turns(headings_rad), knots)
-    return Problem(layout, trajectories, tuple(factors), points), state
+    blocks = find_blocks(layout, trajectories, factors) if observations.in_hall else ()
+    return Problem(layout, trajectories, tuple(factors), points, blocks), state
 
 
 def _floor(placed: list[PlacedCamera], settings: JointSettings) -> FloorField:
     points_m = np.concatenate([camera.points_m[:, :2] for camera in placed])
     points_m = points_m[np.isfinite(points_m).all(axis=1)]
     low_m, high_m = np.percentile(points_m, [1, 99], axis=0)
-    return make_floor_field(
-        low_m - _BEYOND_M, high_m + _BEYOND_M, settings.floor_sigma_m, settings.floor_length_m
-    )
+    low_m, high_m = low_m - _BEYOND_M, high_m + _BEYOND_M
+    # The number of modes must not grow with a hall: only its longer waves are estimated.
+    least_m = float(np.sqrt(np.prod(high_m - low_m) / _MOST_LENGTHS))
+    length_m = max(settings.floor_length_m, least_m)
+    return make_floor_field(low_m, high_m, settings.floor_sigma_m, length_m)
 
 
 def _point_starts(observations: Observations, placed: list[PlacedCamera]) -> tuple[Array, Array]:

@@ -88,7 +88,7 @@ def _motion(fit: JointFit, camera: int, time_s: float) -> CameraMotion:
             between[layout.modes] += rows.modes.T @ lifted
     factorisation = fit.solution.factorisation
     mixed = factorisation.forward(extra.mixed)
-    coupling = between[layout.free] - factorisation.whitened.T @ mixed
+    coupling = between[layout.free] - factorisation.pull(mixed)
     information = extra.dense - mixed.T @ mixed - coupling.T @ factorisation.solve_reduced(coupling)
     step: Array = -np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ extra.global_gradient
     return CameraMotion(

@@ -24,6 +24,8 @@ __all__ = [
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+# In a lab with so few cameras, a robot passes all of them within seconds.
+_FEW_CAMERAS = 8
 _MODELS = {
     model.distortion_model: model
     for model in (LENS_MODELS["fisheye"], LENS_MODELS["pinhole"], LENS_MODELS["pinhole8"])
@@ -143,3 +145,8 @@ class Observations:
     bodies: tuple[Body, ...]
     points: tuple[CalibrationPoint, ...]
     sightings: tuple[Sightings, ...]
+
+    @property
+    def in_hall(self) -> bool:
+        """True with so many cameras that most of them never see the same place."""
+        return len(self.cameras) > _FEW_CAMERAS

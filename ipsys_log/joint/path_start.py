@@ -32,6 +32,9 @@ _PAD_S = 0.25
 # Errors of a place and of a heading from one marker and rough camera poses.
 _PLACE_M, _HEADING_RAD = 0.01, 0.02
 _ROUNDS = 4
+# In a hall, a longer part of a path is divided. A robot passes only a few cameras in this time, and its place
+# at a cut is known from their sightings alone.
+_LONGEST_PART_S = 10.0
 # A marker this far from its height is in the hand of a person, and not on a robot.
 _FAR_M = 0.25
 
@@ -62,7 +65,8 @@ def start_paths(
     parts: list[_Places] = []
     first = 0
     for body in range(len(observations.bodies)):
-        for part in _parts(_places(observations, placed, body)):
+        longest_s = _LONGEST_PART_S if observations.in_hall else np.inf
+        for part in _parts(_places(observations, placed, body), longest_s):
             step_s = _step(part)
             start_s = float(part.times_s[0]) - _PAD_S
             count = int(np.ceil((part.times_s[-1] + _PAD_S - start_s) / step_s)) + 3
@@ -109,11 +113,12 @@ def _places(observations: Observations, placed: list[PlacedCamera], body: int) -
     return _Places(times_s[order], places, cameras[order].astype(np.intp), indices[order].astype(np.intp))
 
 
-def _parts(places: _Places) -> list[_Places]:
-    """Divide the places of a body at gaps, and leave out short parts."""
+def _parts(places: _Places, longest_s: float) -> list[_Places]:
+    """Divide the places of a body at gaps and into parts of equal duration, and leave out short parts."""
     cuts = np.flatnonzero(np.diff(places.times_s) > _GAP_S) + 1
     parts = []
-    for rows in np.split(np.arange(len(places.times_s)), cuts):
+    whole = np.split(np.arange(len(places.times_s)), cuts)
+    for rows in (part for own in whole for part in _divide(places.times_s, own, longest_s)):
         if len(rows) < _LEAST_SIGHTINGS or np.ptp(places.times_s[rows]) < _LEAST_S:
             continue
         times_s, own, cameras, indices = places
@@ -121,6 +126,15 @@ def _parts(places: _Places) -> list[_Places]:
         headings = np.unwrap(part.places[:, 2])
         parts.append(part._replace(places=np.column_stack([part.places[:, :2], headings])))
     return parts
+
+
+def _divide(times_s: Array, rows: Indices, longest_s: float) -> list[Indices]:
+    if not len(rows) or not np.isfinite(longest_s):
+        return [rows]
+    first_s, last_s = times_s[rows[0]], times_s[rows[-1]]
+    count = max(int(np.ceil((last_s - first_s) / longest_s)), 1)
+    limits_s = np.linspace(first_s, last_s, count + 1)[1:-1]
+    return np.split(rows, np.searchsorted(times_s[rows], limits_s))
 
 
 def _step(part: _Places) -> float:

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.joint.normal import NormalEquations
+from ipsys_log.joint.normal import Block, NormalEquations
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.point_factors import PointFactors
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.sighting_factors import SightingFactors
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
-__all__ = ["Problem"]
+__all__ = ["Problem", "find_blocks"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """All factors of a lab and the order of its unknowns."""
+    """All factors of a lab and the order of its unknowns.
+
+    The elimination of the local unknowns goes through ``blocks``, or through all of them at once if there are
+    none. Both give the same equations.
+    """
 
     layout: Layout
     trajectories: Trajectories
     sightings: tuple[SightingFactors, ...]
     points: PointFactors
+    blocks: tuple[Block, ...] = ()
 
     def cost(self, state: State, ease: float) -> float:
         """Return half the sum of the losses; ``ease`` multiplies the limits between error and outlier."""
@@ -46,7 +52,8 @@ class Problem:
     def linearise(self, state: State, ease: float) -> NormalEquations:
         """Return the normal equations at a state."""
         layout, trajectories = self.layout, self.trajectories
-        normal = NormalEquations(trajectories.local_count, len(layout.mean), trajectories.bandwidth)
+        counts = trajectories.local_count, len(layout.mean)
+        normal = NormalEquations(*counts, trajectories.bandwidth, self.blocks)
         for factors in self.sightings:
             factors.add_to(normal, state, layout, trajectories, ease)
         self.points.add_to(normal, state, layout, ease)
@@ -90,3 +97,27 @@ class Problem:
         ]
         every = np.concatenate(chi2) if chi2 else np.zeros(1)
         return max(1.0, 2 * float(np.median(every)))
+
+
+def find_blocks(
+    layout: Layout, trajectories: Trajectories, sightings: Sequence[SightingFactors]
+) -> tuple[Block, ...]:
+    """Return one block for all stationary poses, and one for each path over the floor.
+
+    A block has the cameras and the bodies of its sightings, and all modes of the floor.
+    """
+    starts = trajectories.path_starts
+    used = np.zeros((len(starts), len(layout.mean)), dtype=np.bool_)
+    used[:, layout.modes] = True
+    for factors in sightings:
+        block, bodies = layout.cameras[factors.camera], factors.sightings.body
+        moving = factors.kind is Kind.FLOOR
+        numbers = factors.trajectory + 1 if moving else np.zeros_like(factors.trajectory)
+        used[np.unique(numbers), block.start : block.stop] = True
+        used[numbers, layout.scales.start + bodies] = True
+        used[numbers, layout.heights.start + bodies] |= moving
+    ends = [*starts[1:].tolist(), trajectories.local_count]
+    return tuple(
+        Block(start, end, np.flatnonzero(own))
+        for start, end, own in zip(starts.tolist(), ends, used, strict=True)
+    )

@@ -128,7 +128,7 @@ class SightingFactors:
             across = (rows.by_global * by_height[:, :, None]).sum(axis=1)
             normal.add_global_block(columns, modes, across.T @ rows.modes)
             strengths = (by_height**2).sum(axis=1)[:, None]
-            normal.dense[np.ix_(modes, modes)] += (rows.modes * strengths).T @ rows.modes
+            normal.dense[layout.modes, layout.modes] += (rows.modes * strengths).T @ rows.modes
             normal.global_gradient[modes] += (by_height * rows.residuals).sum(axis=1) @ rows.modes
 
     def weighted_rows(

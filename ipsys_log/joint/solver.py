@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.errors import FitError
+from ipsys_log.joint.anchoring import anchor
 from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
@@ -40,6 +41,7 @@ def solve(
     state: State,
     progress: Callable[[int, float], None] = lambda step, cost: None,
     short: float = SHORT,
+    patient: bool = False,
 ) -> Solution:
     """Minimise the cost of a problem, from a start.
 
@@ -52,6 +54,9 @@ def solve(
     state : the start.
     progress : called with the number of steps and the cost after each step.
     short : the fit has converged if a full step is shorter than this share of the standard deviation.
+    patient : whether the limit falls only after convergence; until then, the whole lab moves to its measured
+        points after each step. In a hall, the sightings fit long before the cameras fit to the few measured
+        points, which would then count as outliers.
 
     Raises
     ------
@@ -67,12 +72,14 @@ def solve(
     for step in range(_MOST_STEPS):
         state, cost, decrement, damping = _descend(problem, state, normal, damping, ease)
         progress(step + 1, cost)
+        if patient and ease > 1.0:
+            state = anchor(problem, state)
         long = short if ease == 1.0 else _ROUGH
         settled = decrement <= long**2
         if settled and ease == 1.0:
             normal = problem.linearise(state, ease)
             return Solution(state, cost, normal, _factorise(problem, normal), step + 1)
-        if ease > 1.0 and (settled or step % 3 == 2):
+        if ease > 1.0 and (settled or (step % 3 == 2 and not patient)):
             ease = min(ease, problem.ease(state))
             # The last stage is strict, even if more than half of the sightings have errors above the noise.
             ease = ease / 4 if settled else ease

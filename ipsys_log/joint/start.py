@@ -89,18 +89,25 @@ def place_cameras(observations: Observations) -> list[PlacedCamera]:
     if free:
         root = max(range(len(views)), key=lambda camera: len(observations.sightings[camera]))
         placed[root] = _moved(views[root], np.zeros(3), 0.0)
-    while len(placed) < len(views):
-        candidates = {
-            camera: _shared_matches(observations, camera, views[camera], placed)
-            for camera in range(len(views))
-            if camera not in placed
-        }
-        camera = max(candidates, key=lambda one: len(candidates[one].points_m))
-        if not len(candidates[camera].points_m):
-            raise FitError(_lonely(observations, sorted(candidates)))
-        placed[camera] = _place(views[camera], candidates[camera])
+    _chain(observations, views, placed)
     cameras = [placed[camera] for camera in range(len(views))]
     return _anchor(observations, cameras, known) if free else cameras
+
+
+def _chain(observations: Observations, views: list[MarkerViews], placed: dict[int, PlacedCamera]) -> None:
+    """Place all other cameras, the one with the most shared markers first."""
+    shared: dict[int, list[_Matches]] = {camera: [] for camera in range(len(views)) if camera not in placed}
+    fresh = list(placed)
+    while shared:
+        for camera, parts in shared.items():
+            for other in fresh:
+                parts.extend(_shared_matches(observations, camera, views[camera], other, placed[other]))
+        camera = max(shared, key=lambda one: sum(len(part.points_m) for part in shared[one]))
+        matches = _join(shared.pop(camera))
+        if not len(matches.points_m):
+            raise FitError(_lonely(observations, sorted([camera, *shared])))
+        placed[camera] = _place(views[camera], matches)
+        fresh = [camera]
 
 
 def _lonely(observations: Observations, cameras: list[int]) -> str:
@@ -134,40 +141,44 @@ def _tape_matches(observations: Observations, camera: int, view: MarkerViews, kn
 
 
 def _shared_matches(
-    observations: Observations, camera: int, view: MarkerViews, placed: dict[int, PlacedCamera]
-) -> _Matches:
+    observations: Observations, camera: int, view: MarkerViews, other: int, other_camera: PlacedCamera
+) -> list[_Matches]:
     """Return the markers that a placed camera sees too: at the same point, or at the same time."""
-    sightings = observations.sightings[camera]
+    sightings, known = observations.sightings[camera], observations.sightings[other]
+    seen, known_seen = (
+        np.isfinite(points_m).all(axis=1) for points_m in (view.points_m, other_camera.points_m)
+    )
     parts = []
-    for other, other_camera in placed.items():
-        known = observations.sightings[other]
-        for body in np.unique(sightings.body).tolist():
-            own = np.flatnonzero((sightings.body == body) & np.isfinite(view.points_m).all(axis=1))
-            theirs = np.flatnonzero((known.body == body) & np.isfinite(other_camera.points_m).all(axis=1))
-            at_points = [
-                (one, int(two))
-                for one in own.tolist()
-                for two in theirs[known.point[theirs] == sightings.point[one]]
-                if sightings.point[one] >= 0
-            ]
-            if at_points:
-                first, second = np.array(at_points).T
-                world = other_camera.points_m[second], other_camera.headings_rad[second]
-                parts.append(_Matches(view.points_m[first], view.headings_rad[first], *world))
-            moving, theirs = own[sightings.point[own] < 0], theirs[known.point[theirs] < 0]
-            if len(moving) and len(theirs) > 1:
-                world_m, headings_rad, near = _interpolate(
-                    sightings.times_s[moving],
-                    known.times_s[theirs],
-                    other_camera.points_m[theirs],
-                    other_camera.headings_rad[theirs],
-                )
-                first = moving[near]
-                parts.append(
-                    _Matches(
-                        view.points_m[first], view.headings_rad[first], world_m[near], headings_rad[near]
-                    )
-                )
+    for body in np.intersect1d(sightings.body, known.body).tolist():
+        own, theirs = (
+            np.flatnonzero((sightings.body == body) & seen),
+            np.flatnonzero((known.body == body) & known_seen),
+        )
+        at_points = [
+            (one, int(two))
+            for one in own[sightings.point[own] >= 0].tolist()
+            for two in theirs[known.point[theirs] == sightings.point[one]]
+        ]
+        if at_points:
+            first, second = np.array(at_points).T
+            world = other_camera.points_m[second], other_camera.headings_rad[second]
+            parts.append(_Matches(view.points_m[first], view.headings_rad[first], *world))
+        moving, theirs = own[sightings.point[own] < 0], theirs[known.point[theirs] < 0]
+        if len(moving) and len(theirs) > 1:
+            world_m, headings_rad, near = _interpolate(
+                sightings.times_s[moving],
+                known.times_s[theirs],
+                other_camera.points_m[theirs],
+                other_camera.headings_rad[theirs],
+            )
+            first = moving[near]
+            parts.append(
+                _Matches(view.points_m[first], view.headings_rad[first], world_m[near], headings_rad[near])
+            )
+    return parts
+
+
+def _join(parts: list[_Matches]) -> _Matches:
     columns = [[getattr(part, name) for part in parts] for name in _Matches.__slots__]
     empty = (np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
     return _Matches(*(np.concatenate([e, *c]) for e, c in zip(empty, columns, strict=True)))

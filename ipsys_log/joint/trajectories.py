@@ -112,6 +112,11 @@ class Trajectories:
         return self._free_start + _FREE_KNOT * self.free_paths.knot_count
 
     @property
+    def path_starts(self) -> Indices:
+        """The first local unknown of the stationary poses, and of each path over the floor, (1 + paths,)."""
+        return np.concatenate([[0], _POSE * self.stationary + _KNOT * self.paths.first]).astype(np.intp)
+
+    @property
     def _free_start(self) -> int:
         return _POSE * self.stationary + _KNOT * self.paths.knot_count
 

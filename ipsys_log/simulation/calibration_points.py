@@ -12,7 +12,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.marker_cells import PlacedMarker, black_cells, print_outline
 from ipsys_log.geometry.poses import pose_facing_up
 from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
-from ipsys_log.simulation.cameras import FLOOR_M, Camera, sees
+from ipsys_log.simulation.cameras import Camera, sees
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "overlap",
     "place_marker",
     "plan_points",
+    "reference_points",
     "split",
     "tape_lengths_m",
 ]
@@ -35,6 +36,14 @@ _DRAWS = 4000
 # Number of candidates of a pose. The selected candidate is the one farthest from all earlier poses.
 _CANDIDATES = 4
 _TEST_SHARE = 0.2
+
+
+def reference_points(settings: LabSettings) -> tuple[ReferencePoint, ReferencePoint]:
+    """Return the two points from which the tape measures; in a hall, half of its length apart."""
+    if settings.grid is None:
+        return REFERENCES
+    x_m, y_m = settings.floor_m
+    return ReferencePoint("A", x_m / 4, y_m / 2), ReferencePoint("B", 3 * x_m / 4, y_m / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +154,8 @@ def measure(
     splits : splits of the calibration point, such as train or test.
     """
     rng = random_stream(settings.seed, Purpose.TAPE, index)
-    distances = _tape(where, settings.tape_sigma_m, rng)
+    references = reference_points(settings)
+    distances = _tape(where, references, settings.tape_sigma_m, rng)
     readout_ns = (settings.height - 1) * settings.row_time_ns
     # A marker on the floor needs no ruler.
     height_m = where.z_m + (rng.normal(0.0, settings.ruler_sigma_m) if where.z_m else 0.0)
@@ -155,9 +165,9 @@ def measure(
         marker_id=where.marker_id,
         distances=tuple(
             Distance(reference.name, float(distance_m), settings.tape_sigma_m)
-            for reference, distance_m in zip(REFERENCES, distances, strict=True)
+            for reference, distance_m in zip(references, distances, strict=True)
         ),
-        side="left" if where.y_m >= REFERENCES[0].y_m else "right",
+        side="left" if where.y_m >= references[0].y_m else "right",
         height_m=float(height_m),
         height_sigma_m=settings.ruler_sigma_m,
         still=Interval(times_ns[0], times_ns[-1] + readout_ns) if index % 2 == 0 else None,
@@ -165,15 +175,20 @@ def measure(
     )
 
 
-def tape_lengths_m(where: SimulatedPose) -> Array:
+def tape_lengths_m(where: SimulatedPose, references: Sequence[ReferencePoint] = REFERENCES) -> Array:
     """Return the true distances of a marker from A and B in the plane of the floor, (2,) in m."""
-    return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
+    return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in references])
 
 
-def _tape(where: SimulatedPose, sigma_m: float, rng: np.random.Generator) -> Array:
+def _tape(
+    where: SimulatedPose,
+    references: tuple[ReferencePoint, ReferencePoint],
+    sigma_m: float,
+    rng: np.random.Generator,
+) -> Array:
     """Draw two distances that form a triangle with AB; repeat invalid readings."""
-    a, b = REFERENCES
-    true_m = tape_lengths_m(where)
+    a, b = references
+    true_m = tape_lengths_m(where, references)
     base_m = np.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
     for _ in range(1000):
         read_m = true_m + rng.normal(0.0, sigma_m, 2)
@@ -204,7 +219,7 @@ def choose_place(
     """
     candidates: list[SimulatedPose] = []
     for _ in range(_DRAWS):
-        x_m, y_m = rng.uniform(0, FLOOR_M, 2)
+        x_m, y_m = rng.uniform(0, settings.floor_m, 2)
         z_m, heading_rad = rng.choice(settings.heights_m), rng.uniform(-np.pi, np.pi)
         candidate = SimulatedPose(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
         if _fits(candidate, settings, cameras, camera, taken) and suits(candidate, camera, settings):
@@ -226,7 +241,10 @@ def _fits(
     camera: Camera,
     taken: Sequence[SimulatedPose],
 ) -> bool:
-    if not sees(camera, _centre(where)[None])[0] or _tape_angle_deg(where) < settings.tape_angle_deg:
+    if (
+        not sees(camera, _centre(where)[None])[0]
+        or _tape_angle_deg(where, settings) < settings.tape_angle_deg
+    ):
         return False
     if camera.name not in cameras_seeing(where, (camera,), settings):
         return False
@@ -234,9 +252,10 @@ def _fits(
     return not overlap(_centre(where), others, cameras, settings).any()
 
 
-def _tape_angle_deg(where: SimulatedPose) -> float:
+def _tape_angle_deg(where: SimulatedPose, settings: LabSettings) -> float:
     """Return the crossing angle of the lines from A and B, 0..90 degrees: flat triangles are inaccurate."""
-    to_a, to_b = (np.array([where.x_m - p.x_m, where.y_m - p.y_m]) for p in REFERENCES)
+    references = reference_points(settings)
+    to_a, to_b = (np.array([where.x_m - p.x_m, where.y_m - p.y_m]) for p in references)
     cross = abs(to_a[0] * to_b[1] - to_a[1] * to_b[0])
     return float(np.degrees(np.arcsin(min(cross / (np.hypot(*to_a) * np.hypot(*to_b)), 1.0))))
 

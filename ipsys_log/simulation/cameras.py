@@ -11,15 +11,16 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 
 __all__ = ["FLOOR_M", "Camera", "aim_cameras", "mount_cameras", "sees"]
 
 Array = NDArray[np.float64]
 
-FLOOR_M = 4.88
 # Distance of the outermost cameras from the wall. With three cameras, the distance between two is 1.59 m.
 _FROM_WALL_M = 0.85
+# The fields of view of a hall overlap by twice this, beside the diagonal of a marker.
+_BEYOND_M = 0.1
 _TRIES = 5000
 # Intrinsics for images of 1920 px width. The distortion is about that of the lenses in the paper.
 _FOCAL_PX = (1150.0, 1165.0)
@@ -45,7 +46,7 @@ class Camera:
 
 
 def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
-    """Return the cameras in a row above the middle of the floor.
+    """Return the cameras in a row above the middle of the floor, or in the grid of a hall.
 
     Parameters
     ----------
@@ -57,10 +58,27 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
     IpsysError
         A camera cannot see its part of the floor with any intrinsics and tilt.
     """
+    if settings.grid is not None:
+        return tuple(
+            _mount(settings, index, middle_m, _cell_of_floor(settings, middle_m), time_ns)
+            for index, middle_m in enumerate(_grid_middles(*settings.grid, settings.spacing_m))
+        )
     count = len(settings.cameras)
     spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
     ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
-    return tuple(_mount(settings, index, float(y_m), spacing_m, time_ns) for index, y_m in enumerate(ys_m))
+    return tuple(
+        _mount(settings, index, (FLOOR_M / 2, y_m), _part_of_floor(settings, y_m, spacing_m), time_ns)
+        for index, y_m in enumerate(ys_m.tolist())
+    )
+
+
+def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return the middles of the parts of the floor, column after column, in m."""
+    return [
+        ((column + 0.5) * spacing_m[0], (row + 0.5) * spacing_m[1])
+        for column in range(columns)
+        for row in range(rows)
+    ]
 
 
 def aim_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
@@ -91,18 +109,19 @@ def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def _mount(settings: LabSettings, index: int, y_m: float, spacing_m: float, time_ns: int) -> Camera:
-    """Draw intrinsics and poses of a camera until it sees its part of the floor."""
+def _mount(
+    settings: LabSettings, index: int, place_m: tuple[float, float], wanted_m: Array, time_ns: int
+) -> Camera:
+    """Draw intrinsics and poses of a camera until it sees all wanted points."""
     rng = random_stream(settings.seed, Purpose.CAMERA, index)
     name = settings.cameras[index]
-    wanted_m = _part_of_floor(settings, y_m, spacing_m)
     for _ in range(_TRIES):
         lens = _draw_lens(rng, settings, name, time_ns)
         tilt = np.radians(rng.uniform(*settings.tilt_deg))
         towards = rng.uniform(0, 2 * np.pi)
         tilt_rad = tilt * np.array([np.cos(towards), np.sin(towards), 0.0])
         nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
-        origin_m = np.array([FLOOR_M / 2, y_m, settings.mount_height_m]) + nudge_m
+        origin_m = np.array([*place_m, settings.mount_height_m]) + nudge_m
         camera = Camera(name, lens, look_down(origin_m, tilt_rad))
         if _reaches(lens) and sees(camera, wanted_m).all():
             return camera
@@ -147,6 +166,20 @@ def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array
     low = np.stack(np.meshgrid(across, along, [0.0]), axis=-1).reshape(-1, 3)
     high = np.stack(np.meshgrid(across_top, along_top, [top_m]), axis=-1).reshape(-1, 3)
     return np.vstack([low, high])
+
+
+def _cell_of_floor(settings: LabSettings, middle_m: tuple[float, float]) -> Array:
+    """Return the points that a camera of a hall must see: the edge of its part of the floor, with an overlap.
+
+    The overlap is at the greatest height.
+    """
+    top_m = max(*settings.heights_m, settings.drive_height_m)
+    beyond_m = settings.marker_length_m / np.sqrt(2) + _BEYOND_M
+    reach_m = np.array(settings.spacing_m) / 2 + beyond_m
+    share = np.linspace(-1, 1, 9)
+    edge = np.array([(x, y) for x in share for y in share if max(abs(x), abs(y)) == 1])
+    flat_m = np.clip(middle_m + edge * reach_m, 0.0, settings.floor_m)
+    return np.column_stack([flat_m, np.full(len(flat_m), top_m)])
 
 
 def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:

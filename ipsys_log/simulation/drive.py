@@ -12,22 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.simulation.calibration_points import SimulatedPose, overlap
-from ipsys_log.simulation.cameras import FLOOR_M, Camera
+from ipsys_log.simulation.cameras import Camera
+from ipsys_log.simulation.drive_paths import DrivePath, choose_path
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = ["Drive", "plan_drive"]
 
 Array = NDArray[np.float64]
 
-# Distance of the path from the walls: the path reaches the edges of the images, and whole markers are visible
-# everywhere.
-_FROM_WALL_M = 0.55
 # Time constant of the acceleration of a robot.
 _START_S = 0.4
 _TRIES = 200
-_ARMS = 5
-# Mean reach, and the share of a second harmonic that rounds the bends between the arms.
-_MEAN, _ROUND = 0.7, 0.18
 # Largest rate of turn. A robot slows down in bends to keep below it.
 _TURN_RAD_S = 2.5
 _CHECKED_HZ = 10
@@ -35,14 +30,14 @@ _CHECKED_HZ = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A path in the form of a star with five rounded arms, and the start of each marker on it.
+    """A path over the floor, and the start of each marker on it.
 
     ``ahead_s`` is the time from the start of the path to the start of each marker, in s. ``times_s`` (n,) are
     the times at which a robot passes the angles ``phases_rad`` (n,) of the path.
     """
 
     height_m: float
-    mirrored: bool
+    path: DrivePath
     ahead_s: dict[int, float]
     times_s: Array
     phases_rad: Array
@@ -69,7 +64,7 @@ class Drive:
         by_way = (np.diff(self.phases_rad) / np.diff(self.times_s))[interval]
         # The robot accelerates: its way on the path grows by this share of the time.
         share = np.where(times_s > 0, 1 - np.exp(-np.maximum(times_s, 0.0) / _START_S), 0.0)
-        _, (dx, dy) = _figure(self._phase(way_s), self.mirrored)
+        _, (dx, dy) = self.path.at(self._phase(way_s))
         return np.stack([dx, dy], axis=1) * (by_way * share)[:, None]
 
     def track(self, ahead_s: float, times_s: Array) -> Array:
@@ -78,7 +73,7 @@ class Drive:
         return np.stack([x_m, y_m, np.full_like(x_m, self.height_m)], axis=1)
 
     def _follow(self, ahead_s: float, times_s: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        return _figure(self._phase(self._way_s(ahead_s, times_s)), self.mirrored)
+        return self.path.at(self._phase(self._way_s(ahead_s, times_s)))
 
     def _way_s(self, ahead_s: float, times_s: Array) -> Array:
         """Return the place on the path (n,), as the time from its start to there at full speed."""
@@ -96,7 +91,8 @@ def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
     """
     rng = random_stream(settings.seed, Purpose.DRIVE)
     mirrored = bool(rng.integers(2))
-    empty = Drive(settings.drive_height_m, mirrored, {}, *_timetable(settings.drive_speed_m_s))
+    timetable = _timetable(choose_path(settings, False), settings.drive_speed_m_s)
+    empty = Drive(settings.drive_height_m, choose_path(settings, mirrored), {}, *timetable)
     times_s = np.arange(0, settings.drive_s + 1 / _CHECKED_HZ, 1 / _CHECKED_HZ)
     ahead_s, tracks_m = {0: 0.0}, [empty.track(0.0, times_s)]
     for marker_id in range(1, settings.markers):
@@ -109,34 +105,14 @@ def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
     return replace(empty, ahead_s=ahead_s)
 
 
-def _timetable(speed_m_s: float) -> tuple[Array, Array]:
+def _timetable(path: DrivePath, speed_m_s: float) -> tuple[Array, Array]:
     """Return times in s, and the angles of the path at these times in rad.
 
     The path starts at the wall at the first camera.
     """
     phases_rad = -np.pi / 2 + np.linspace(0, 2 * np.pi, 20_001)
-    (x_m, y_m), (dx, dy) = _figure(phases_rad, False)
+    (x_m, y_m), (dx, dy) = path.at(phases_rad)
     step_m = np.hypot(np.diff(x_m), np.diff(y_m))
     turn_rad = np.abs(np.diff(np.unwrap(np.arctan2(dy, dx))))
     step_s = np.hypot(step_m / speed_m_s, turn_rad / _TURN_RAD_S)
     return np.concatenate([[0.0], np.cumsum(step_s)]), phases_rad
-
-
-def _figure(phase: Array, mirrored: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return points of the path at angles (n,), in m, and their derivatives by the angle.
-
-    Between two arms, the path returns to near the middle. The arms end on a square with rounded corners, so
-    they reach the edges of all images.
-    """
-    side = -1.0 if mirrored else 1.0
-    cos, sin = np.cos(phase), np.sin(phase)
-    corner = cos**4 + sin**4
-    arm = _ARMS * (phase + np.pi / 2)
-    swing = (1 - _MEAN) / (1 + (1 - _MEAN) * _ROUND)
-    wave = 1 - swing * (1 - np.cos(arm) + _ROUND * (1 - np.cos(2 * arm)))
-    wave_slope = -swing * _ARMS * (np.sin(arm) + 2 * _ROUND * np.sin(2 * arm))
-    size_m = (FLOOR_M / 2 - _FROM_WALL_M) * corner**-0.25
-    reach_m = size_m * wave
-    slope_m = size_m * (wave * (cos**3 * sin - sin**3 * cos) / corner + wave_slope)
-    point_m = (FLOOR_M / 2 + side * reach_m * cos, FLOOR_M / 2 + reach_m * sin)
-    return point_m, (side * (slope_m * cos - reach_m * sin), slope_m * sin + reach_m * cos)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.cameras import Camera
-from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 
 __all__ = ["FIELD_PX", "Check", "FloorView", "lay_floor", "pixel_rays", "prepare_view", "to_light"]
 
@@ -79,20 +79,32 @@ def _lay_rows(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     # Width of a pixel on the floor: finer details have less contrast.
     pixel_m = np.maximum(np.abs(np.gradient(x_m, axis=1)), np.abs(np.gradient(y_m, axis=0)))
     across, along = x_m / _BOARD_M[0], y_m / _BOARD_M[1]
-    on_boards = (across >= 0) & (across <= _BOARDS[0]) & (along >= 0) & (along <= _BOARDS[1])
+    columns, rows = _count_boards(settings)
+    on_boards = (across >= 0) & (across <= columns) & (along >= 0) & (along <= rows)
     boards = _boards(settings, x_m, y_m) * _seams(across, along, pixel_m)
     concrete = 0.62 * settings.floor + 4.0 * _noise_at(settings, 1, x_m, y_m, 1.0)
-    fade = 1.0 - 0.012 * ((x_m - 2.2) ** 2 + (y_m - 2.8) ** 2)
+    # The lamps are above the middle of the floor; a hall has more of them.
+    shares = np.array(settings.floor_m) / FLOOR_M
+    bright_m, fading = (2.2, 2.8) * shares, 0.012 / shares.max() ** 2
+    fade = 1.0 - fading * ((x_m - bright_m[0]) ** 2 + (y_m - bright_m[1]) ** 2)
     level = np.where(on_boards, boards, concrete) * np.clip(fade, 0.5, 1.0)
     return np.asarray(np.clip(level, 1.0, 255.0), dtype=np.float32)
+
+
+def _count_boards(settings: LabSettings) -> tuple[int, int]:
+    if settings.grid is None:
+        return _BOARDS
+    columns, rows = np.ceil(settings.floor_m / _BOARD_M).astype(int).tolist()
+    return columns, rows
 
 
 def _boards(settings: LabSettings, x_m: Array, y_m: Array) -> Array:
     """Return grey levels of wood with its grain along y; each board has its own shade and grain."""
     rng = random_stream(settings.seed, Purpose.FLOOR, 0)
-    shades, shifts_m = rng.uniform(-5, 5, _BOARDS), rng.uniform(0, _TILE_M, _BOARDS)
-    column = np.clip((x_m / _BOARD_M[0]).astype(int), 0, _BOARDS[0] - 1)
-    row = np.clip((y_m / _BOARD_M[1]).astype(int), 0, _BOARDS[1] - 1)
+    boards = _count_boards(settings)
+    shades, shifts_m = rng.uniform(-5, 5, boards), rng.uniform(0, _TILE_M, boards)
+    column = np.clip((x_m / _BOARD_M[0]).astype(int), 0, boards[0] - 1)
+    row = np.clip((y_m / _BOARD_M[1]).astype(int), 0, boards[1] - 1)
     shift_m = shifts_m[column, row]
     # A slow oscillation bends the grain.
     bent_m = x_m + 0.012 * np.sin(2.3 * y_m + 5 * shift_m) + shift_m

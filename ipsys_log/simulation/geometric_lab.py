@@ -14,7 +14,7 @@ from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.calibration_points import SimulatedPose
-from ipsys_log.simulation.cameras import FLOOR_M, Camera, aim_cameras, mount_cameras
+from ipsys_log.simulation.cameras import Camera, aim_cameras, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
 from ipsys_log.simulation.geometric_points import choose_points
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
@@ -210,7 +210,7 @@ def build_lab(settings: GeometricSettings) -> GeometricLab:
     cameras = (aim_cameras if lab.tilt_deg[1] > _MOST_TILT_DEG else mount_cameras)(lab)
     clock_offsets_ns, frame_delays_ns = _clocks(settings)
     rng = random_stream(lab.seed, Purpose.UNEVENNESS)
-    floor = SmoothField.draw(settings.floor_rms_m, settings.floor_length_m, FLOOR_M, rng)
+    floor = SmoothField.draw(settings.floor_rms_m, settings.floor_length_m, max(lab.floor_m), rng)
     prints = random_stream(lab.seed, Purpose.PRINTS).standard_normal((lab.markers, 2))
     scales = 1 + settings.marker_scale_sigma * prints[:, 0]
     heights_m = lab.drive_height_m + settings.robot_height_sigma_m * prints[:, 1]

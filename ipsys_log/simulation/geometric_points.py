@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.marker_cells import black_cells
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.simulation.calibration_points import REFERENCES, SimulatedPose, overlap
-from ipsys_log.simulation.cameras import FLOOR_M, Camera, sees
+from ipsys_log.simulation.calibration_points import SimulatedPose, overlap, reference_points
+from ipsys_log.simulation.cameras import Camera, sees
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = ["choose_points"]
@@ -72,10 +72,10 @@ def _choose_point(
     fitting = np.empty((0, 4))
     for _ in range(_BATCHES):
         poses = np.empty((_BATCH, 4))
-        poses[:, :2] = rng.uniform(0, FLOOR_M, (_BATCH, 2))
+        poses[:, :2] = rng.uniform(0, lab.floor_m, (_BATCH, 2))
         poses[:, 2] = rng.choice(lab.heights_m, _BATCH)
         poses[:, 3] = rng.uniform(-np.pi, np.pi, _BATCH)
-        fits = (_tape_sine(poses) >= np.sin(np.radians(lab.tape_angle_deg))) & _whole(
+        fits = (_tape_sine(poses, lab) >= np.sin(np.radians(lab.tape_angle_deg))) & _whole(
             cameras[index], poses, lab
         )
         for other in taken:
@@ -91,8 +91,8 @@ def _choose_point(
     return np.asarray(fitting[apart_m.argmax()])
 
 
-def _tape_sine(poses: Array) -> Array:
-    to_a, to_b = (poses[:, :2] - [point.x_m, point.y_m] for point in REFERENCES)
+def _tape_sine(poses: Array, lab: LabSettings) -> Array:
+    to_a, to_b = (poses[:, :2] - [point.x_m, point.y_m] for point in reference_points(lab))
     cross = np.abs(to_a[:, 0] * to_b[:, 1] - to_a[:, 1] * to_b[:, 0])
     sine: Array = cross / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
     return sine

@@ -25,15 +25,15 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.simulation.calibration_points import (
-    REFERENCES,
     SimulatedPose,
     cameras_seeing,
     measure,
     place_marker,
     plan_points,
+    reference_points,
     split,
 )
-from ipsys_log.simulation.cameras import FLOOR_M, Camera, mount_cameras
+from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
 from ipsys_log.simulation.floor import FloorView, prepare_view
 from ipsys_log.simulation.pixel_shares import exposure_interval
@@ -110,13 +110,13 @@ def simulate(
 def build_rig(settings: LabSettings) -> Rig:
     """Return the rig of the simulated lab; each marker is on its own robot."""
     return Rig(
-        name="simulated_lab",
+        name="simulated_lab" if settings.grid is None else "simulated_hall",
         dictionary=settings.dictionary,
         marker_length_m=settings.marker_length_m,
         markers=tuple(RigMarker(index, robot=f"robot_{index}") for index in range(settings.markers)),
         cameras=tuple(RigCamera(name, row_time_ns=settings.row_time_ns or None) for name in settings.cameras),
-        reference_points=REFERENCES,
-        floor=Floor(FLOOR_M, FLOOR_M),
+        reference_points=reference_points(settings),
+        floor=Floor(*settings.floor_m),
         marker_height_m=settings.drive_height_m,
         marker_height_sigma_m=ROBOT_HEIGHT_SIGMA_M,
         tape_sigma_m=settings.tape_sigma_m or None,

@@ -12,7 +12,11 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.rig.file import check_name
 
-__all__ = ["LabSettings", "Purpose", "random_stream"]
+__all__ = ["FLOOR_M", "LabSettings", "Purpose", "random_stream"]
+
+FLOOR_M = 4.88
+# Each camera of a hall has this part of the floor: 6 x 4 cameras are above 20 x 15 m.
+_HALL_SPACING_M = (20 / 6, 15 / 4)
 
 
 class Purpose(IntEnum):
@@ -82,7 +86,9 @@ class LabSettings:
     ----------
     seed : seed of all random numbers.
     width, height : size of an image in px; the focal length scales with the width (1160 px at 1920).
-    cameras : names, in the order of the world's y.
+    cameras : names, in the order of the world's y; in a hall, column after column.
+    grid : columns (along x) and rows (along y) of the cameras of a hall, see
+        :func:`~ipsys_log.simulation.hall.hall_settings`; None: one row of cameras above a floor of 4.88 m.
     dictionary, marker_length_m, markers : OpenCV's name; side of the black square; number of simultaneous
         markers, with the ids 0, 1, ...
     stations : approximate number of calibration points that each camera sees.
@@ -115,6 +121,7 @@ class LabSettings:
     width: int = 1920
     height: int = 1080
     cameras: tuple[str, ...] = ("red", "white", "black")
+    grid: tuple[int, int] | None = None
     dictionary: str = "DICT_4X4_100"
     marker_length_m: float = 0.20
     markers: int = 3
@@ -155,7 +162,24 @@ class LabSettings:
             raise IpsysError("simulator: nothing to show with stations = 0 and drive_s = 0; set one of them")
         _check_tilt(self.tilt_deg)
         _check_cameras(self.cameras)
+        if self.grid is not None and len(self.cameras) != self.grid[0] * self.grid[1]:
+            raise IpsysError(
+                f"simulator: {len(self.cameras)} cameras for a grid of {self.grid[0]} x {self.grid[1]}; "
+                "give each place of the grid one camera"
+            )
         _check_dictionary(self.dictionary, self.markers)
+
+    @property
+    def spacing_m(self) -> tuple[float, float]:
+        """The distance of two columns, and of two rows, of the cameras of a hall, in m."""
+        return _HALL_SPACING_M
+
+    @property
+    def floor_m(self) -> tuple[float, float]:
+        """The size of the floor along x and y, in m."""
+        if self.grid is None:
+            return FLOOR_M, FLOOR_M
+        return self.grid[0] * _HALL_SPACING_M[0], self.grid[1] * _HALL_SPACING_M[1]
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:

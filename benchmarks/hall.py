@@ -1,0 +1,169 @@
+"""Joint calibration of simulated halls from one drive and eight taped points: error, time and memory.
+
+    python benchmarks/hall.py                      # 3, 6, 12 and 24 cameras
+    python benchmarks/hall.py --hall-labs 3        # with three seeds
+    python benchmarks/hall.py --hall-floor-mm 1.5    # an uneven floor
+
+Each hall has one robot for two cameras; all drive at the same time. Clocks of the cameras have offsets of up
+to 25 ms, and intrinsics have the errors of a chessboard calibration. There are no images: markers have the
+noise of detect. The error is that of noise-free markers on a grid over the whole floor, against the ground
+truth. Times are processor times of one thread, each hall in its own process. The exponent is that of the
+sightings in the time: 1 means that twice the sightings take twice the time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from geometric_labs import Scene, joint_locator, make_session, nodes_of, observe_session
+from results import Report, command
+from rounds import Row
+from threadpoolctl import threadpool_limits
+
+from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, summarize
+from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.start import place_cameras
+from ipsys_log.simulation.geometric_lab import GeometricSettings
+from ipsys_log.simulation.hall import hall_settings
+
+__all__ = ["measure"]
+
+# No other part of the project uses these seeds.
+_FIRST_SEED = 3000
+_GRIDS = ((3, 1), (3, 2), (4, 3), (6, 4))
+_POINTS, _RATE_HZ, _CLOCK_S = 8, 10.0, 0.025
+# The nodes are 0.1 m apart; a prime number takes some of each row.
+_EVERY_NODE = 11
+_MM, _KB_PER_MB = 1000.0, 1024
+_MOST_EXPONENT = 1.2
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """The figures of one hall.
+
+    ``unmeasured`` cameras see no taped point. ``start_s`` and ``fit_s`` are processor times of the rough poses,
+    and of the whole calibration. ``start_mm`` is the largest error of a rough camera position. The other
+    errors are those over the floor; ``aligned_mm`` is the mean after the best rigid alignment.
+    """
+
+    cameras: int
+    sightings: int
+    unmeasured: int
+    start_s: float
+    fit_s: float
+    steps: int
+    memory_mb: float
+    start_mm: float
+    mean_mm: float
+    p95_mm: float
+    aligned_mm: float
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """Calibrate halls of every size."""
+    grids = ((2, 1), (3, 1)) if options.smoke else _GRIDS
+    drive_s = 10.0 if options.smoke else options.hall_drive_s
+    seeds = range(_FIRST_SEED, _FIRST_SEED + (1 if options.smoke else options.hall_labs))
+    report, halls = Report("hall"), []
+    for grid in grids:
+        work = [(grid, seed, drive_s, options.hall_floor_mm) for seed in seeds]
+        halls.append([_in_own_process(*one) for one in work])
+    for own in halls:
+        count = own[0].cameras
+        report.rows.append(Row(f"mean error, {count} cameras", tuple(one.mean_mm for one in own), "mm"))
+        report.details[f"{count} cameras"] = [asdict(one) for one in own]
+    # One exponent for each seed, over the halls of all sizes.
+    by_seed = list(zip(*halls, strict=True))
+    whole = tuple(_exponent(own, [one.fit_s for one in own]) for own in by_seed)
+    one_step = tuple(_exponent(own, [one.fit_s / one.steps for one in own]) for own in by_seed)
+    report.rows.append(Row("exponent of the time", whole, wanted=("<=", _MOST_EXPONENT)))
+    report.rows.append(Row("exponent of the time of a step", one_step, wanted=("<=", _MOST_EXPONENT)))
+    report.tables.append(_table(by_seed[0]))
+    return report
+
+
+def _exponent(halls: Sequence[Figures], times_s: Sequence[float]) -> float:
+    """Return the slope of the best line through the logarithms of sightings and times."""
+    return float(np.polyfit(np.log([one.sightings for one in halls]), np.log(times_s), 1)[0])
+
+
+def _table(halls: Sequence[Figures]) -> str:
+    lines = ["cameras  sightings  no point  steps   start    fit   MB  start mm  mean mm   p95"]
+    for one in halls:
+        times = f"{one.start_s:>6.2f} s{one.fit_s:>5.0f} s"
+        errors = f"{one.start_mm:>10.0f}{one.mean_mm:>9.2f}{one.p95_mm:>6.2f}"
+        counts = f"{one.cameras:>7}{one.sightings:>11}{one.unmeasured:>10}{one.steps:>7}"
+        lines.append(f"{counts}{times}{one.memory_mb:>5.0f}{errors}")
+    return "\n".join(lines)
+
+
+def _in_own_process(grid: tuple[int, int], seed: int, drive_s: float, floor_mm: float) -> Figures:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(calibrate_hall, grid, seed, drive_s, floor_mm).result()
+
+
+def calibrate_hall(grid: tuple[int, int], seed: int, drive_s: float, floor_mm: float) -> Figures:
+    """Simulate a hall, calibrate it, and compare it with its ground truth."""
+    robots = max(grid[0] * grid[1] // 2, 2)
+    settings = hall_settings(*grid, markers=robots, rate_hz=_RATE_HZ, drive_s=drive_s)
+    scene = Scene(
+        "hall",
+        GeometricSettings(lab=settings, points=_POINTS, clock_offset_s=_CLOCK_S, floor_rms_m=floor_mm / _MM),
+    )
+    with threadpool_limits(1):
+        session = make_session(scene, seed)
+        observations, steps = observe_session(session), []
+        begin = time.process_time()
+        placed = place_cameras(observations)
+        after_start = time.process_time()
+        fit = fit_jointly(observations, progress=lambda step, cost: steps.append(step))
+        fit_s = time.process_time() - after_start
+        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB
+        nodes = [_some(seen) for seen in nodes_of(session.lab)]
+        error = summarize(compute_errors(nodes, joint_locator(fit, session)), session.measured_m)
+    origins_m = {camera.name: camera.origin_m for camera in session.lab.cameras}
+    misses_m = [
+        np.linalg.norm(view.origin_m - origins_m[camera.name])
+        for view, camera in zip(placed, observations.cameras, strict=True)
+    ]
+    return Figures(
+        len(observations.cameras),
+        sum(map(len, observations.sightings)),
+        sum(not (sightings.point >= 0).any() for sightings in observations.sightings),
+        after_start - begin,
+        fit_s,
+        len(steps),
+        memory_mb,
+        _MM * float(np.max(misses_m)),
+        _MM * error.mean_m,
+        _MM * error.p95_m,
+        _MM * error.aligned_mean_m,
+    )
+
+
+def _some(seen: KnownSightings) -> KnownSightings:
+    return replace(
+        seen,
+        truth_m=seen.truth_m[::_EVERY_NODE],
+        corners_px=seen.corners_px[::_EVERY_NODE],
+        heights_m=seen.heights_m[::_EVERY_NODE],
+    )
+
+
+def add_options(parser: argparse._ArgumentGroup) -> None:
+    parser.add_argument("--hall-labs", type=int, default=1, help="halls of each size, with other seeds")
+    parser.add_argument("--hall-drive-s", type=float, default=60.0, help="duration of the drive, in s")
+    parser.add_argument("--hall-floor-mm", type=float, default=0.0, help="unevenness of the floor (RMS)")
+
+
+if __name__ == "__main__":
+    command("hall")

@@ -215,7 +215,7 @@ class NodeStream:
             # The node has given the middle of the exposure. The reader of the camera adds this distance
             # again.
             time_ns -= mid_exposure_ns(0, self._camera)
-        return Frame(data, header.format, time_ns)
+        return Frame(data, header.format, time_ns, session=header.session, number=header.number)
 
     def _is_plausible(self, frame: Frame, now_ns: int) -> bool:
         return frame.time_ns is not None and _YOUNGEST_NS <= now_ns - frame.time_ns <= _OLDEST_NS

@@ -1,4 +1,4 @@
-"""Optional libraries: the extra of the package that installs each, and the error if one is missing."""
+"""Optional libraries: the extras of the package that install each, and the error if one is missing."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ __all__ = ["LIBRARIES", "Library", "check_installed"]
 
 
 class Library(NamedTuple):
-    """An optional library: its name in texts, and the extra of ``ipsys_log`` that installs it."""
+    """An optional library: its name in texts, and the extras of ``ipsys_log`` that install it."""
 
     name: str
-    extra: str
+    extras: tuple[str, ...]
 
 
 # By the name of the module.
 LIBRARIES = {
-    "pandas": Library("pandas", "table"),
-    "pyarrow": Library("PyArrow", "table"),
-    "rerun": Library("Rerun", "view"),
-    "matplotlib": Library("Matplotlib", "report"),
-    "jinja2": Library("Jinja2", "report"),
-    "starlette": Library("Starlette", "web"),
-    "uvicorn": Library("Uvicorn", "web"),
-    "pymavlink": Library("pymavlink", "mavlink"),
-    "zenoh": Library("Zenoh", "ros2"),
-    "rosbags": Library("rosbags", "ros2"),
-    "xxhash": Library("xxhash", "ros2"),
-    "websockets": Library("websockets", "foxglove"),
-    "fsspec": Library("fsspec", "remote"),
-    "dask": Library("Dask", "batch"),
-    "distributed": Library("Dask distributed", "batch"),
-    "bokeh": Library("Bokeh", "batch"),
-    "cryptography": Library("cryptography", "batch"),
+    "pandas": Library("pandas", ("table",)),
+    "pyarrow": Library("PyArrow", ("table",)),
+    "rerun": Library("Rerun", ("view",)),
+    "matplotlib": Library("Matplotlib", ("report",)),
+    "jinja2": Library("Jinja2", ("report",)),
+    "starlette": Library("Starlette", ("web",)),
+    "uvicorn": Library("Uvicorn", ("web",)),
+    "pymavlink": Library("pymavlink", ("mavlink",)),
+    "zenoh": Library("Zenoh", ("nodes", "ros2")),
+    "rosbags": Library("rosbags", ("ros2",)),
+    "xxhash": Library("xxhash", ("ros2",)),
+    "websockets": Library("websockets", ("foxglove",)),
+    "fsspec": Library("fsspec", ("remote",)),
+    "dask": Library("Dask", ("batch",)),
+    "distributed": Library("Dask distributed", ("batch",)),
+    "bokeh": Library("Bokeh", ("batch",)),
+    "cryptography": Library("cryptography", ("batch",)),
 }
 
 
@@ -48,7 +48,7 @@ def check_installed(subject: str, *modules: str) -> None:
     Parameters
     ----------
     subject : the beginning of the error, with its verb, such as ``view needs``.
-    modules : names of modules in ``LIBRARIES``, all of one extra.
+    modules : names of modules in ``LIBRARIES``. The error names the first extra that has all of them.
 
     Raises
     ------
@@ -58,4 +58,6 @@ def check_installed(subject: str, *modules: str) -> None:
     missing = [LIBRARIES[module] for module in modules if find_spec(module) is None]
     if missing:
         names = " and ".join(library.name for library in missing)
-        raise IpsysError(f"{subject} {names}: pip install 'ipsys_log[{missing[0].extra}]'")
+        first, *others = (LIBRARIES[module].extras for module in modules)
+        extra = next(name for name in first if all(name in extras for extras in others))
+        raise IpsysError(f"{subject} {names}: pip install 'ipsys_log[{extra}]'")

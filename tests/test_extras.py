@@ -76,6 +76,9 @@ def run_without(
 def folder(tmp_path: Path, detected_log: Path, calibration: Path) -> Path:
     """A folder with a rig of simulated cameras, a recording with markers, and the model of another log."""
     (tmp_path / "lab.toml").write_text(RIG + "".join(CAMERA.format(name) for name in ("red", "white")))
+    (tmp_path / "nodes.toml").write_text(
+        RIG + CAMERA.format("red").replace("sim:red?stations=0", "zenoh:red")
+    )
     shutil.copy(detected_log, tmp_path / "lab.mcap")
     shutil.copy(calibration, tmp_path / "model.mcap")
     return tmp_path
@@ -111,6 +114,9 @@ REFUSED = {
     "pip install 'ipsys_log[mavlink]'",
     "live --ros2 --model-from model.mcap -o x.mcap": "--ros2 needs Zenoh and rosbags and xxhash: pip install "
     "'ipsys_log[ros2]'",
+    "node lab.toml --camera red": "node needs Zenoh: pip install 'ipsys_log[nodes]'",
+    "record --rig nodes.toml -o x.mcap": "camera red: the source zenoh:red needs Zenoh: pip install "
+    "'ipsys_log[nodes]'",
     "live --foxglove --model-from model.mcap -o x.mcap": "--foxglove needs websockets: pip install "
     "'ipsys_log[foxglove]'",
     "live --web --model-from model.mcap -o x.mcap": "--web needs Starlette and Uvicorn: pip install "
@@ -182,7 +188,8 @@ def test_extras_of_the_errors_are_those_of_the_package() -> None:
     installed = packages_distributions()
     named: dict[str, set[str]] = {}
     for module, library in LIBRARIES.items():
-        named.setdefault(library.extra, set()).update(normalize(name) for name in installed[module])
+        for extra in library.extras:
+            named.setdefault(extra, set()).update(normalize(name) for name in installed[module])
     declared = {
         name: {normalize(re.split("[<>=;[]", text)[0]) for text in texts}
         for name, texts in extras.items()

@@ -8,9 +8,12 @@ above::
     sent_ns - received_ns  <=  offset  <=  back_ns - replied_ns
 
 A line in the time of the node must separate the lower bounds from the upper ones. The estimate is the middle
-of the line pair that has the greatest distance: jitter moves most bounds away from the lines, and the
-exchanges with the least delay decide. A constant difference between the delays of both directions cannot be
-observed. Half of it is an error of the offset; it is always less than the bound of the estimate.
+of two parallel lines that touch the bounds: jitter moves most bounds away from the lines, and the exchanges
+with the least delay decide. With an exponential distribution of the jitter, the likelihood of a drift is
+exp(n distance / mean): n exchanges, the distance of the lines, and the mean jitter. The drift is the most
+probable one with the normal prior of crystals, so it is near 0 at first. A constant difference between the
+delays of both directions cannot be observed. Half of it is an error of the offset; it is always less than
+the bound of the estimate.
 
 References: F. Cristian, Probabilistic clock synchronization, Distributed Computing 3 (1989) 146-158; S. B.
 Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM
@@ -19,6 +22,7 @@ Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network d
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -31,17 +35,16 @@ __all__ = ["ClockHistory", "ClockLine", "Exchange", "fit_clock"]
 
 # Crystals of computers differ by less, also at extreme temperatures.
 _MOST_DRIFT = 500e-6
-# A shorter time does not determine the drift beside the jitter.
-_DRIFT_SPAN_NS = 20 * NS_PER_S
+# The drift of most computers: the standard deviation of the prior.
+_DRIFT_SIGMA = 50e-6
 # The temperature changes the drift within minutes.
 _WINDOW_NS = 60 * NS_PER_S
-_STEPS = 60
-# A greater contradiction between an exchange and the estimate is a jump of the clock.
-_JUMP_NS = NS_PER_S // 100
-
-
-# Later estimates change slowly, so they are made once a second only.
-_FEW, _REFIT_NS = 50, NS_PER_S
+# Each step of the search leaves two thirds of the range: 1e-9 in the end.
+_STEPS = 34
+# The round trip is never shorter, in s; the mean jitter is not 0.
+_LEAST_JITTER_S = 1e-6
+# Later estimates change slowly: they are made after so many exchanges more, or after this time.
+_FEW, _GROWTH, _REFIT_NS = 50, 1.1, NS_PER_S
 
 
 class Exchange(NamedTuple):
@@ -87,12 +90,13 @@ def fit_clock(exchanges: list[Exchange]) -> ClockLine:
 
     Parameters
     ----------
-    exchanges : at least one. The drift is 0 if they span less than 20 s.
+    exchanges : at least one.
 
     Examples
     --------
-    >>> fit_clock([Exchange(100, 1010, 1020, 130), Exchange(200, 1104, 1106, 214)])
-    ClockLine(node_ns=1105, offset_ns=-898, drift=0.0, bound_ns=6, exchanges=2)
+    >>> line = fit_clock([Exchange(100, 1010, 1020, 130), Exchange(200, 1104, 1106, 214)])
+    >>> line.node_ns, line.offset_ns, line.bound_ns
+    (1105, -898, 6)
     """
     reference = exchanges[-1]
     node_ns = (reference.received_ns + reference.replied_ns) // 2
@@ -104,8 +108,7 @@ def fit_clock(exchanges: list[Exchange]) -> ClockLine:
             [(row.replied_ns, row.back_ns - row.replied_ns) for row in exchanges],
         )
     )
-    span_ns = reference.received_ns - exchanges[0].received_ns
-    drift = _find_drift(lower_s, upper_s) if span_ns >= _DRIFT_SPAN_NS else 0.0
+    drift = _find_drift(lower_s, upper_s, _mean_jitter_s(exchanges))
     offset_s = float(np.mean(_offsets(lower_s, upper_s, drift)))
     bound_ns = round(_bound_s(lower_s, upper_s, offset_s) * NS_PER_S)
     return ClockLine(node_ns, base_ns + round(offset_s * NS_PER_S), drift, bound_ns, len(exchanges))
@@ -126,14 +129,53 @@ def _offsets(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64], drift: 
     )
 
 
-def _find_drift(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64]) -> float:
-    """Return the drift with the greatest distance of the lines: it is a concave function of the drift."""
+def _mean_jitter_s(exchanges: list[Exchange]) -> float:
+    """Return the mean jitter of a direction, in s; one whole round trip is added, for few exchanges."""
+    trips_ns = [exchange.round_trip_ns for exchange in exchanges]
+    least_ns, count = min(trips_ns), len(trips_ns)
+    return max((sum(trips_ns) - (count - 1) * least_ns) / (2 * count * NS_PER_S), _LEAST_JITTER_S)
+
+
+def _find_drift(lower_s: NDArray[np.float64], upper_s: NDArray[np.float64], jitter_s: float) -> float:
+    """Return the most probable drift: the logarithm of its probability is a concave function."""
+    scale = len(lower_s) / jitter_s
+
+    def log_probability(drift: float) -> float:
+        low_s, high_s = _offsets(lower_s, upper_s, drift)
+        return scale * (high_s - low_s) - (drift / _DRIFT_SIGMA) ** 2 / 2
+
     low, high = -_MOST_DRIFT, _MOST_DRIFT
     for _ in range(_STEPS):
         left, right = low + (high - low) / 3, high - (high - low) / 3
-        distances = [np.subtract(*_offsets(lower_s, upper_s, drift)[::-1]) for drift in (left, right)]
-        low, high = (left, high) if distances[0] < distances[1] else (low, right)
+        is_left = log_probability(left) > log_probability(right)
+        low, high = (low, right) if is_left else (left, high)
     return (low + high) / 2
+
+
+class _Limits(NamedTuple):
+    """The limits of the offset at a time of the node, for all delays and for all drifts of computers."""
+
+    node_ns: int
+    least_ns: int
+    most_ns: int
+
+    @classmethod
+    def of(cls, exchange: Exchange) -> _Limits:
+        """Return the limits by an exchange."""
+        low_ns, high_ns = exchange.sent_ns - exchange.received_ns, exchange.back_ns - exchange.replied_ns
+        room_ns = _drift_ns(exchange.replied_ns - exchange.received_ns)
+        return cls(exchange.replied_ns, low_ns - room_ns, high_ns)
+
+    def combine(self, later: _Limits) -> _Limits:
+        """Return the limits at a later time; the least is above the most if the clock has jumped between."""
+        room_ns = _drift_ns(later.node_ns - self.node_ns)
+        least_ns, most_ns = self.least_ns - room_ns, self.most_ns + room_ns
+        return _Limits(later.node_ns, max(least_ns, later.least_ns), min(most_ns, later.most_ns))
+
+
+def _drift_ns(span_ns: int) -> int:
+    """Return the greatest change of an offset in a time."""
+    return math.ceil(_MOST_DRIFT * abs(span_ns))
 
 
 class ClockHistory:
@@ -146,6 +188,7 @@ class ClockHistory:
 
     def __init__(self) -> None:
         self.line: ClockLine | None = None
+        self._limits: _Limits | None = None
         self._exchanges: deque[Exchange] = deque()
         # The lines before each jump, with the range of node times in which they held.
         self._former: list[tuple[int, int, ClockLine]] = []
@@ -153,19 +196,25 @@ class ClockHistory:
 
     def add(self, exchange: Exchange) -> int | None:
         """Add an exchange; return the size of a jump of the node's clock before it, in ns, or None."""
-        jump_ns = self._jump_ns(exchange)
+        jump_ns = self._take_limits(_Limits.of(exchange))
         if self.line is None or jump_ns is not None:
             if self.line is not None:
                 self._former.append((self._start_ns, self._exchanges[-1].replied_ns, self.line))
+            self.line = None
             self._exchanges.clear()
             self._start_ns = exchange.received_ns
         self._exchanges.append(exchange)
         while exchange.received_ns - self._exchanges[0].received_ns > _WINDOW_NS:
             self._exchanges.popleft()
-        few = len(self._exchanges) <= _FEW
-        if self.line is None or few or exchange.received_ns - self.line.node_ns >= _REFIT_NS:
+        if self._is_fit_due(exchange.received_ns):
             self.line = fit_clock(list(self._exchanges))
         return jump_ns
+
+    def _is_fit_due(self, node_ns: int) -> bool:
+        line, count = self.line, len(self._exchanges)
+        if line is None or count <= _FEW or count >= _GROWTH * line.exchanges:
+            return True
+        return node_ns - line.node_ns >= _REFIT_NS
 
     def to_centre_ns(self, node_ns: int) -> int | None:
         """Convert a time of the node by the estimate that held then; None before the first exchange."""
@@ -175,13 +224,14 @@ class ClockHistory:
         *_, line = min(rows, key=lambda row: max(row[0] - node_ns, node_ns - row[1], 0))
         return line.to_centre_ns(node_ns)
 
-    def _jump_ns(self, exchange: Exchange) -> int | None:
-        if self.line is None:
+    def _take_limits(self, limits: _Limits) -> int | None:
+        """Take the limits by an exchange; return the size of a jump if they contradict the earlier ones."""
+        before, self._limits = self._limits, limits
+        if before is None or self.line is None:
             return None
-        expected_ns = self.line.to_centre_ns(exchange.received_ns) - exchange.received_ns
-        room_ns = _JUMP_NS + round(_MOST_DRIFT * abs(exchange.received_ns - self.line.node_ns))
-        low_ns, high_ns = exchange.sent_ns - exchange.received_ns, exchange.back_ns - exchange.replied_ns
-        room_ns = min(room_ns, _JUMP_NS * 10)
-        if low_ns - room_ns <= expected_ns <= high_ns + room_ns:
+        combined = before.combine(limits)
+        if combined.least_ns <= combined.most_ns:
+            self._limits = combined
             return None
-        return expected_ns - (low_ns + high_ns) // 2
+        expected_ns = self.line.to_centre_ns(limits.node_ns) - limits.node_ns
+        return expected_ns - (limits.least_ns + limits.most_ns) // 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,17 +12,17 @@ from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import frame_payload
 from ipsys_log.capture.video_packets import find_size, is_decodable_start
-from ipsys_log.errors import LogError
+from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "ReaderContext"]
+__all__ = ["Arrival", "CameraReader", "CameraState", "ReaderContext", "imported_run"]
 
 # The run of markers that nodes have detected.
-NODES_RUN = "nodes"
+_NODES_RUN = "nodes"
 
 # Longest wait for the first frame of a camera.
 _FIRST_FRAME_S = 10.0
@@ -57,6 +57,26 @@ class CameraState:
     format: str | None = None
     size_px: tuple[int, int] | None = None
     delay_s: float | None = None
+
+
+def imported_run(states: Mapping[str, CameraState]) -> str | None:
+    """Return the run of the markers that nodes send instead of frames; None if no camera sends markers.
+
+    A stage reads the markers of one run, so all cameras send markers, or none.
+
+    Raises
+    ------
+    IpsysError
+        Some cameras send markers, and others frames.
+    """
+    names = [name for name, state in states.items() if state.format == MARKERS_FORMAT]
+    if names and len(names) < len(states):
+        others = ", ".join(name for name in states if name not in names)
+        raise IpsysError(
+            f"camera {', '.join(names)} sends markers, but camera {others} sends frames; start all nodes with"
+            " --detect, or none"
+        )
+    return _NODES_RUN if names else None
 
 
 class Arrival(NamedTuple):
@@ -229,7 +249,8 @@ class CameraReader:
             markers = decode(schema_name(Markers), frame.data)
         except LogError as error:
             raise SourceError(f"camera {name}: its node sends damaged markers ({error})") from error
-        return MARKERS.topic_of(NODES_RUN, name), replace(markers, timestamp=time_ns)
+        keyed = replace(markers, timestamp=time_ns, node_session=frame.session, node_frame=frame.number)
+        return MARKERS.topic_of(_NODES_RUN, name), keyed
 
     def _is_early(self, frame: Frame) -> bool:
         """Return whether a frame arrived before the recording began, or depends on a frame that did.

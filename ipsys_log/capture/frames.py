@@ -34,13 +34,16 @@ class Frame(NamedTuple):
 
     ``format`` is jpeg, png, h264 or h265; or markers, if a node has detected them and sends no image.
     ``time_ns`` is the driver's stamp in UTC; None without a stamp. ``missed`` is the number of frames lost
-    directly before this frame, by the count of the driver.
+    directly before this frame, by the count of the driver. A frame of a node has the session of the node, and
+    its number in it.
     """
 
     data: bytes
     format: str
     time_ns: int | None
     missed: int = 0
+    session: str | None = None
+    number: int | None = None
 
 
 class SourceMessage(NamedTuple):

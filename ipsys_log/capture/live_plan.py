@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.camera_thread import NODES_RUN, CameraState
+from ipsys_log.capture.camera_thread import CameraState, imported_run
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
@@ -112,27 +112,9 @@ def plan_live(
     copied = _copied(request, until)
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
-    wired = _wire(cameras, settings, lenses, request, copied, until, _sends_markers(cameras))
+    arriving = imported_run(cameras) if isinstance(cameras, Mapping) else None
+    wired = _wire(cameras, settings, lenses, request, copied, until, arriving)
     return LivePlan(request, copied, *wired)
-
-
-def _sends_markers(cameras: Collection[str]) -> bool:
-    """Return whether the cameras send markers instead of frames.
-
-    Raises
-    ------
-    IpsysError
-        Some cameras send markers, and others frames.
-    """
-    states = cameras.items() if isinstance(cameras, Mapping) else ()
-    names = [name for name, state in states if state.format == MARKERS_FORMAT]
-    if names and len(names) < len(cameras):
-        others = ", ".join(name for name in cameras if name not in names)
-        raise IpsysError(
-            f"camera {', '.join(names)} sends markers, but camera {others} sends frames; start all nodes with"
-            " --detect, or none"
-        )
-    return bool(names)
 
 
 def check_start(
@@ -239,21 +221,24 @@ def _wire(
     request: Request,
     copied: Sequence[tuple[Task, Model]],
     until: str | None,
-    sends_markers: bool,
+    arriving: str | None,
 ) -> tuple[list[LiveRun], list[WiredStage]]:
-    """Return the runs of a live recording, and its stages, each wired to the runs that it reads."""
+    """Return the runs of a live recording, and its stages, each wired to the runs that it reads.
+
+    ``arriving`` is the run of markers that arrive instead of images.
+    """
     runs: list[LiveRun] = []
     stages: list[WiredStage] = []
 
-    imported = {MARKERS: NODES_RUN} if sends_markers else {}
+    imported = {} if arriving is None else {MARKERS: arriving}
     # Stages that read images see no camera.
-    pictured = () if sends_markers else cameras
+    pictured = cameras if arriving is None else ()
 
     def add(stage: Stage, inputs: dict[Channel, str], model: Model | None) -> None:
         options = request.options(model.name if model else None)
         view = _LiveView(pictured, lenses, settings, inputs, model, imported=imported)
         plan = stage.plan(view, options)
-        if isinstance(plan, str) and sends_markers:
+        if isinstance(plan, str) and arriving is not None:
             inputs.update({channel: plan for channel in stage.writes if channel is not RUN_EVENTS})
             return
         assert isinstance(plan, Plan), f"{stage.name} cannot run live"

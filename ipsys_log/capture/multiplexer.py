@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from ipsys_log.capture.camera_thread import NODES_RUN, Arrival, CameraReader, ReaderContext
+from ipsys_log.capture.camera_thread import Arrival, CameraReader, ReaderContext, imported_run
 from ipsys_log.capture.frames import Clock, Open, Say, SourceError
-from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 
@@ -118,9 +117,14 @@ class LiveCameras:
 
     @property
     def imported_run(self) -> str | None:
-        """The run of the markers that nodes send instead of frames; None if no camera sends markers."""
-        sends_markers = any(state.format == MARKERS_FORMAT for state in self.states.values())
-        return NODES_RUN if sends_markers else None
+        """The run of the markers that nodes send instead of frames; None if no camera sends markers.
+
+        Raises
+        ------
+        IpsysError
+            Some cameras send markers, and others frames.
+        """
+        return imported_run(self.states)
 
     @property
     def is_stopped(self) -> bool:

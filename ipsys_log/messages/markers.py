@@ -28,12 +28,18 @@ class Marker:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """All markers in a frame of ``width`` x ``height`` px, sorted by id."""
+    """All markers in a frame of ``width`` x ``height`` px, sorted by id.
+
+    If a node has detected them, the log of the centre has the session of the node, and the number of the frame
+    in it.
+    """
 
     timestamp: TimeNs
     markers: tuple[Marker, ...]
     width: int
     height: int
+    node_session: str | None = None
+    node_frame: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,7 @@ from ipsys_log.runs.graph import input_runs, writes
 from ipsys_log.runs.provenance import complete_runs, newest_run, replaced_lenses
 from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.selection import rig_in_force
+from ipsys_log.soundness.clocks import check_clocks
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
@@ -70,6 +71,7 @@ class Findings:
     cameras : cameras in the order of the rig, which is the order of the paper's tables.
     advice : advice from learning curves; None without learning curves.
     calibrated : cameras of the joint model; empty without such a model.
+    clock_contradictions : a sentence for each camera of a node whose clock contradicts the joint model.
     """
 
     rig: Rig | None
@@ -78,6 +80,7 @@ class Findings:
     cameras: tuple[str, ...]
     advice: Advice | None
     calibrated: tuple[CalibratedCamera, ...] = ()
+    clock_contradictions: tuple[str, ...] = ()
 
     @property
     def models(self) -> list[str]:
@@ -200,6 +203,7 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
         (*ordered, *sorted(cameras - {*ordered})),
         advise(evaluations),
         _calibrated(session, evaluated, models),
+        tuple(finding.text for finding in check_clocks(session)),
     )
 
 

@@ -163,6 +163,7 @@ def joint_pictures(findings: Findings) -> list[Picture]:
             "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the "
             "reference, or that of a camera that saw no drive"
         )
+        text = ". ".join([text, *(f"Contradiction: {line}" for line in findings.clock_contradictions)])
         pictures.append(picture(clocks_figure(cameras), text))
     most_px = residual_limit_px(cameras)
     for camera in cameras:

@@ -21,6 +21,7 @@ from ipsys_log.soundness.channels import (
     decoded_topics,
     image_topics,
 )
+from ipsys_log.soundness.clocks import check_clocks
 from ipsys_log.soundness.finding import BROKEN, REMARK, LogCheck, LogFinding
 from ipsys_log.soundness.provenance import check_runs, find_input_logs
 from ipsys_log.soundness.references import check_cameras, check_intrinsics, check_measurements, check_rigs
@@ -114,6 +115,7 @@ def _check_contents(
             whole = stack.enter_context(Session([*sources, path]))
         for check in (check_rigs, check_cameras, check_intrinsics, check_measurements):
             yield from _findings("reference", check(whole))
+        yield from _findings("time", check_clocks(whole))
         yield from _findings("run", check_runs(whole, names))
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from ipsys_log.analysis.node_clock import ClockHistory, Exchange, fit_clock
+from ipsys_log.capture.nodes.centre import _TURN_S, _TURNS_S
 from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
@@ -93,23 +94,29 @@ def test_asymmetric_delay_gives_half_its_difference_as_error() -> None:
     assert fit_clock(rows).bound_ns >= 5 * MS
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_line_has_the_greatest_distance_by_linear_programming(seed: int) -> None:
-    rows = jittered(seed, 250, 7 * MS, 40e-6, (1, 3), 10)
+@pytest.mark.parametrize(("seed", "count"), [(0, 250), (1, 250), (2, 250), (3, 20), (4, 20)])
+def test_line_is_the_most_probable_one_by_linear_programming(seed: int, count: int) -> None:
+    """The oracle maximises over both lines and the drift; tangents replace the square of the prior."""
+    rows = jittered(seed, count, 7 * MS, 40e-6, (1, 3), 10)
     line = fit_clock(rows)
     base = rows[-1].sent_ns - rows[-1].received_ns
     lower = np.array([(r.received_ns - line.node_ns, r.sent_ns - r.received_ns - base) for r in rows]) / MS
     upper = np.array([(r.replied_ns - line.node_ns, r.back_ns - r.replied_ns - base) for r in rows]) / MS
-    # The variables are the lower offset, the upper offset (both in ms) and 1e6 times the drift.
-    one, zero = np.ones(len(rows)), np.zeros(len(rows))
-    below = np.column_stack([-one, zero, -lower[:, 0] * 1e-6])
-    above = np.column_stack([zero, one, upper[:, 0] * 1e-6])
-    bounds = [(None, None), (None, None), (-500, 500)]
+    trips = [row.round_trip_ns / MS for row in rows]
+    jitter = (sum(trips) - (len(trips) - 1) * min(trips)) / len(trips) / 2
+    # The variables: the lower and the upper offset in ms, 1e6 times the drift, and half its scaled square.
+    one, zero, ppm = np.ones(len(rows)), np.zeros(len(rows)), np.arange(-500.0, 501.0)
+    below = np.column_stack([-one, zero, -lower[:, 0] * 1e-6, zero])
+    above = np.column_stack([zero, one, upper[:, 0] * 1e-6, zero])
+    tangents = np.column_stack([0 * ppm, 0 * ppm, ppm / 50**2, 0 * ppm - 1])
     best = linprog(
-        [1, -1, 0], np.vstack([below, above]), np.concatenate([-lower[:, 1], upper[:, 1]]), bounds=bounds
+        [len(rows) / jitter, -len(rows) / jitter, 0, 1],
+        np.vstack([below, above, tangents]),
+        np.concatenate([-lower[:, 1], upper[:, 1], ppm**2 / 50**2 / 2]),
+        bounds=[(None, None), (None, None), (-500, 500), (None, None)],
     )
     assert best.x is not None
-    low, high, drift = best.x
+    low, high, drift, _ = best.x
     assert line.bound_ns / MS >= (high - low) / 2 - 1e-4
     assert (line.offset_ns - base) / MS == pytest.approx((high + low) / 2, abs=0.02)
     assert line.drift * 1e6 == pytest.approx(drift, abs=2)
@@ -140,3 +147,40 @@ def test_drift_of_100_ppm_is_no_jump() -> None:
     assert {history.add(row) for row in rows} == {None}
     assert history.line is not None
     assert history.line.exchanges < 700  # the window has an end
+
+
+def test_slow_first_answers_are_no_jump() -> None:
+    """The first answers take 200 ms on the way back: the estimate is wrong by 100 ms, within its bound."""
+    history = ClockHistory()
+    rows = jittered(1, 5, 0, 0.0, (1, 200), 1) + jittered(2, 40, 0, 0.0, (1, 1), 1)[5:]
+    assert {history.add(row) for row in rows} == {None}
+    assert history.line is not None
+    assert abs(history.line.offset_ns) < 2 * MS
+
+
+def test_jump_of_5_ms_is_found_when_the_exchanges_show_it() -> None:
+    history = ClockHistory()
+    rows = jittered(1, 100, 0, 0.0, (0.1, 0.1), 1)
+    later = [row._replace(received_ns=row.received_ns + 5 * MS, replied_ns=row.replied_ns + 5 * MS)
+             for row in rows[50:]]  # fmt: skip
+    jumps = [history.add(row) for row in rows[:50] + later]
+    assert [number for number, jump_ns in enumerate(jumps) if jump_ns is not None] == [50]
+    assert jumps[50] == pytest.approx(5 * MS, abs=1.5 * MS)
+
+
+# The greatest error of 1,000 random clocks was 0.85 ms.
+@pytest.mark.parametrize("seed", range(3))
+def test_error_is_below_1_ms_from_2_5_s_on(seed: int) -> None:
+    """The exchanges have the times of the centre; a frame is converted by the estimate before it."""
+    rng, history, at_s = random.Random(seed), ClockHistory(), 0.0
+    offset_ns, drift = rng.randint(-3600 * NS_PER_S, 3600 * NS_PER_S), 100e-6 * (-1) ** seed
+    for number in range(700):
+        delays_ns = [round((0.1 + rng.random() * 20) * MS) for _ in range(2)]
+        row = exchange(round(at_s * NS_PER_S), *delays_ns, offset_ns, drift)
+        node_ns = START_NS - offset_ns + round((1 - drift) * (row.sent_ns - START_NS))
+        centre_ns = history.to_centre_ns(node_ns)
+        if at_s > 2.5:
+            assert centre_ns is not None
+            assert abs(centre_ns - row.sent_ns) < MS
+        history.add(row)
+        at_s += next((turn_s for count, turn_s in _TURNS_S if number < count), _TURN_S)

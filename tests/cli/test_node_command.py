@@ -85,6 +85,13 @@ def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool,
         assert session.payloads(["/cameras/red/clock"])[0].camera == "red"
 
 
+def markers_at_node(log: Path, run: str) -> list[bytes]:
+    """Return the markers of a run by the number of their frame, without their times."""
+    with Session([log]) as session:
+        payloads = session.payloads([f"/runs/{run}/cameras/red/markers"])
+        return [encode(replace(markers, timestamp=0)) for markers in payloads]
+
+
 def test_rig_file_keeps_the_network_of_nodes(tmp_path: Path) -> None:
     rig = Rig("lab", "DICT_4X4_100", 0.2, nodes=RigNodes("192.168.1.10:7449", "certificates"))
     (tmp_path / "lab.toml").write_text(rig_toml(rig))
@@ -116,7 +123,11 @@ def test_wrong_node_is_refused_with_one_line(tmp_path: Path, ipsys: Ipsys) -> No
 def test_live_from_markers_of_nodes_is_verified(
     tmp_path: Path, lab_log: Path, calibration: Path, ipsys: Ipsys
 ) -> None:
-    """The markers at the centre are those of the node, byte for byte; the frames stay at the node."""
+    """The markers at the centre are those of the node, for each key byte for byte; frames stay at the node.
+
+    The key is the session of the node and the number of the frame. The detection from the recorded images of
+    the node is repeated, and gives the same bytes.
+    """
     write_rigs(tmp_path, "sim:red?stations=5")
     with node_of(tmp_path, "--detect", "--calibration", str(lab_log)) as node:
         lenses = ("--rig", tmp_path / "centre.toml", "--calibration", lab_log)
@@ -126,18 +137,21 @@ def test_live_from_markers_of_nodes_is_verified(
         node.terminate()
         said, _ = node.communicate(timeout=PATIENCE_S)
     assert node.returncode == 0, said
-    with Session([tmp_path / "centre.mcap"]) as centre, Session([tmp_path / "red.mcap"]) as at_node:
+    again = ipsys("detect", tmp_path / "red.mcap", "--as-live", "--run", "again")
+    assert again.code == 0, again.err
+    made, repeated = (markers_at_node(tmp_path / "red.mcap", run) for run in ("edges", "again"))
+    assert repeated == made
+    with Session([tmp_path / "centre.mcap"]) as centre:
         assert centre.images == {}
-        arrived, made = (
-            [encode(replace(markers, timestamp=0)) for markers in session.payloads([topic])]
-            for session, topic in (
-                (centre, "/runs/nodes/cameras/red/markers"),
-                (at_node, "/runs/edges/cameras/red/markers"),
-            )
-        )
-        assert arrived
-        assert set(arrived) <= set(made)
+        arrived = centre.payloads(["/runs/nodes/cameras/red/markers"])
         assert centre.payloads(["/runs/poly/tracks"])
+        sessions = {estimate.session for estimate in centre.payloads(["/cameras/red/clock"])}
+    assert arrived
+    assert {markers.node_session for markers in arrived} == sessions
+    numbers = [markers.node_frame for markers in arrived]
+    assert len(set(numbers)) == len(numbers)
+    for number, markers in zip(numbers, arrived, strict=True):
+        assert encode(replace(markers, timestamp=0, node_session=None, node_frame=None)) == made[number]
     verified = ipsys("verify", tmp_path / "centre.mcap")
     assert verified.code == 0, verified.out
     assert "the replay is identical to the log" in verified.out

@@ -78,6 +78,8 @@ def test_page_has_a_picture_of_each_kind(cameras: tuple[CalibratedCamera, ...], 
     assert "image of black" in captions[2]
     assert captions[3].endswith(". Without one sighting that does not fit")
     assert all(one["width"] < 480 for one in joint_pictures(findings))
+    contradicted = replace(findings, clock_contradictions=("camera red: its clock",))
+    assert joint_pictures(contradicted)[1]["caption"].endswith(". Contradiction: camera red: its clock")
     still = tuple(replace(camera, clock_sigma_s=0.0, residuals=None) for camera in cameras)
     assert len(joint_pictures(replace(findings, calibrated=still))) == 1
     assert joint_pictures(replace(findings, calibrated=())) == []

@@ -1,8 +1,8 @@
 """The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
 
-All cameras of a recording share one session. The centre asks each node for its state ten times a second, and
-for frames that did not arrive, with the lowest priority. Everything that arrives waits in a queue with a
-limit; a dropped frame is missing, so the node sends it again.
+All cameras of a recording share one session. The centre asks each node for its state ten times a second, more
+often in the first 20 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
+waits in a queue with a limit; a dropped frame is missing, so the node sends it again.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ __all__ = ["Centre", "is_of_node", "node_of"]
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
+# The period of the exchanges up to a number of them: the first ones together find offset and drift.
+_TURNS_S = ((250, 0.02), (625, 0.04))
 _TURN_S = 0.1
-# The first exchanges follow each other faster: together they find the offset.
-_FIRST_TURN_S, _FIRST_EXCHANGES = 0.02, 40
 _FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S
 _ANSWER_S, _FRAMES_S = 3.0, 20.0
@@ -193,13 +193,15 @@ class _Link:
                 return
 
     def _take(self) -> _Arrival | None:
-        turn_s = _FIRST_TURN_S if self._exchanges < _FIRST_EXCHANGES else _TURN_S
         with self._arrived:
             if not self._waiting:
-                self._arrived.wait(turn_s)
+                self._arrived.wait(self._turn_s())
             arrival = self._waiting.popleft() if self._waiting else None
             self._waiting_bytes -= arrival.size if arrival else 0
             return arrival
+
+    def _turn_s(self) -> float:
+        return next((turn_s for count, turn_s in _TURNS_S if self._exchanges < count), _TURN_S)
 
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
         with self._arrived:
@@ -227,8 +229,7 @@ class _Link:
         import zenoh
 
         now_ns = self._clock.now_ns()
-        turn_s = _FIRST_TURN_S if self._exchanges < _FIRST_EXCHANGES else _TURN_S
-        if now_ns - self._state_asked_ns < turn_s * NS_PER_S:
+        if now_ns - self._state_asked_ns < self._turn_s() * NS_PER_S:
             return
         self._state_asked_ns = sent_ns = self._clock.now_ns()
 

@@ -27,6 +27,10 @@ _ON_THE_WAY_NS = NS_PER_S
 # A frame cannot be older on arrival, nor younger: the clock of the node has jumped, and no exchange shows it
 # yet.
 _OLDEST_NS, _YOUNGEST_NS = 10 * NS_PER_S, -NS_PER_S // 10
+# A node was started again if another session answers for this time, and its own session does not.
+_RESTARTED_NS = 2 * NS_PER_S
+# Before so many answers, the user can still choose between two nodes: the recording does not begin.
+_FIRST_ANSWERS = 20
 # One gap names at most this number of frames: an hour at 100 frames/s.
 _MOST_MISSING = 360_000
 
@@ -46,6 +50,10 @@ class NodeStream:
         self._camera, self._version = camera, version
         self._session = ""
         self._former: set[str] = set()
+        # Another session that answers, and its first request; the sessions that were refused.
+        self._rival: tuple[str, int] | None = None
+        self._refused: set[str] = set()
+        self._began_ns = self._answers = 0
         self._history = ClockHistory()
         self._asked_ns = self._estimated_ns = 0
         self._counts: deque[tuple[int, int]] = deque()
@@ -116,12 +124,20 @@ class NodeStream:
         Raises
         ------
         SourceError
-            The node has another version of ipsys, or two nodes send as this camera.
+            The node has another version of ipsys, or two nodes send as this camera from the start.
         """
-        self._check(state, sent_ns)
+        self._check_version(state)
+        if second := self._find_second(state, sent_ns):
+            yield from self._refuse(second, back_ns)
+            if second == state.session:
+                return
         if state.session != self._session:
+            if self._rival is not None and sent_ns - self._rival[1] < _RESTARTED_NS:
+                return
+            self._began_ns = sent_ns
             yield from self._begin(state, back_ns)
-        self._state, self._asked_ns, self._is_unsure = state, sent_ns, False
+        self._state, self._asked_ns, self._is_unsure = state, max(sent_ns, self._asked_ns), False
+        self._answers += 1
         exchange = Exchange(sent_ns, state.received_ns, state.replied_ns, back_ns)
         jump_ns = self._history.add(exchange) if _is_possible(exchange) else None
         if jump_ns is not None:
@@ -183,18 +199,41 @@ class NodeStream:
         if not self._missing:
             yield from self._close_gap(now_ns)
 
-    def _check(self, state: NodeState, sent_ns: int) -> None:
+    def _check_version(self, state: NodeState) -> None:
         if state.version != self._version:
             raise SourceError(
                 f"camera {self._camera.name}: its node has ipsys {state.version}, but this machine has ipsys "
                 f"{self._version}; install one version on both"
             )
-        is_second = sent_ns == self._asked_ns and state.session != self._session
-        if is_second or state.session in self._former:
-            raise SourceError(
-                f"camera {self._camera.name}: two nodes send as camera {self._camera.name}; end one of them, "
-                "or give it another --camera"
-            )
+
+    def _find_second(self, state: NodeState, sent_ns: int) -> str:
+        """Return the session of a second node, known by an answer of each to one request; "" for none."""
+        rival, self._rival = self._rival, None
+        if state.session == self._session:
+            return rival[0] if rival is not None and sent_ns >= rival[1] else ""
+        if not self._session or (state.session in self._former and sent_ns < self._began_ns):
+            return ""
+        if state.session in self._former or sent_ns <= self._asked_ns:
+            return state.session
+        self._rival = rival if rival is not None and rival[0] == state.session else (state.session, sent_ns)
+        return ""
+
+    def _refuse(self, session: str, now_ns: int) -> Items:
+        """Refuse a second node: once by an event, or by an error at the start.
+
+        Raises
+        ------
+        SourceError
+            The recording has not begun.
+        """
+        name = self._camera.name
+        advice = "end one of them, or give it another --camera"
+        if self._answers < _FIRST_ANSWERS:
+            raise SourceError(f"camera {name}: two nodes send as camera {name}; {advice}")
+        if session not in self._refused:
+            self._refused.add(session)
+            text = f"camera {name}: two nodes send as camera {name}, and the second one is refused; {advice}"
+            yield self._event("node_refused", text, now_ns)
 
     def _begin(self, state: NodeState, now_ns: int) -> Items:
         """Begin a session: of the first one, only new frames; of a later one, all."""
@@ -206,7 +245,7 @@ class NodeStream:
             yield self._event("node_restarted", text, now_ns)
         self._first = 0 if self._session else state.recorded
         self._session, self._next = state.session, None
-        self._history, self._counts = ClockHistory(), deque()
+        self._history, self._counts, self._rival = ClockHistory(), deque(), None
         self._missing, self._gap_count = {}, 0
 
     def _frame(self, header: FrameHeader, data: bytes) -> Frame:
@@ -215,7 +254,7 @@ class NodeStream:
             # The node has given the middle of the exposure. The reader of the camera adds this distance
             # again.
             time_ns -= mid_exposure_ns(0, self._camera)
-        return Frame(data, header.format, time_ns)
+        return Frame(data, header.format, time_ns, session=header.session, number=header.number)
 
     def _is_plausible(self, frame: Frame, now_ns: int) -> bool:
         return frame.time_ns is not None and _YOUNGEST_NS <= now_ns - frame.time_ns <= _OLDEST_NS

@@ -62,7 +62,7 @@ class Bench:
             if (request := self.stream.frame_request()) is None:
                 return
             for number in range(request.first, request.end):
-                self.frame(number, is_late=True)
+                self.frame(number, is_late=True, session=request.session)
         raise AssertionError("the centre asks for ever")
 
 
@@ -180,7 +180,8 @@ def test_restarted_node_sends_all_frames_of_its_new_session() -> None:
     bench.frame(7)
     bench.frame(9)
     bench.frame(0, session=TWO)  # not announced yet
-    bench.state(count=2, session=TWO)
+    for _ in range(22):
+        bench.state(count=2, session=TWO)
     bench.frame(1, session=TWO)
     assert [event.kind for event in bench.events] == ["node_gap", "node_restarted", "node_gap"]
     assert "1 frames before are only in the log of the node" in bench.events[1].text
@@ -192,11 +193,42 @@ def test_two_nodes_with_one_name_are_refused() -> None:
     bench.state(count=7)
     with pytest.raises(SourceError, match="camera red: two nodes send as camera red; end one of them"):
         bench.state(count=2, session=TWO, after_s=0)  # both answer one request
+    assert bench.events == []
     other = Bench()
     for session in (ONE, TWO):
         other.state(count=7, session=session)
     with pytest.raises(SourceError, match="two nodes send as camera red"):
         other.state(count=8, session=ONE)
+
+
+def test_second_node_during_a_recording_is_refused_and_sends_nothing() -> None:
+    """The order of both answers to a request varies; the second node ends, and the first one sends on."""
+    bench = Bench()
+    bench.state(count=0)
+    for number in range(100):
+        sessions = (ONE, TWO) if number % 3 else (TWO, ONE)
+        bench.now_ns += NS_PER_S // 10
+        for session in sessions if 30 < number < 90 else (ONE,):
+            bench.state(count=number, session=session, after_s=0)
+            bench.frame(number, session=session)
+    assert bench.numbers() == list(range(100))
+    (refusal,) = bench.events
+    assert refusal.kind == "node_refused"
+    assert "two nodes send as camera red, and the second one is refused; end one" in refusal.text
+
+
+def test_node_that_ends_leaves_its_camera_to_the_second_one() -> None:
+    bench = Bench()
+    for _ in range(30):
+        bench.state(count=0)
+    for number in range(60):
+        bench.state(count=number, session=TWO)
+        bench.frame(number, session=TWO)
+        bench.send_missing()
+        if number < 10:
+            bench.state(count=0, after_s=0)
+    assert [event.kind for event in bench.events[:2]] == ["node_refused", "node_restarted"]
+    assert sorted(bench.numbers()) == list(range(60))
 
 
 def test_other_version_is_refused_with_both_versions() -> None:

@@ -1,8 +1,8 @@
 """Tasks of a batch: the functions of the single commands on one log, each with a small result.
 
 A task runs in a worker process, perhaps on another machine. Each task can run twice: a log has its results as
-runs, and a run that exists is not computed again. The first task of a long log gives the pieces of its detection
-as further tasks. When these are done, the same task merges their results.
+runs, and a run that exists is not computed again. The first task of a long log gives the pieces of its
+detection as further tasks. When these are done, the same task merges their results.
 """
 
 from __future__ import annotations

@@ -49,5 +49,5 @@ def _store_and_note(task: PieceTask) -> None:
 
 
 if NOTES in os.environ:
-    tasks.store_piece = _store_and_note
+    vars(tasks)["store_piece"] = _store_and_note
     pieces._MIN_FRAMES = 1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
-from ipsys_log.cli.options import AsJson, RigFile
+from ipsys_log.cli.options import AsJson, LogList, OtherLog, RigFile, log_argument, other_log_option
 
 if TYPE_CHECKING:
     from ipsys_log.survey.drift_reading import DriftReading
@@ -17,18 +17,17 @@ if TYPE_CHECKING:
 __all__ = ["add_commands"]
 
 Sources = Annotated[
-    list[Path],
-    typer.Argument(help="Logs of one lab, in any order. Each is read on its own.", metavar="LOG"),
+    LogList,
+    log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own."),
 ]
 Baseline = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--baseline", metavar="LOG", help="The log before all moves. Default: the first by time."),
+    OtherLog,
+    other_log_option("--baseline", help="The log before all moves. Default: the first by time."),
 ]
 ModelLog = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option(
+    OtherLog,
+    other_log_option(
         "--model-from",
-        metavar="LOG",
         help="The log with the fitted model. Default: the baseline, if it has one.",
     ),
 ]

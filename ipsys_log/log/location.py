@@ -167,5 +167,10 @@ def is_one_of(path: Path, logs: Sequence[LogLocation]) -> bool:
 
 
 def file_beside(log: LogLocation, suffix: str) -> Path:
-    """Return the file with the name of a log and another suffix; for a URL, it is in the current folder."""
-    return log.with_suffix(suffix) if isinstance(log, Path) else Path(f"{log.stem}{suffix}")
+    """Return the file with the name of a log and another suffix.
+
+    It is in the current folder if the log is at a URL, or in a folder without write permission.
+    """
+    if isinstance(log, Path) and os.access(log.absolute().parent, os.W_OK):
+        return log.with_suffix(suffix)
+    return Path(f"{log.stem}{suffix}")

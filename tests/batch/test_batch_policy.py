@@ -59,8 +59,8 @@ class Future:
 class Scheduler:
     """A scheduler whose workers end in the tasks of some logs, with all other tasks that run meanwhile.
 
-    It repeats a task itself ``retries`` times before it reports the end of a worker. The logs in ``long`` have
-    this number of pieces, and the deadly ones among them end their workers in their first piece only.
+    It repeats a task itself ``retries`` times before it reports the end of a worker. The logs in ``long``
+    have this number of pieces, and the deadly ones among them end their workers in their first piece only.
     """
 
     def __init__(

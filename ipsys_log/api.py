@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from ipsys_log.capture.frames import Clock
     from ipsys_log.joint.fitted_corners import FittedCornerModel
+    from ipsys_log.runs.pieces import PieceWorkers
     from ipsys_log.sinks.sink import Sink
 
 __all__ = [
@@ -135,7 +136,7 @@ def replay(
     until: str | None = None,
     rig: Rig | StrPath | None = None,
     calibrations: Mapping[str, CameraCalibration] | None = None,
-    model_from: StrPath | None = None,
+    model_from: StrPath | LogUrl | None = None,
     output: StrPath | None = None,
     run: str | None = None,
     corners: str | None = None,
@@ -148,6 +149,7 @@ def replay(
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
     jobs: int | None = None,
+    workers: PieceWorkers | None = None,
 ) -> ReplayResult:
     """Compute the results that logs lack, and append them to the last log or write them to ``output``.
 
@@ -166,6 +168,7 @@ def replay(
     progress : called with the stage, the number of messages done, and the total number of messages.
     say : called with the runs that are out of date and computed again.
     jobs : number of processes that detect markers in a long log; None: one for each core.
+    workers : they compute the pieces of a long log, instead of ``jobs`` processes of this machine.
 
     Raises
     ------
@@ -180,7 +183,7 @@ def replay(
         models=tuple(models),
         rig=rig if rig is None or isinstance(rig, Rig) else load_rig(Path(rig)),
         lenses=dict(calibrations or {}),
-        model_from=None if model_from is None else Path(model_from),
+        model_from=None if model_from is None else parse_location(model_from),
         train=train,
         seed=seed,
         run=run,
@@ -192,7 +195,7 @@ def replay(
     )
     count = available_cores() if jobs is None else jobs
     logs, target = choose_target(find_logs(paths), None if output is None else Path(output))
-    outcomes = pipeline.replay(logs, request, until, target, progress, say, count)
+    outcomes = pipeline.replay(logs, request, until, target, progress, say, count, workers)
     written = [target] if target is not None and target.exists() else []
     with Session([*logs, *written]) as session:
         return ReplayResult(tuple(outcomes), _evaluations(session, outcomes))

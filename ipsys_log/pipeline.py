@@ -58,6 +58,7 @@ from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stag
 from ipsys_log.runs.model_checks import check_fits
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
+from ipsys_log.runs.pieces import PieceWorkers
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
@@ -76,6 +77,7 @@ def replay(
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
     jobs: int = 1,
+    workers: PieceWorkers | None = None,
 ) -> list[Outcome]:
     """Compute the results that a log lacks, up to a stage, and append them; or write them to a new log.
 
@@ -87,6 +89,7 @@ def replay(
     until : the last stage; None: all stages. With fuse, models are also evaluated if points are held out.
     say : called before the computation, with the runs that are out of date and the reason.
     jobs : number of processes that detect markers in a long log; the bytes are the same with any number.
+    workers : they compute the pieces of a long log, instead of ``jobs`` processes of this machine.
 
     Returns
     -------
@@ -104,7 +107,7 @@ def replay(
     outcomes: list[Outcome] = []
     unchecked = list(models) if len(models) > 1 else []
 
-    workers = LocalWorkers(jobs)
+    local = LocalWorkers(jobs)
 
     def make(task: Task, session: Session, name: str) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
@@ -112,9 +115,9 @@ def replay(
             if MODEL in task.stage.writes and task.foreign == () and unchecked:
                 check_fits(session, request, task.inputs, unchecked)
                 unchecked.clear()
-            yield from compute_messages(task, session, name, progress, workers)
+            yield from compute_messages(task, session, name, progress, workers or local)
 
-    with open_target(paths, output) as (logs, target), workers:
+    with open_target(paths, output) as (logs, target), local:
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""

@@ -8,6 +8,8 @@ from typing import Any
 
 from ipsys_log.batch.tasks import UP_TO_DATE, LogResult
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
+from ipsys_log.log.log_files import read_log_state
 from ipsys_log.log_export import EXPORT_FORMATS, ExportOptions, channel_of_table, find_format
 
 __all__ = ["check_exports", "export_log"]
@@ -16,7 +18,7 @@ _EXPORTED = "exported"
 
 
 def check_exports(
-    logs: Sequence[Path], folder: Path, table: str, run: str | None, robot: str | None, format: str
+    logs: Sequence[LogLocation], folder: Path, table: str, run: str | None, robot: str | None, format: str
 ) -> str:
     """Check the options of an export, and the names of its files; return the suffix of the files.
 
@@ -29,7 +31,7 @@ def check_exports(
     target = folder / f"log{suffix}"
     find_format(target, format).check(target, ExportOptions(table, robot), [run])
     channel_of_table(table)
-    by_name: dict[str, Path] = {}
+    by_name: dict[str, LogLocation] = {}
     for log in logs:
         other = by_name.setdefault(log.stem, log)
         if other != log:
@@ -42,16 +44,20 @@ def check_exports(
     return suffix
 
 
-def export_log(path: Path, folder: Path, suffix: str, overwrite: bool = False, **wishes: Any) -> LogResult:
+def export_log(
+    path: LogLocation, folder: Path, suffix: str, overwrite: bool = False, **wishes: Any
+) -> LogResult:
     """Export a log to a file of its name, as :meth:`ipsys_log.opened_log.Log.export` does.
 
-    A file that is newer than its log is up to date.
+    A file that is newer than its log is up to date. A store that tells no times has all its logs exported.
     """
     from ipsys_log import api
 
     target = folder / f"{path.stem}{suffix}"
-    if not overwrite and target.exists() and target.stat().st_mtime_ns >= path.stat().st_mtime_ns:
-        return LogResult(str(path), UP_TO_DATE)
+    if not overwrite and target.exists():
+        changed_ns = read_log_state(path).changed_ns
+        if changed_ns is not None and target.stat().st_mtime_ns >= changed_ns:
+            return LogResult(str(path), UP_TO_DATE)
     folder.mkdir(parents=True, exist_ok=True)
     with api.open(path) as log:
         exported = log.export(target, **wishes)

@@ -1,21 +1,32 @@
 """Tasks of a batch: the functions of the single commands on one log, each with a small result.
 
 A task runs in a worker process, perhaps on another machine. Each task can run twice: a log has its results as
-runs, and a run that exists is not computed again.
+runs, and a run that exists is not computed again. The first task of a long log gives the pieces of its
+detection as further tasks. When these are done, the same task merges their results.
 """
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ipsys_log import __version__
-from ipsys_log.errors import IpsysError, os_error_text, reason_without
+from ipsys_log.errors import IpsysError, WriteError, os_error_text, reason_without
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.runs.graph import VERSIONS
+from ipsys_log.runs.output import choose_target
+from ipsys_log.runs.piece_folder import (
+    OtherSoftwareError,
+    PieceFolder,
+    PiecesMissingError,
+    PieceTask,
+    StoredPieces,
+    store_piece,
+)
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.soundness.finding import BROKEN, SOUND
 
@@ -23,11 +34,15 @@ __all__ = [
     "FAILED",
     "UP_TO_DATE",
     "BatchTask",
+    "LogPieces",
     "LogResult",
+    "PieceState",
     "VersionError",
     "Work",
     "check_log",
     "perform",
+    "perform_or_divide",
+    "perform_piece",
     "replay_log",
     "verify_log",
 ]
@@ -57,6 +72,8 @@ class LogResult:
     runs : the runs that were computed, compared or exported.
     messages : the number of messages that were written, compared or exported.
     trace : the traceback of a fault of the program; "" otherwise.
+    pieces : the number of pieces of a long log that were computed as tasks of their own.
+    lost_attempts : the number of results of pieces that were computed more than once, and deleted.
     """
 
     log: str
@@ -66,6 +83,29 @@ class LogResult:
     runs: tuple[str, ...] = ()
     messages: int = 0
     trace: str = ""
+    pieces: int = 0
+    lost_attempts: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LogPieces:
+    """The pieces that must be computed before the task of a long log is repeated."""
+
+    tasks: tuple[PieceTask, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PieceState:
+    """The state of a piece after its task.
+
+    Attributes
+    ----------
+    failure : the result of its log, if the piece failed; None if the piece is stored.
+    other_software : True if the worker has other libraries: the log must not be divided.
+    """
+
+    failure: LogResult | None = None
+    other_software: bool = False
 
 
 Work = Callable[..., LogResult]
@@ -79,39 +119,83 @@ class BatchTask:
     ----------
     work : one of the functions of this module.
     version, stage_versions : of the program that gives the work to the workers.
+    divides : True if the work may divide a long log into pieces.
     """
 
     work: Work
     options: Mapping[str, Any] = field(default_factory=dict)
+    divides: bool = False
     version: str = __version__
     stage_versions: Mapping[str, int] = field(default_factory=lambda: dict(VERSIONS))
 
 
-def perform(task: BatchTask, path: Path) -> LogResult:
+def perform(task: BatchTask, path: LogLocation) -> LogResult:
     """Do the work on a log; every fault becomes a result, so that the other logs are not affected.
 
     Raises
     ------
     VersionError
         The worker has another version than the batch: it would compute other results.
+    PiecesMissingError
+        The work may divide the log, and pieces are missing.
     """
     _check_versions(task)
     try:
         return task.work(path, **task.options)
-    except IpsysError as error:
+    except PiecesMissingError:
+        raise
+    except Exception as error:
+        return _failure_of(path, error)
+
+
+def perform_or_divide(task: BatchTask, path: LogLocation) -> LogResult | LogPieces:
+    """Do the work on a log as :func:`perform`; of a long log, return the pieces that are not stored yet.
+
+    Raises
+    ------
+    VersionError
+        The worker has another version than the batch.
+    """
+    try:
+        return perform(replace(task, options={**task.options, "divide": True}), path)
+    except PiecesMissingError as missing:
+        return LogPieces(tuple(missing.tasks))
+
+
+def perform_piece(task: BatchTask, path: LogLocation, piece: PieceTask) -> PieceState:
+    """Compute a piece of a log, and store its result.
+
+    Raises
+    ------
+    VersionError
+        The worker has another version than the batch.
+    """
+    _check_versions(task)
+    try:
+        store_piece(piece)
+    except OtherSoftwareError:
+        return PieceState(other_software=True)
+    except Exception as error:
+        return PieceState(_failure_of(path, error))
+    return PieceState()
+
+
+def _failure_of(path: LogLocation, error: Exception) -> LogResult:
+    """Return the result of a log whose task had an error."""
+    if isinstance(error, IpsysError):
         return _failure(path, reason_without(path, error))
-    except OSError as error:
+    if isinstance(error, OSError):
         return _failure(path, os_error_text(error).removeprefix(f"{path}: "))
-    except MemoryError:
+    if isinstance(error, MemoryError):
         return _failure(
             path, "the memory of the worker is full; use fewer workers, or a larger --memory-limit"
         )
-    except Exception as error:
-        text = f"fault of ipsys: {type(error).__name__}: {error}"
-        return _failure(path, text, traceback.format_exc())
+    text = f"fault of ipsys: {type(error).__name__}: {error}"
+    trace = "".join(traceback.format_exception(error))
+    return _failure(path, text, trace)
 
 
-def _failure(path: Path, text: str, trace: str = "") -> LogResult:
+def _failure(path: LogLocation, text: str, trace: str = "") -> LogResult:
     """Return the result of a log that failed; its reason is one line."""
     return LogResult(str(path), FAILED, False, text.partition("\n")[0], trace=trace)
 
@@ -134,30 +218,64 @@ def _differences(ours: Mapping[str, int], theirs: Mapping[str, int]) -> str:
     return ", ".join(named) or "no others"
 
 
-def replay_log(path: Path, outdated: bool = False, **options: Any) -> LogResult:
+def replay_log(
+    path: LogLocation,
+    outdated: bool = False,
+    folder: Path | None = None,
+    divide: bool = False,
+    **options: Any,
+) -> LogResult:
     """Compute the results that a log lacks in this process, as :func:`ipsys_log.api.replay` does.
 
     Parameters
     ----------
     outdated : leave a log without outdated runs unchanged.
+    folder : for the results of a log that cannot be appended to; None: the working folder.
+    divide : do not detect markers in a long log here, but merge the stored results of its pieces.
     options : those of the replay.
+
+    Raises
+    ------
+    PiecesMissingError
+        Some pieces are not stored yet; nothing is written.
     """
     from ipsys_log import api
 
-    if outdated and not _has_outdated_run(path):
+    logs, output = choose_target([path], None, folder)
+    if outdated and not _has_outdated_run(logs):
         return LogResult(str(path), NOT_OUTDATED)
+    target = output or logs[-1]
+    assert isinstance(target, Path)  # the results are in a file, also those of a log at a URL
+    target.parent.mkdir(parents=True, exist_ok=True)
+    stored = StoredPieces(PieceFolder.beside(target))
     remarks: list[str] = []
-    outcomes = api.replay(path, say=remarks.append, jobs=1, **options).outcomes
+    workers = stored if divide else None
+    try:
+        outcomes = api.replay(
+            *logs, output=output, say=remarks.append, jobs=1, workers=workers, **options
+        ).outcomes
+    except WriteError:
+        raise
+    except IpsysError:
+        if output is None and 0 < stored.count == stored.merged:  # the log has their run already
+            stored.folder.clear(stored.merged)
+        raise
+    lost = stored.folder.clear(stored.merged)
     new = [outcome for outcome in outcomes if outcome.fresh]
     remarks += [f"{outcome.run}: {remark}" for outcome in new for remark in outcome.remarks]
-    runs = tuple(dict.fromkeys(outcome.run for outcome in new))
-    messages = sum(outcome.messages for outcome in new)
-    state = COMPUTED if new else UP_TO_DATE
-    return LogResult(str(path), state, text=_remarks_text(remarks), runs=runs, messages=messages)
+    return LogResult(
+        str(path),
+        COMPUTED if new else UP_TO_DATE,
+        text=_remarks_text(remarks),
+        runs=tuple(dict.fromkeys(outcome.run for outcome in new)),
+        messages=sum(outcome.messages for outcome in new),
+        pieces=stored.merged,
+        lost_attempts=lost,
+    )
 
 
-def _has_outdated_run(path: Path) -> bool:
-    with Session([path]) as session:
+def _has_outdated_run(logs: Sequence[LogLocation]) -> bool:
+    with Session(logs) as session:
         return bool(outdated_runs(session))
 
 
@@ -167,7 +285,7 @@ def _remarks_text(remarks: Sequence[str]) -> str:
     return "; ".join(lines[:_MOST_REMARKS] + more)
 
 
-def verify_log(path: Path, run: str | None = None) -> LogResult:
+def verify_log(path: LogLocation, run: str | None = None) -> LogResult:
     """Repeat the runs of a log, and compare each channel, as :func:`ipsys_log.api.verify` does."""
     from ipsys_log import api
 
@@ -184,7 +302,7 @@ def verify_log(path: Path, run: str | None = None) -> LogResult:
     )
 
 
-def check_log(path: Path) -> LogResult:
+def check_log(path: LogLocation) -> LogResult:
     """Read a log completely and check it, as :func:`ipsys_log.api.check` does."""
     from ipsys_log import api
 

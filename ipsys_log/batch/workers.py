@@ -5,23 +5,28 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipsys_log import __version__
 from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-__all__ = ["Workers", "dask_setup", "open_workers"]
+__all__ = ["Workers", "dask_setup", "most_tasks", "open_workers"]
 
 _LOOPBACK = "127.0.0.1"
 _CONNECT_TIMEOUT_S = 15.0
 _DISTRIBUTION = "ipsys_log"
+# A piece of a log has about this many bytes or more, so a smaller log is one task.
+_PIECE_BYTES = 4 << 20
+_MOST_PIECES = 1024  # of a log of unknown size
 # An existing cluster can grow, and it grows only if tasks wait.
 _LEAST_WAITING = 8
 # Dask's settings of the workers on this machine.
@@ -63,13 +68,20 @@ class Workers:
         return self.local or max(_LEAST_WAITING, 2 * sum(self.client.nthreads().values()))
 
 
+def most_tasks(logs: Iterable[LogLocation]) -> int:
+    """Return the number of tasks that may run at the same time: long logs have pieces."""
+    sizes = (log.stat().st_size if isinstance(log, Path) and log.is_file() else None for log in logs)
+    # The size of a log at a URL would be a request.
+    return sum(_MOST_PIECES if size is None else 1 + size // _PIECE_BYTES for size in sizes)
+
+
 @contextmanager
-def open_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
+def open_workers(settings: WorkerSettings, tasks: int) -> Iterator[Workers]:
     """Start worker processes on this machine, or connect to an existing scheduler.
 
     Parameters
     ----------
-    logs : the number of logs: more worker processes would have no work.
+    tasks : the number of tasks at the same time: more worker processes would have no work.
 
     Raises
     ------
@@ -79,7 +91,7 @@ def open_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
     settings.check()
     with ExitStack() as stack:
         if settings.scheduler is None:
-            workers = stack.enter_context(_local_workers(settings, logs))
+            workers = stack.enter_context(_local_workers(settings, tasks))
         else:
             workers = stack.enter_context(_connected_workers(settings.scheduler, settings))
         _check_versions(workers.client)
@@ -87,12 +99,12 @@ def open_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
 
 
 @contextmanager
-def _local_workers(settings: WorkerSettings, logs: int) -> Iterator[Workers]:
+def _local_workers(settings: WorkerSettings, tasks: int) -> Iterator[Workers]:
     import dask
     from dask.system import CPU_COUNT
     from distributed import Client, LocalCluster, Security
 
-    count = min(settings.workers or CPU_COUNT, max(logs, 1))
+    count = min(settings.workers or CPU_COUNT, max(tasks, 1))
     limit = _parse_limit(settings.memory_limit)
     with (
         dask.config.set(_CONFIG),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ipsys_log.analysis.frame_gaps import find_gaps
@@ -13,17 +12,19 @@ from ipsys_log.api import ModelEvaluation
 from ipsys_log.errors import IpsysError, os_error_text, reason_without
 from ipsys_log.exchange.parquet_rows import Columns
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation, LogState
 from ipsys_log.messages.channels import EVALUATION, EVENTS, MEASUREMENTS
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["COLUMNS", "Baseline", "file_state", "read_row"]
+__all__ = ["COLUMNS", "Baseline", "read_row", "state_columns"]
 
 COLUMNS: Columns = {
     "log": "string",
     "bytes": "int64",
     "changed_ns": "int64",
+    "object_version": "string",
     "error": "string",
     "start_utc": "time",
     "end_utc": "time",
@@ -75,19 +76,20 @@ COLUMNS: Columns = {
 class Baseline:
     """The log before all moves of cameras, and the log with the fitted model of the cameras."""
 
-    log: Path
-    model_from: Path
+    log: LogLocation
+    model_from: LogLocation
 
 
-def read_row(path: Path, name: str, baseline: Baseline | None) -> dict[str, Any]:
+def read_row(path: LogLocation, name: str, state: LogState, baseline: Baseline | None) -> dict[str, Any]:
     """Return the row of a log; the row of a log that cannot be read has its error instead of contents.
 
     Parameters
     ----------
     name : of the log in the catalogue.
+    state : of the log before it is read, so that a later change is noticed.
     baseline : for the drift of the cameras since then; None: no drift.
     """
-    row: dict[str, Any] = {"log": name, **file_state(path)}
+    row: dict[str, Any] = {"log": name, **state_columns(state)}
     try:
         with Session([path]) as session:
             row |= _contents(session)
@@ -98,10 +100,13 @@ def read_row(path: Path, name: str, baseline: Baseline | None) -> dict[str, Any]
     return row | (_drift(path, baseline) if baseline is not None else {})
 
 
-def file_state(path: Path) -> dict[str, int]:
-    """Return size and change time of a file: a log that has the same ones is not read again."""
-    status = path.stat()
-    return {"bytes": status.st_size, "changed_ns": status.st_mtime_ns}
+def state_columns(state: LogState) -> dict[str, Any]:
+    """Return the columns that show a change of a log: a log with the same ones is not read again."""
+    return {
+        "bytes": state.size,
+        "changed_ns": state.changed_ns,
+        "object_version": state.version or None,
+    }
 
 
 def _contents(session: Session) -> dict[str, Any]:
@@ -164,7 +169,7 @@ def _evaluations(session: Session) -> Iterator[dict[str, Any]]:
                 yield {"run": run, "model": evaluation.model, **{name: row[name] for name in kept}}
 
 
-def _drift(path: Path, baseline: Baseline) -> dict[str, Any]:
+def _drift(path: LogLocation, baseline: Baseline) -> dict[str, Any]:
     """Return the shift of each camera's floor map since the baseline, at the end of the log."""
     from ipsys_log.survey.drift_reading import read_drift
 

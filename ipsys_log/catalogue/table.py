@@ -9,16 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.catalogue.row import COLUMNS, Baseline, file_state, read_row
+from ipsys_log.catalogue.row import COLUMNS, Baseline, read_row, state_columns
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.parquet_rows import read_rows, write_rows
-from ipsys_log.log.log_files import logs_below
+from ipsys_log.log.location import LogLocation
+from ipsys_log.log.log_files import read_log_state, states_below
 from ipsys_log.runs.graph import VERSIONS
 
 __all__ = ["CatalogueUpdate", "update_catalogue"]
 
 # Raised when a row gets another content for the same log.
-_VERSION = 1
+_VERSION = 2
 _KIND = "catalogue "
 
 
@@ -41,19 +42,19 @@ class CatalogueUpdate:
 
 
 def update_catalogue(
-    folder: Path,
+    folder: LogLocation,
     target: Path,
     baseline: Baseline | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> CatalogueUpdate:
     """Write the catalogue of all logs below a folder; only new or changed logs are read.
 
-    A log is read again if its size or change time differs. All logs are read again if the stages of this
-    ipsys have other versions, or the baseline differs: states and drift depend on these.
+    A log is read again if its size, change time or, in a store, its ETag differs. All logs are read again if
+    the stages of this ipsys have other versions, or the baseline differs: states and drift depend on these.
 
     Parameters
     ----------
-    folder : logs are named by their path below it.
+    folder : a folder, or the URL of one, or a URL with a pattern. Logs are named by their path below it.
     target : the Parquet file. The rows of an earlier catalogue in it are used again.
     baseline : for the drift of the cameras since then; None: no drift.
     progress : called with the number of logs done, and of all logs.
@@ -61,23 +62,24 @@ def update_catalogue(
     Raises
     ------
     IpsysError
-        There is no such folder, PyArrow is not installed, or the target is another file.
+        There is no such folder, a store cannot be listed, PyArrow is not installed, or the target is another
+        file.
     """
-    paths = {str(path.relative_to(folder)): path for path in logs_below(folder)}
+    logs = {name: (log, state) for name, log, state in states_below(folder)}
     mark = _mark(baseline)
     before = _earlier_rows(target, mark) if target.exists() else {}
     rows: list[dict[str, Any]] = []
     read = 0
-    for number, (name, path) in enumerate(paths.items()):
-        progress(number, len(paths))
-        row = before.get(name)
-        if row is None or {key: row[key] for key in ("bytes", "changed_ns")} != file_state(path):
-            row, read = read_row(path, name, baseline), read + 1
+    for number, (name, (log, state)) in enumerate(logs.items()):
+        progress(number, len(logs))
+        row, columns = before.get(name), state_columns(state)
+        if row is None or any(row[key] != value for key, value in columns.items()):
+            row, read = read_row(log, name, state, baseline), read + 1
         rows.append(row)
-    progress(len(paths), len(paths))
+    progress(len(logs), len(logs))
     write_rows(target, rows, COLUMNS, mark)
     errors = {row["log"]: row["error"] for row in rows if row.get("error")}
-    return CatalogueUpdate(len(rows), read, len(before.keys() - paths.keys()), errors)
+    return CatalogueUpdate(len(rows), read, len(before.keys() - logs.keys()), errors)
 
 
 def _earlier_rows(target: Path, mark: str) -> dict[str, dict[str, Any]]:
@@ -91,6 +93,10 @@ def _earlier_rows(target: Path, mark: str) -> dict[str, dict[str, Any]]:
 def _mark(baseline: Baseline | None) -> str:
     """Return the identity of all on which a row depends besides its log."""
     logs = [] if baseline is None else [baseline.log, baseline.model_from]
-    states = [[str(log.resolve()), file_state(log)] for log in logs]
+    states = [[_name(log), state_columns(read_log_state(log))] for log in logs]
     parts = json.dumps([_VERSION, VERSIONS, states], sort_keys=True)
     return _KIND + hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
+
+
+def _name(log: LogLocation) -> str:
+    return str(log.resolve() if isinstance(log, Path) else log)

@@ -16,6 +16,7 @@ from ipsys_log.cli.options import (
     Corners,
     RigFile,
     cameras_of,
+    file_log_argument,
     load_calibrations,
     log_option,
 )
@@ -28,7 +29,7 @@ __all__ = ["add_commands"]
 
 NoLogs = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    typer.Argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
+    file_log_argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
 ]
 Plot = Annotated[
     Path | None,

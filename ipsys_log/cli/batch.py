@@ -6,18 +6,22 @@ import inspect
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from ipsys_log.cli.console import console, remarks, say
-from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.options import AsJson, LogList, log_argument
 from ipsys_log.cli.stages import build_command, options_until, replay_options
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from ipsys_log.batch.settings import WorkerSettings
-    from ipsys_log.batch.tasks import BatchTask, LogResult, Work
+    from ipsys_log.batch.tasks import BatchTask, LogResult
+    from ipsys_log.log.location import LogLocation
 
 __all__ = ["add_commands"]
 
@@ -28,12 +32,26 @@ _RATE_PERIOD_S = 1800.0
 
 _LOGS = (
     Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="LOG", help="Logs, each one on its own. A folder stands for all logs below it."
+        LogList,
+        log_argument(
+            help="Logs, files or URLs, each one on its own. A folder, or a URL that ends with /, stands for "
+            "all logs below it."
         ),
     ],
     inspect.Parameter.empty,
+)
+_FOLDER = (
+    Annotated[
+        _Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="The folder for the results of logs that cannot be appended to: URLs and read-only files. "
+            "Default: the working folder.",
+        ),
+    ],
+    None,
 )
 # The options of the workers and of the result, which all commands of the group have.
 _WORKERS: dict[str, tuple[Any, Any]] = {
@@ -161,9 +179,9 @@ def add_commands(app: typer.Typer) -> None:
         group.command(name, help=text + _MORE)(build_command(options, work))
 
     text = "Run the missing stages of each log, and append their results to it."
-    add("replay", text, _replay, {**_stage_options(None), "outdated": _OUTDATED})
+    add("replay", text, _replay, {**_stage_options(None), "output": _FOLDER, "outdated": _OUTDATED})
     text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
-    add("evaluate", text, _evaluate, _stage_options("evaluate"))
+    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _FOLDER})
     add(
         "verify", "Compute every run of each log again, and compare it byte for byte.", _verify, {"run": _RUN}
     )
@@ -178,33 +196,45 @@ def _stage_options(until: str | None) -> dict[str, tuple[Any, Any]]:
 
 
 def _replay(outdated: bool, **given: Any) -> None:
-    from ipsys_log.batch.tasks import replay_log
-
-    options, batch = _divide(given)
-    _run(replay_log, {"outdated": outdated, **_replay_options(options)}, **batch)
+    _replay_each(given, outdated=outdated)
 
 
 def _evaluate(**given: Any) -> None:
-    from ipsys_log.batch.tasks import replay_log
+    _replay_each(given, until="evaluate")
+
+
+def _replay_each(given: dict[str, Any], **further: Any) -> None:
+    from ipsys_log.batch.tasks import BatchTask, replay_log
 
     options, batch = _divide(given)
-    _run(replay_log, {"until": "evaluate", **_replay_options(options)}, **batch)
+    folder = _result_folder(options.pop("output"))
+    work = {**further, "folder": folder, **_replay_options(options)}
+    _run(BatchTask(replay_log, work, divides=True), **batch)
+
+
+def _result_folder(folder: Path | None) -> Path:
+    """Return the folder for derived logs, as workers with other working folders name it."""
+    from ipsys_log.errors import IpsysError
+
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise IpsysError(f"-o {folder}: is not a folder; name a folder for the results")
+    return (folder or Path()).absolute()
 
 
 def _verify(run: str | None, **batch: Any) -> None:
-    from ipsys_log.batch.tasks import verify_log
+    from ipsys_log.batch.tasks import BatchTask, verify_log
 
-    _run(verify_log, {"run": run}, **batch)
+    _run(BatchTask(verify_log, {"run": run}), **batch)
 
 
 def _check(**batch: Any) -> None:
-    from ipsys_log.batch.tasks import check_log
+    from ipsys_log.batch.tasks import BatchTask, check_log
 
-    _run(check_log, {}, **batch)
+    _run(BatchTask(check_log), **batch)
 
 
 def _export(
-    logs: list[Path],
+    logs: list[LogLocation],
     output: Path,
     format_: str,
     channel: str,
@@ -214,12 +244,14 @@ def _export(
     **batch: Any,
 ) -> None:
     from ipsys_log.batch.exports import check_exports, export_log
+    from ipsys_log.batch.tasks import BatchTask
     from ipsys_log.log.log_files import expand_folders
 
     wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
-    suffix = check_exports(expand_folders(logs), output, **wishes)
-    options = {"folder": output, "suffix": suffix, "overwrite": overwrite, **wishes}
-    _run(export_log, options, logs=logs, **batch)
+    paths = expand_folders(logs)
+    suffix = check_exports(paths, output, **wishes)
+    options = {"folder": output.absolute(), "suffix": suffix, "overwrite": overwrite, **wishes}
+    _run(BatchTask(export_log, options), logs=paths, **batch)
 
 
 def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -249,16 +281,10 @@ def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _run(
-    work: Work,
-    options: dict[str, Any],
-    logs: list[Path],
-    table: Path | None,
-    as_json: bool,
-    **settings: Any,
+    task: BatchTask, logs: list[LogLocation], table: Path | None, as_json: bool, **settings: Any
 ) -> None:
     """Do the work on each log, and print the results in the order of the logs."""
     from ipsys_log.batch.settings import WorkerSettings
-    from ipsys_log.batch.tasks import BatchTask
     from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
     from ipsys_log.report.files import check_file
@@ -269,23 +295,27 @@ def _run(
         check_file(table, "--table", logs)
     workers, paths = WorkerSettings(**settings), expand_folders(logs)
     if workers.scheduler is not None:  # its workers have other working directories
-        paths = [path.absolute() for path in paths]
-        options = {k: value.absolute() if isinstance(value, Path) else value for k, value in options.items()}
-    results = _collect(BatchTask(work, options), paths, workers)
+        paths = [path.absolute() if isinstance(path, Path) else path for path in paths]
+        task = replace(task, options={name: _absolute(value) for name, value in task.options.items()})
+    results = _collect(task, paths, workers)
     _print(results, table, as_json)
     if not all(result.good for result in results):
         raise typer.Exit(1)
 
 
-def _collect(task: BatchTask, paths: Sequence[Path], settings: WorkerSettings) -> list[LogResult]:
+def _absolute(value: Any) -> Any:
+    return value.absolute() if isinstance(value, Path) else value
+
+
+def _collect(task: BatchTask, paths: Sequence[LogLocation], settings: WorkerSettings) -> list[LogResult]:
     from ipsys_log.batch.execution import run_batch
-    from ipsys_log.batch.workers import open_workers
+    from ipsys_log.batch.workers import most_tasks, open_workers
 
     by_log: dict[str, LogResult] = {}
-    with open_workers(settings, len(paths)) as workers:
+    with open_workers(settings, most_tasks(paths) if task.divides else len(paths)) as workers:
         say(f"dashboard: {workers.dashboard}")
-        with _batch_bar(len(paths)) as show:
-            for result in run_batch(workers, task, paths):
+        with _batch_bar(len(paths)) as (show, show_pieces):
+            for result in run_batch(workers, task, paths, show_pieces):
                 by_log[result.log] = result
                 show(result)
     return [by_log[str(path)] for path in paths]
@@ -308,29 +338,40 @@ def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> N
 
 
 @contextmanager
-def _batch_bar(count: int) -> Iterator[Callable[[LogResult], None]]:
-    """Yield a function that shows a result: a bar with rate, failures and remaining time, on a terminal."""
+def _batch_bar(
+    count: int,
+) -> Iterator[tuple[Callable[[LogResult], None], Callable[[LogLocation, int, int], None]]]:
+    """Yield functions that show a result, and the pieces of a log, as bars with rate and remaining time."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     if not remarks.is_terminal:
-        yield lambda result: None
+        yield lambda result: None, lambda log, done, total: None
         return
     columns = (
-        TextColumn("logs"),
+        TextColumn("{task.description}"),
         BarColumn(bar_width=None),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}", justify="right"),
-        TextColumn("{task.fields[failures]} failed", justify="right"),
+        TextColumn("{task.fields[failures]}", justify="right"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=remarks, transient=True, speed_estimate_period=_RATE_PERIOD_S) as bar:
-        task, failures = bar.add_task("logs", total=count, rate="", failures=0), 0
+        task, failures = bar.add_task("logs", total=count, rate="", failures="0 failed"), 0
+        of_log: dict[str, TaskID] = {}
 
         def show(result: LogResult) -> None:
             nonlocal failures
             failures += not result.good
-            speed = bar.tasks[task].speed
+            speed = bar.tasks[0].speed
             rate = f"{60 * speed:,.1f} logs/min" if speed else ""
-            bar.update(task, advance=1, rate=rate, failures=failures)
+            bar.update(task, advance=1, rate=rate, failures=f"{failures} failed")
+            if result.log in of_log:
+                bar.remove_task(of_log.pop(result.log))
 
-        yield show
+        def show_pieces(log: LogLocation, done: int, total: int) -> None:
+            name = str(log)
+            if name not in of_log:
+                of_log[name] = bar.add_task(f"pieces of {log.name}", rate="", failures="")
+            bar.update(of_log[name], completed=done, total=total)
+
+        yield show, show_pieces

@@ -12,7 +12,7 @@ import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.open_cameras import SENT_NOW, Lab, prepare_lab, record_now
-from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ __all__ = ["add_commands"]
 
 Sources = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    typer.Argument(help="Logs, folders of pictures, pictures or videos.", metavar="SOURCE"),
+    file_log_argument(help="Logs, folders of pictures, pictures or videos.", metavar="SOURCE"),
 ]
 RigNow = Annotated[
     Path | None,

@@ -25,6 +25,7 @@ from ipsys_log.cli.options import (
     Port,
     RigFile,
     cameras_of,
+    file_log_argument,
     load_calibrations,
     load_matching_rig,
     log_option,
@@ -60,7 +61,7 @@ Plot = Annotated[
 
 Sources = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    typer.Argument(
+    file_log_argument(
         help="Logs, read as one session. The last log gets the results. Without LOG: use the cameras of "
         "--rig now.",
         metavar="LOG",

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
 
 __all__ = ["add_commands"]
 
@@ -23,14 +26,19 @@ def add_commands(app: typer.Typer) -> None:
 
 def catalogue(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="The folder; all logs below it are in the catalogue.")
+        str,
+        typer.Argument(
+            metavar="FOLDER",
+            help="The folder, or its URL; all logs below it are in the catalogue. A URL may have a pattern, "
+            "such as 's3://lab/2026-*/*.mcap'.",
+        ),
     ],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="FILE", help="The catalogue: a Parquet file (.parquet)."),
     ],
     baseline: Annotated[
-        Optional[Path],  # noqa: UP045
+        Optional[str],  # noqa: UP045
         typer.Option(
             "--baseline",
             metavar="LOG",
@@ -38,7 +46,7 @@ def catalogue(
         ),
     ] = None,
     model_from: Annotated[
-        Optional[Path],  # noqa: UP045
+        Optional[str],  # noqa: UP045
         typer.Option(
             "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
         ),
@@ -54,6 +62,7 @@ def catalogue(
     from ipsys_log.catalogue.table import update_catalogue
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
+    from ipsys_log.log.location import parse_location
     from ipsys_log.plain_text import plain_text
     from ipsys_log.report.files import check_file
 
@@ -61,14 +70,15 @@ def catalogue(
     if output.suffix != ".parquet":
         raise IpsysError(f"-o {output}: a catalogue ends in .parquet; use {output.stem}.parquet")
     check_file(output, "-o", [])
-    for name, log in (("--baseline", baseline), ("--model-from", model_from)):
-        if log is not None and not log.is_file():
-            raise IpsysError(f"{name} {log}: is not a file; name a log")
     if model_from is not None and baseline is None:
         raise IpsysError("--model-from: has an effect only with --baseline; give the log before all moves")
-    since = None if baseline is None else Baseline(baseline, model_from or baseline)
+    given = [
+        _log(name, text) for name, text in (("--baseline", baseline), ("--model-from", model_from)) if text
+    ]
+    since = Baseline(given[0], given[-1]) if given else None
+    place = parse_location(folder)
     with progress_bar(()) as progress:
-        update = update_catalogue(folder, output, since, lambda done, total: progress("logs", done, total))
+        update = update_catalogue(place, output, since, lambda done, total: progress("logs", done, total))
     if as_json:
         print(json.dumps(asdict(update), indent=2))  # noqa: T201
         return
@@ -79,3 +89,13 @@ def catalogue(
         console.print(plain_text(line), style="yellow")
     if len(errors) > _MOST_LINES:
         console.print(f"and {len(errors) - _MOST_LINES} more logs with errors: --json lists all")
+
+
+def _log(name: str, text: str) -> LogLocation:
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.location import parse_location
+
+    log = parse_location(text)
+    if isinstance(log, Path) and not log.is_file():
+        raise IpsysError(f"{name} {log}: is not a file; name a log")
+    return log

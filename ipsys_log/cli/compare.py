@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, ReadLogs
+from ipsys_log.cli.options import AsJson, OneLog, OtherLog, ReadLogs, one_log_argument
 from ipsys_log.cli.signals import writes_nothing
 
 if TYPE_CHECKING:
@@ -61,10 +61,10 @@ def verify(
 
 @writes_nothing
 def diff(
-    first: Annotated[Path, typer.Argument(metavar="FIRST", help="The first log.")],
+    first: Annotated[OneLog, one_log_argument(metavar="FIRST", help="The first log, a file or a URL.")],
     second: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Argument(
+        OtherLog,
+        one_log_argument(
             metavar="SECOND", help="The second log. Without it, --run twice compares two runs of the first."
         ),
     ] = None,

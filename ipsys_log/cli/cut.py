@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import FileLogs, NewLog, Overwrite
+from ipsys_log.cli.options import NewLog, Overwrite, ReadLogs
 
 __all__ = ["add_commands"]
 
@@ -19,7 +19,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def cut(
-    logs: FileLogs,
+    logs: ReadLogs,
     output: NewLog,
     start: Annotated[
         str, typer.Option(metavar="TIME", help=f"Keep messages from this time on: {_TIME}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
-from ipsys_log.cli.options import AsJson, RigFile
+from ipsys_log.cli.options import AsJson, LogList, OtherLog, RigFile, log_argument, other_log_option
 
 if TYPE_CHECKING:
     from ipsys_log.survey.drift_reading import DriftReading
@@ -17,18 +17,17 @@ if TYPE_CHECKING:
 __all__ = ["add_commands"]
 
 Sources = Annotated[
-    list[Path],
-    typer.Argument(help="Logs of one lab, in any order. Each is read on its own.", metavar="LOG"),
+    LogList,
+    log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own."),
 ]
 Baseline = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--baseline", metavar="LOG", help="The log before all moves. Default: the first by time."),
+    OtherLog,
+    other_log_option("--baseline", help="The log before all moves. Default: the first by time."),
 ]
 ModelLog = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option(
+    OtherLog,
+    other_log_option(
         "--model-from",
-        metavar="LOG",
         help="The log with the fitted model. Default: the baseline, if it has one.",
     ),
 ]
@@ -85,6 +84,7 @@ def drift(
 
 def _fix(reading: DriftReading) -> str | None:
     """Append the mended model to the last log; return its run, or None if no camera has moved."""
+    from ipsys_log.errors import IpsysError
     from ipsys_log.joint.mending import PoseChange
     from ipsys_log.runs.mended_model import append_mended_model
 
@@ -96,7 +96,10 @@ def _fix(reading: DriftReading) -> str | None:
     ends_ns = [state.time_ns for camera in moved for state in reading.drift.of_camera(camera)]
     steps_ns = [move.after_ns for move in reading.drift.moves if move.camera in moved]
     valid_from_ns = max(steps_ns, default=max(ends_ns))
-    run = append_mended_model(reading.paths[-1], reading.source, reading.paths[0], changes, valid_from_ns)
+    last = reading.paths[-1]
+    if not isinstance(last, Path):
+        raise IpsysError(f"{last}: nothing can be appended to a log at a URL; download the log for --fix")
+    run = append_mended_model(last, reading.source, reading.paths[0], changes, valid_from_ns)
     say(
         f"{reading.paths[-1]}: run {run} has the model with the new poses of {', '.join(changes)}; to use "
         f"it: ipsys live --model-from {reading.paths[-1]} --model joint"

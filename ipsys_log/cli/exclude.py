@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.options import AsJson, file_log_argument
 
 __all__ = ["add_commands"]
 
@@ -20,7 +20,8 @@ def add_commands(app: typer.Typer) -> None:
 
 def exclude(
     log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="A finished log with measurements, which gets the change.")
+        Path,
+        file_log_argument(metavar="LOG", help="A finished log with measurements, which gets the change."),
     ],
     points: Annotated[
         list[str],

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, NewLog, Overwrite
+from ipsys_log.cli.options import AsJson, LogList, NewLog, Overwrite, log_argument
 
 if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.runs.merge import MergeResult
     from ipsys_log.runs.merge_plan import LogOffset
 
@@ -25,8 +26,8 @@ def add_commands(app: typer.Typer) -> None:
 
 def merge(
     logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG", help="The logs of the recorders. The clock of the first log counts."),
+        LogList,
+        log_argument(help="The logs of the recorders, files or URLs. The clock of the first log counts."),
     ],
     output: NewLog,
     offset: Annotated[
@@ -65,7 +66,7 @@ def merge(
     remarks.print(f"next: ipsys replay {output}", markup=False)
 
 
-def _show(logs: Sequence[Path], offsets: Sequence[LogOffset], result: MergeResult) -> None:
+def _show(logs: Sequence[LogLocation], offsets: Sequence[LogOffset], result: MergeResult) -> None:
     for path, offset, one in zip(logs[1:], offsets[1:], result.logs[1:], strict=True):
         sigma = "" if offset.sigma_s is None else f" (estimated, sigma {offset.sigma_s * 1e3:.2f} ms)"
         console.print(f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}", markup=False)

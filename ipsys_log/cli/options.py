@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,14 +19,17 @@ if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 
     LogList = list[LogLocation]
+    OneLog = LogLocation
+    OtherLog = LogLocation | None
 else:
     LogList = list[str]  # typer knows no union of types
+    OneLog = str
+    OtherLog = Optional[str]  # noqa: UP045
 
 __all__ = [
     "AsJson",
     "Calibrations",
     "Corners",
-    "FileLogs",
     "Force",
     "Host",
     "LogList",
@@ -33,7 +37,9 @@ __all__ = [
     "Method",
     "ModelOfOther",
     "NewLog",
+    "OneLog",
     "Only",
+    "OtherLog",
     "Overwrite",
     "Port",
     "ReadLogs",
@@ -43,11 +49,14 @@ __all__ = [
     "build_option",
     "cameras_of",
     "check_present",
+    "file_log_argument",
     "load_calibrations",
     "load_lab",
     "load_matching_rig",
     "log_argument",
     "log_option",
+    "one_log_argument",
+    "other_log_option",
 ]
 
 
@@ -74,13 +83,42 @@ def _locations(texts: list[str]) -> list[Any]:
     return find_logs(texts)
 
 
+def _location(text: str | None) -> Any:
+    """Return the log of an option, a file or a URL."""
+    from ipsys_log.log.location import parse_location
+
+    return None if text is None else parse_location(text)
+
+
+def _files(given: list[Path] | Path | None) -> list[Path] | Path | None:
+    """Return the log file, or the files, of an argument of a command that needs files.
+
+    Raises
+    ------
+    IpsysError
+        A URL is among them.
+    """
+    for path in [given] if isinstance(given, Path) else given or ():
+        if _URL_AS_PATH.match(str(path)) and not path.exists():
+            from ipsys_log.errors import IpsysError
+
+            raise IpsysError(
+                f"{path.name}: is at a URL, but this command reads files; download the log first"
+            )
+    return given
+
+
 log_argument = partial(typer.Argument, metavar="LOG", callback=_locations)
+one_log_argument = partial(typer.Argument, metavar="LOG", callback=_location)
+other_log_option = partial(typer.Option, metavar="LOG", callback=_location)
+file_log_argument = partial(typer.Argument, metavar="LOG", callback=_files)
 Logs = Annotated[
     LogList, log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
 ]
 ReadLogs = Annotated[LogList, log_argument(help="Logs, files or URLs, read as one session.")]
-FileLogs = Annotated[list[Path], typer.Argument(help="Logs, read as one session.", metavar="LOG")]
 
+# A path has lost one of the two slashes of a URL.
+_URL_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 # File name extensions of other input and output files: a log with such a name is a mistake.
 _OTHER_FILES = (
     *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
@@ -189,14 +227,15 @@ def load_calibrations(
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
+    from ipsys_log.log.location import parse_location
 
     lenses: dict[str, CameraCalibration] = {}
     for option in options:
         camera, equals, name = option.partition("=")
         if equals:
             calibrations = {camera: read_intrinsics(Path(name), camera)}
-        elif option.endswith(".mcap"):
-            with Session([Path(option)]) as log:
+        elif (place := parse_location(option)).suffix == ".mcap":
+            with Session([place]) as log:
                 recorded = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
             calibrations = {c: lens for c, lens in recorded.items() if c in cameras()}
             if not calibrations:

@@ -9,7 +9,7 @@ from typing import Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
-from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import say_kept
 
 __all__ = ["add_commands"]
@@ -23,7 +23,7 @@ def add_commands(app: typer.Typer) -> None:
 def pack(
     logs: Annotated[
         Optional[list[Path]],  # noqa: UP045
-        typer.Argument(help="Logs, read as one session; they stay unchanged.", metavar="LOG"),
+        file_log_argument(help="Logs, read as one session; they stay unchanged."),
     ] = None,
     output: Annotated[
         Optional[Path],  # noqa: UP045

@@ -159,10 +159,13 @@ def _options(logs: Sequence[LogLocation], **given: Any) -> dict[str, Any]:
 
 def replay_options(**given: Any) -> dict[str, Any]:
     """Return the options of a command without rig and intrinsics as those of :func:`ipsys_log.api.replay`."""
+    from ipsys_log.log.location import parse_location
     from ipsys_log.rig.file import check_name
     from ipsys_log.runs.options import Request
 
     run, models = given.pop("run"), given.pop("model", None) or ()
+    if given.get("model_from") is not None:
+        given["model_from"] = parse_location(given["model_from"])
     # Parameters that every request has; those of an added stage arrive by name.
     known = {field.name for field in fields(Request)}
     further = {name: given.pop(name) for name in [*given] if name not in known}

@@ -12,7 +12,15 @@ from urllib.parse import unquote
 from ipsys_log.passwords import hide_password
 from ipsys_log.plain_text import plain_text
 
-__all__ = ["LogLocation", "LogUrl", "file_beside", "find_logs", "is_one_of", "parse_location"]
+__all__ = [
+    "LogLocation",
+    "LogState",
+    "LogUrl",
+    "file_beside",
+    "find_logs",
+    "is_one_of",
+    "parse_location",
+]
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)")
 _LOCAL = ("file", "local")
@@ -62,6 +70,26 @@ class LogUrl:
         return PurePosixPath(self.name).suffix
 
     @property
+    def below_pattern(self) -> PurePosixPath:
+        """The path below the folder in which the pattern begins; without a pattern, the name.
+
+        Examples
+        --------
+        >>> LogUrl("s3://lab/logs/2026-*/a.mcap", "lab/logs/2026-05/a.mcap").below_pattern
+        PurePosixPath('2026-05/a.mcap')
+        """
+        folder = _GLOB.split(self.url, maxsplit=1)[0].rpartition("/")[0]
+        below = PurePosixPath(str(self).removeprefix(str(LogUrl(folder))).lstrip("/"))
+        # An object store permits any names: no file may come outside of the folder of the user.
+        is_inside = bool(self.key) and "://" not in str(below) and ".." not in below.parts
+        return below if is_inside else PurePosixPath(self.name)
+
+    @property
+    def is_folder(self) -> bool:
+        """True if the URL stands for all logs below it: it ends with ``/``."""
+        return not self.key and self.url.partition("?")[0].endswith("/")
+
+    @property
     def scheme(self) -> str:
         """The protocol, such as ``s3``."""
         match = _URL.match(self.url)
@@ -75,6 +103,22 @@ class LogUrl:
 
 
 LogLocation = Path | LogUrl
+
+
+@dataclass(frozen=True, slots=True)
+class LogState:
+    """The state of a log: a log with an equal state has the same content.
+
+    Attributes
+    ----------
+    size : in bytes.
+    changed_ns : time of the last change, in ns since 1970; None if the store of a URL does not tell it.
+    version : of an object in a store, such as its ETag; "" for a file.
+    """
+
+    size: int
+    changed_ns: int | None
+    version: str = ""
 
 
 def parse_location(text: str | os.PathLike[str] | LogUrl) -> LogLocation:
@@ -123,5 +167,10 @@ def is_one_of(path: Path, logs: Sequence[LogLocation]) -> bool:
 
 
 def file_beside(log: LogLocation, suffix: str) -> Path:
-    """Return the file with the name of a log and another suffix; for a URL, it is in the current folder."""
-    return log.with_suffix(suffix) if isinstance(log, Path) else Path(f"{log.stem}{suffix}")
+    """Return the file with the name of a log and another suffix.
+
+    It is in the current folder if the log is at a URL, or in a folder without write permission.
+    """
+    if isinstance(log, Path) and os.access(log.absolute().parent, os.W_OK):
+        return log.with_suffix(suffix)
+    return Path(f"{log.stem}{suffix}")

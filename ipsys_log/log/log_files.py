@@ -1,4 +1,4 @@
-"""Log files on the disk: the files of a list of paths, where a folder stands for all logs below it."""
+"""The logs of a list of locations, where a folder or a pattern stands for several logs."""
 
 from __future__ import annotations
 
@@ -6,29 +6,50 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation, LogState, LogUrl
 
-__all__ = ["expand_folders", "logs_below"]
+__all__ = ["expand_folders", "logs_below", "read_log_state", "states_below"]
+
+_ALL_BELOW = "**/*.mcap"
 
 
-def expand_folders(paths: Iterable[Path]) -> list[Path]:
-    """Return the logs of some paths, in their order; a folder stands for all logs below it.
+def read_log_state(log: LogLocation) -> LogState:
+    """Return the state of a log; of a URL, in one request.
 
-    A log that is named twice, or by a link, is returned once.
+    Raises
+    ------
+    LogError
+        The object cannot be found.
+    OSError
+        The file cannot be found.
+    """
+    if isinstance(log, LogUrl):
+        from ipsys_log.log.remote_object import read_state
+
+        return read_state(log)
+    status = log.stat()
+    return LogState(status.st_size, status.st_mtime_ns)
+
+
+def expand_folders(logs: Iterable[LogLocation]) -> list[LogLocation]:
+    """Return the logs of some locations, in their order; a folder stands for all logs below it.
+
+    A URL that ends with ``/`` is a folder. A log that is named twice, or by a link, is returned once.
 
     Raises
     ------
     IpsysError
-        A folder has no logs.
+        A folder has no logs, or the protocol of a URL is not known.
 
     Examples
     --------
     >>> expand_folders([Path("b.mcap"), Path("a.mcap"), Path("./b.mcap")])
     [PosixPath('b.mcap'), PosixPath('a.mcap')]
     """
-    found: dict[Path, Path] = {}
-    for path in paths:
-        for log in _logs_of(path):
-            found.setdefault(log.resolve(), log)
+    found: dict[LogLocation, LogLocation] = {}
+    for location in logs:
+        for log in _logs_of(location):
+            found.setdefault(log.resolve() if isinstance(log, Path) else log, log)
     return list(found.values())
 
 
@@ -45,11 +66,46 @@ def logs_below(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*.mcap") if path.is_file())
 
 
-def _logs_of(path: Path) -> Iterator[Path]:
-    if not path.is_dir():
-        yield path
+def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogState]]:
+    """Yield the logs below a folder, or those of a URL with a pattern: name below the folder, log and state.
+
+    The lists of an object store have the states, so an unchanged object needs no request of its own.
+
+    Raises
+    ------
+    IpsysError
+        There is no such folder, or the store cannot be listed.
+    """
+    if isinstance(folder, Path):
+        for path in logs_below(folder):
+            yield str(path.relative_to(folder)), path, read_log_state(path)
         return
-    logs = logs_below(path)
+    from ipsys_log.log.remote_object import list_states
+
+    pattern = folder if folder.is_pattern else _all_below(folder)
+    for log, state in list_states(pattern).items():
+        yield str(log.below_pattern), log, state or read_log_state(log)
+
+
+def _all_below(folder: LogUrl) -> LogUrl:
+    address, mark, query = folder.url.partition("?")
+    return LogUrl(f"{address.rstrip('/')}/{_ALL_BELOW}{mark}{query}")
+
+
+def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
+    if isinstance(location, LogUrl):
+        from ipsys_log.log.remote_object import check_protocol, list_objects
+
+        if location.is_pattern or location.is_folder:
+            yield from list_objects(location if location.is_pattern else _all_below(location))
+        else:
+            check_protocol(location)
+            yield location
+        return
+    if not location.is_dir():
+        yield location
+        return
+    logs = logs_below(location)
     if not logs:
-        raise IpsysError(f"{path}: has no file that ends in .mcap; name another folder")
+        raise IpsysError(f"{location}: has no file that ends in .mcap; name another folder")
     yield from logs

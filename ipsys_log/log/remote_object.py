@@ -10,14 +10,23 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, TypeVar
 
 from ipsys_log.errors import LogError
 from ipsys_log.extras import check_installed
-from ipsys_log.log.location import LogUrl
+from ipsys_log.log.location import LogState, LogUrl
 from ipsys_log.plain_text import plain_text
+from ipsys_log.units import NS_PER_S
 
-__all__ = ["RemoteObject", "list_objects", "open_object"]
+__all__ = [
+    "RemoteObject",
+    "check_protocol",
+    "list_objects",
+    "list_states",
+    "open_object",
+    "read_state",
+]
 
 _PAUSES_S = (0.1, 0.4, 1.6, 4.0)
 _SELF_REPEATING = ("s3", "s3a", "gs", "gcs")  # their file systems repeat a request some times themselves
@@ -60,6 +69,7 @@ class RemoteObject:
     filesystem, path : the file system of fsspec, and the object in it.
     size : in bytes.
     version : identifies the content, as far as the store tells.
+    changed_ns : the time of the last change, in ns since 1970, if the store tells it.
     requests, bytes_fetched : the number of successful requests for bytes, and of these bytes.
     """
 
@@ -69,6 +79,7 @@ class RemoteObject:
     size: int
     version: tuple[str, ...]
     read_pinned: Callable[[int, int], bytes]
+    changed_ns: int | None = None
     requests: int = 0
     bytes_fetched: int = 0
 
@@ -111,7 +122,8 @@ def open_object(url: LogUrl) -> RemoteObject:
         raise LogError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
     if size is None or entry.get("partial") is False:
         raise _failure(url, _NoRangesError())
-    return RemoteObject(url, filesystem, path, int(size), _version_of(entry), read)
+    version, changed_ns = _version_of(entry), _changed_ns(entry)
+    return RemoteObject(url, filesystem, path, int(size), version, read, changed_ns)
 
 
 def list_objects(pattern: LogUrl) -> list[LogUrl]:
@@ -122,19 +134,57 @@ def list_objects(pattern: LogUrl) -> list[LogUrl]:
     LogError
         Nothing matches, or the store cannot be listed.
     """
+    return list(_list_entries(pattern))
+
+
+def list_states(pattern: LogUrl) -> dict[LogUrl, LogState | None]:
+    """Return the objects that match a pattern, by name, with their states; None if the list has no sizes.
+
+    Raises
+    ------
+    LogError
+        As :func:`list_objects`.
+    """
+    return {url: _state(entry) for url, entry in _list_entries(pattern).items()}
+
+
+def read_state(url: LogUrl) -> LogState:
+    """Return the state of one object, in one request.
+
+    Raises
+    ------
+    LogError
+        As :func:`open_object`.
+    """
+    source = open_object(url)
+    return LogState(source.size, source.changed_ns, "; ".join(source.version))
+
+
+def check_protocol(url: LogUrl) -> None:
+    """Check that the protocol of a URL is known, and its package installed; there is no request.
+
+    Raises
+    ------
+    LogError
+        As :func:`open_object`.
+    """
+    _filesystem(url)
+
+
+def _list_entries(pattern: LogUrl) -> dict[LogUrl, Mapping[str, Any]]:
     filesystem, path = _filesystem(pattern)
     find = _find_flat if pattern.scheme in _FLAT else _find_by_folder
     matches = _repeat(pattern, lambda: find(filesystem, path))
     if not matches:
         raise LogError(f"{pattern}: no object matches; check the pattern and the permission to list")
-    return [LogUrl(pattern.url, str(match)) for match in sorted(matches)]
+    return {LogUrl(pattern.url, name): entry for name, entry in sorted(matches.items())}
 
 
-def _find_by_folder(filesystem: Any, path: str) -> list[str]:
-    return list(filesystem.glob(path, detail=False))
+def _find_by_folder(filesystem: Any, path: str) -> dict[str, Mapping[str, Any]]:
+    return _as_entries(filesystem.glob(path, detail=True))
 
 
-def _find_flat(filesystem: Any, path: str) -> list[str]:
+def _find_flat(filesystem: Any, path: str) -> dict[str, Mapping[str, Any]]:
     """List all objects that begin as the pattern does, page by page, and select those that match.
 
     A glob of fsspec would list each folder of such a store, with three requests for each of them.
@@ -143,7 +193,30 @@ def _find_flat(filesystem: Any, path: str) -> list[str]:
 
     folder, _, start = re.split(r"[*?\[]", path, maxsplit=1)[0].rpartition("/")
     matches = re.compile(glob_translate(path)).fullmatch
-    return [str(name) for name in filesystem.find(folder, prefix=start) if matches(str(name))]
+    entries = _as_entries(filesystem.find(folder, prefix=start, detail=True))
+    return {name: entry for name, entry in entries.items() if matches(name)}
+
+
+def _as_entries(found: Mapping[Any, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    return {str(name): entry for name, entry in found.items() if entry.get("type") != "directory"}
+
+
+def _state(entry: Mapping[str, Any]) -> LogState | None:
+    size = entry.get("size")
+    if size is None:
+        return None
+    return LogState(int(size), _changed_ns(entry), "; ".join(_version_of(entry)))
+
+
+def _changed_ns(entry: Mapping[str, Any]) -> int | None:
+    """Return the time of the last change; file systems give it as a time, as seconds, or not at all."""
+    for name in ("LastModified", "last_modified", "mtime", "modified", "updated"):
+        value = entry.get(name)
+        if isinstance(value, datetime):
+            return int(value.timestamp() * NS_PER_S)
+        if isinstance(value, int | float):
+            return int(value * NS_PER_S)
+    return None
 
 
 def _filesystem(url: LogUrl) -> tuple[Any, str]:

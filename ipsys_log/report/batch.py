@@ -76,6 +76,8 @@ def write_results(path: Path, results: Sequence[LogResult]) -> None:
         "runs": "list<string>",
         "messages": "int64",
         "trace": "string",
+        "pieces": "int64",
+        "lost_attempts": "int64",
     }
     rows = ({name: None if value == "" else value for name, value in asdict(one).items()} for one in results)
     write_rows(path, rows, columns)

@@ -155,10 +155,16 @@ def _check_request(paths: Sequence[LogLocation], request: Request, models: Seque
         )
     if request.model_from is None:
         return
-    if any(isinstance(path, Path) and request.model_from.resolve() == path.resolve() for path in paths):
+    if request.model_from in paths or _is_same_file(request.model_from, paths):
         raise IpsysError(f"--model-from {request.model_from}: is the same log; leave out --model-from")
     if request.train != "train":
         raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")
+
+
+def _is_same_file(log: LogLocation, others: Sequence[LogLocation]) -> bool:
+    return isinstance(log, Path) and any(
+        isinstance(other, Path) and log.resolve() == other.resolve() for other in others
+    )
 
 
 def _check_rigs(session: Session, request: Request) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.part import copy_messages, copy_records
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.output import check_copy, create_copy
@@ -31,7 +32,7 @@ class DroppedRun:
     stored_bytes: int
 
 
-def dropped_runs(path: Path) -> list[DroppedRun]:
+def dropped_runs(path: LogLocation) -> list[DroppedRun]:
     """Return the runs that a compaction of a log drops, by name; only their chunks are read.
 
     Raises
@@ -60,7 +61,7 @@ def dropped_runs(path: Path) -> list[DroppedRun]:
 
 @one_reading()
 def compact(
-    path: Path,
+    path: LogLocation,
     output: Path,
     overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,

@@ -13,6 +13,7 @@ from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.part import Choose, copy_messages, copy_records
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelCut, Cut, Message
@@ -37,7 +38,7 @@ class CutResult(NamedTuple):
 
 @one_reading()
 def cut(
-    paths: Sequence[Path],
+    paths: Sequence[LogLocation],
     output: Path,
     options: CutOptions,
     overwrite: bool = False,

@@ -27,12 +27,11 @@ from ipsys_log.rig.file import hide_passwords
 from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
-from ipsys_log.runs.pieces import given_settings, merge_pieces, plan_pieces
+from ipsys_log.runs.pieces import PieceWorkers, given_settings, merge_pieces, plan_pieces
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.states import Recorded, recorded_stages
 from ipsys_log.runs.stream import WiredStage, in_threads, run, wire
-from ipsys_log.runs.workers import LocalWorkers
 from ipsys_log.stages.detect import skipped_frames
 from ipsys_log.units import format_time
 
@@ -301,7 +300,7 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
 
 
 def compute_messages(
-    task: Task, session: Session, name: str, progress: Progress, workers: LocalWorkers | None = None
+    task: Task, session: Session, name: str, progress: Progress, workers: PieceWorkers | None = None
 ) -> Iterator[Message]:
     """Yield the messages of a task's run: of its causal stage, or those computed from the whole log.
 
@@ -311,8 +310,8 @@ def compute_messages(
         yield from _compute_whole(task, session, name, progress)
         return
     wired = wire(task.stage, name, task.inputs, task.step(name))
-    plan = plan_pieces(task, session) if workers is not None and workers.jobs > 1 else None
-    if workers is not None and plan is not None and workers.are_worth(plan):
+    plan = plan_pieces(task, session) if workers is not None and workers.divides else None
+    if workers is not None and plan is not None and plan.is_long:
         yield from merge_pieces(wired, plan, workers.compute(plan), partial(progress, task.stage.name))
     else:
         yield from _stream(task, session, wired, progress)

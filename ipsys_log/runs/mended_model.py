@@ -10,6 +10,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.joint.mending import PoseChange, mend_poses
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import ChannelRead, Message, Model, Run
 from ipsys_log.messages.channels import MARKERS, MODEL
 from ipsys_log.models.table import reads_corners
@@ -48,8 +49,8 @@ def _valid_from_ns(run: Run) -> int:
 
 def append_mended_model(
     target: Path,
-    source: tuple[Path, str],
-    baseline: Path,
+    source: tuple[LogLocation, str],
+    baseline: LogLocation,
     changes: Mapping[str, PoseChange],
     valid_from_ns: int,
 ) -> str:

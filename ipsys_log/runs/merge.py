@@ -12,6 +12,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.log.merged_logs import merge_messages, merged
 from ipsys_log.log.part import copy_records
 from ipsys_log.log.writer import LogWriter
@@ -36,7 +37,7 @@ class MergeResult(NamedTuple):
 
 @one_reading()
 def merge(
-    paths: Sequence[Path],
+    paths: Sequence[LogLocation],
     output: Path,
     offsets: Sequence[LogOffset],
     overwrite: bool = False,
@@ -82,7 +83,7 @@ def merge(
     return MergeResult(sum(state.count for state in states.values()), logs)
 
 
-def open_logs(paths: Sequence[Path], stack: ExitStack) -> list[Session]:
+def open_logs(paths: Sequence[LogLocation], stack: ExitStack) -> list[Session]:
     """Open several logs that differ, each in its own session.
 
     Raises
@@ -94,7 +95,8 @@ def open_logs(paths: Sequence[Path], stack: ExitStack) -> list[Session]:
         raise IpsysError("a merge needs two logs or more; name the log of each recorder")
     sessions = []
     for number, path in enumerate(paths):
-        if any(path.exists() and path.samefile(other) for other in paths[:number]):
+        earlier = paths[:number]
+        if path in earlier or (isinstance(path, Path) and is_one_of(path, earlier)):
             raise IpsysError(f"{path} is named twice; name each log once")
         session = stack.enter_context(Session([path]))
         if not session.readers[0].message_count:

@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import ExitStack
 from decimal import Decimal, InvalidOperation
-from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from ipsys_log.analysis.clock_offset import MarkerPath, estimate_clock_offset
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.runs.merge import open_logs
 from ipsys_log.runs.merge_plan import LogOffset, check_logs_differ
@@ -29,7 +29,7 @@ _LARGEST_S = 1_000_000_000
 
 @one_reading()
 def choose_offsets(
-    paths: Sequence[Path],
+    paths: Sequence[LogLocation],
     texts: Sequence[str],
     progress: Progress = lambda stage, done, total: None,
 ) -> list[LogOffset]:
@@ -112,7 +112,7 @@ def _path(camera: str, marker_id: int, rows: list[tuple[int, float, float]]) -> 
     return MarkerPath(camera, marker_id, table[first, 0] / NS_PER_S, table[first, 1:])
 
 
-def _given_offsets(paths: Sequence[Path], texts: Sequence[str]) -> dict[int, LogOffset]:
+def _given_offsets(paths: Sequence[LogLocation], texts: Sequence[str]) -> dict[int, LogOffset]:
     """Return the offsets of the options by the number of their log."""
     given: dict[int, LogOffset] = {}
     for text in texts:

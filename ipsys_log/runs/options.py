@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Rig
 from ipsys_log.stages.camera_frame import PERIMETER, check_method
 from ipsys_log.stages.detect import check_corners
@@ -43,7 +43,7 @@ class Request:
     models: tuple[str, ...] = ()
     rig: Rig | None = None
     lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
-    model_from: Path | None = None
+    model_from: LogLocation | None = None
     train: str = "train"
     seed: int = 0
     run: str | None = None

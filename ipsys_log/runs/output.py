@@ -16,7 +16,7 @@ from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, journal_path
-from ipsys_log.log.location import LogLocation, file_beside, is_one_of
+from ipsys_log.log.location import LogLocation, LogUrl, is_one_of
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
@@ -139,11 +139,18 @@ def record_message(record: Run, log_time_ns: int) -> Message:
     return Message(f"/runs/{record.run}/record", log_time_ns, record.timestamp, record)
 
 
-def choose_target(paths: Sequence[LogLocation], output: Path | None) -> tuple[list[LogLocation], Path | None]:
+def choose_target(
+    paths: Sequence[LogLocation], output: Path | None, folder: Path | None = None
+) -> tuple[list[LogLocation], Path | None]:
     """Return the logs to read, and the new log for the results; None if they are appended to the last log.
 
-    Nothing can be appended to a log at a URL. Its results come into a derived log in the current folder:
-    ``monday.derived.mcap`` for ``monday.mcap``. A derived log that exists is read, too, and extended.
+    Nothing can be appended to a log at a URL, or to a file without write permission. Its results come into a
+    derived log: ``monday.derived.mcap`` for ``monday.mcap``. A derived log that exists is read, too, and
+    extended.
+
+    Parameters
+    ----------
+    folder : of derived logs. The logs of a pattern keep their folders below it. None: the working folder.
 
     Raises
     ------
@@ -151,13 +158,25 @@ def choose_target(paths: Sequence[LogLocation], output: Path | None) -> tuple[li
         The derived log has results of another log.
     """
     source = paths[-1]
-    if output is not None or isinstance(source, Path):
+    if output is not None or (isinstance(source, Path) and _can_append(source)):
         return list(paths), output
-    derived = file_beside(source, ".derived.mcap")
+    derived = _derived_log(source, folder)
     if not derived.exists():
         return list(paths), derived
     _check_source(paths, derived)
     return [*paths, derived], None
+
+
+def _can_append(log: Path) -> bool:
+    """Return whether a log, and the journal beside it, can be written. A missing log is another error."""
+    return not log.exists() or (os.access(log, os.W_OK) and os.access(log.absolute().parent, os.W_OK))
+
+
+def _derived_log(source: LogLocation, folder: Path | None) -> Path:
+    name = f"{source.stem}.derived.mcap"
+    if folder is None:
+        return Path(name)
+    return folder / source.below_pattern.with_name(name) if isinstance(source, LogUrl) else folder / name
 
 
 def _check_source(paths: Sequence[LogLocation], derived: Path) -> None:

@@ -6,15 +6,18 @@ the messages of the run, with the same bytes as one process without pieces. Neit
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import (
@@ -29,6 +32,7 @@ from ipsys_log.messages.channels import EVENTS, RIG
 from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.stage import Pieces
 from ipsys_log.runs.blas import one_blas_thread
+from ipsys_log.runs.provenance import read_channels
 from ipsys_log.runs.stream import WiredStage, derive
 from ipsys_log.stages import load_stage
 from ipsys_log.stages.detect import skipped_frames
@@ -43,6 +47,7 @@ __all__ = [
     "PiecePlan",
     "PieceResult",
     "PieceRun",
+    "PieceWorkers",
     "compute_piece",
     "compute_piece_of_logs",
     "given_settings",
@@ -52,6 +57,10 @@ __all__ = [
     "split_frames",
 ]
 
+# A smaller run is done before workers have started, and opened the log.
+_MIN_FRAMES = 1_000
+_MIN_PIECES = 4
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PieceRun:
@@ -59,7 +68,8 @@ class PieceRun:
 
     Attributes
     ----------
-    paths : the logs.
+    paths : the logs that have some of the topics.
+    versions : of each of these logs, what changes with its content.
     stage, parameters : of the run.
     topics : the topics that the run reads.
     rig, lenses : they replace those of the logs; intrinsics by camera.
@@ -73,20 +83,25 @@ class PieceRun:
     rig: Rig | None = None
     lenses: Mapping[str, CameraCalibration]
     skipped: frozenset[int] = frozenset()
+    versions: tuple[object, ...] = ()
 
     @classmethod
     def of_task(cls, task: Task, session: Session) -> PieceRun:
         """Return what the pieces of a task need."""
         is_as_live = "as_live" in task.parameters
         events = session.payloads(session.topics(EVENTS)) if is_as_live else []
+        # A new log for the results, which has no topics yet, exists only in this process.
+        topics = set(task.topics)
+        readers = [reader for reader in session.readers if reader.channels.keys() & topics]
         return cls(
-            paths=tuple(session.paths),
+            paths=tuple(reader.path for reader in readers),
             stage=task.stage.name,
             parameters=dict(task.parameters),
             topics=task.topics,
             rig=task.rig,
             lenses=dict(task.lenses),
             skipped=frozenset(skipped_frames(events)),
+            versions=tuple(reader.view.identity()[1] for reader in readers),
         )
 
     def load(self) -> Pieces:
@@ -127,11 +142,38 @@ class PieceFrames(NamedTuple):
 
 
 class PiecePlan(NamedTuple):
-    """The division of a run into pieces, in the order of their first frames."""
+    """The division of a run into pieces, in the order of their first frames.
+
+    Attributes
+    ----------
+    identity : returns a text that differs if the run has another input by content, or other parameters.
+    """
 
     run: PieceRun
     frames: PieceFrames
     pieces: list[Piece]
+    identity: Callable[[], str] = str
+
+    @property
+    def is_long(self) -> bool:
+        """True if several processes compute the run faster than one."""
+        return len(self.frames.times_ns) >= _MIN_FRAMES and len(self.pieces) >= _MIN_PIECES
+
+
+class PieceWorkers(Protocol):
+    """The computation of the pieces of a run outside of this process.
+
+    Attributes
+    ----------
+    divides : False if this process computes all runs itself.
+    """
+
+    @property
+    def divides(self) -> bool: ...
+
+    def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
+        """Yield the results of the pieces in the order of the plan."""
+        ...
 
 
 def plan_pieces(task: Task, session: Session) -> PiecePlan | None:
@@ -140,7 +182,21 @@ def plan_pieces(task: Task, session: Session) -> PiecePlan | None:
     if frames is None:
         return None
     run = PieceRun.of_task(task, session)
-    return PiecePlan(run, frames, split_frames(frames, run.load().resets))
+    pieces = split_frames(frames, run.load().resets)
+    return PiecePlan(run, frames, pieces, partial(_identity, session, run))
+
+
+def _identity(session: Session, run: PieceRun) -> str:
+    """Return the hash of a run's stage, parameters, settings, and input by content."""
+    parts = (
+        run.stage,
+        sorted(run.parameters.items()),
+        read_channels(session, run.topics),
+        None if run.rig is None else encode(run.rig),
+        [(camera, encode(lens)) for camera, lens in sorted(run.lenses.items())],
+        sorted(run.skipped),
+    )
+    return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
 
 
 def order_frames(session: Session, topics: Iterable[str]) -> PieceFrames | None:

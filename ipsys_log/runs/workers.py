@@ -23,9 +23,6 @@ from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
 __all__ = ["LocalWorkers", "available_cores", "serve"]
 
-# A smaller log is done before the workers have started.
-_MIN_FRAMES = 1_000
-_MIN_PIECES = 4
 # Number of pieces for each worker that may be finished before the pieces in front of them.
 _AHEAD = 2
 # The path of modules is that of this process: the folder of the user has no part in it.
@@ -130,9 +127,10 @@ class LocalWorkers:
     ) -> None:
         self._stop()
 
-    def are_worth(self, plan: PiecePlan) -> bool:
-        """Return whether workers compute a run faster than this process."""
-        return self.jobs > 1 and len(plan.frames.times_ns) >= _MIN_FRAMES and len(plan.pieces) >= _MIN_PIECES
+    @property
+    def divides(self) -> bool:
+        """True if there is more than one process."""
+        return self.jobs > 1
 
     def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
         """Yield the results of the pieces in their order; the workers may finish them in another order.

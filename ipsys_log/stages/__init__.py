@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -96,9 +95,9 @@ MODEL = StageParameter(
 )
 MODEL_FROM = StageParameter(
     name="model_from",
-    help="Copy the model of this log, and apply it.",
+    help="Copy the model of this log, a file or a URL, and apply it.",
     metavar="LOG",
-    kind=Path | None,
+    kind=str | None,
 )
 TRAIN = StageParameter(
     name="train",

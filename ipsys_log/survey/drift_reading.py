@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
 from ipsys_log.analysis.drift import Motion
@@ -12,6 +11,7 @@ from ipsys_log.analysis.floor_cameras import FloorCamera, read_floor_cameras
 from ipsys_log.analysis.reference_markers import image_sizes, read_windows
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Rig
 from ipsys_log.messages.channels import MARKERS, RIG
 from ipsys_log.runs.mended_model import find_model
@@ -32,10 +32,10 @@ class DriftReading:
     """
 
     drift: LabDrift
-    paths: list[Path]
+    paths: list[LogLocation]
     names: list[str]
     model: str
-    source: tuple[Path, str]
+    source: tuple[LogLocation, str]
     remarks: list[str] = field(default_factory=list)
 
     def moved(self) -> dict[str, Motion]:
@@ -49,9 +49,9 @@ class DriftReading:
 
 
 def read_drift(
-    paths: Sequence[Path],
-    baseline: Path | None = None,
-    model_from: Path | None = None,
+    paths: Sequence[LogLocation],
+    baseline: LogLocation | None = None,
+    model_from: LogLocation | None = None,
     rig: Rig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> DriftReading:
@@ -88,7 +88,7 @@ def read_drift(
     return DriftReading(drift, kept, [log.name for log in windows], model, source, remarks)
 
 
-def _order(paths: Sequence[Path], baseline: Path | None) -> tuple[list[Path], list[str]]:
+def _order(paths: Sequence[LogLocation], baseline: LogLocation | None) -> tuple[list[LogLocation], list[str]]:
     """Return the logs in order of time, the baseline first, and remarks on logs before the baseline."""
     starts_ns = {path: _start_ns(path) for path in dict.fromkeys([*paths, *([baseline] if baseline else [])])}
     first = baseline or min(starts_ns, key=starts_ns.__getitem__)
@@ -99,7 +99,7 @@ def _order(paths: Sequence[Path], baseline: Path | None) -> tuple[list[Path], li
 
 
 def _read_logs(
-    paths: Sequence[Path], rig: Rig | None, progress: Callable[[int, int], None], remarks: list[str]
+    paths: Sequence[LogLocation], rig: Rig | None, progress: Callable[[int, int], None], remarks: list[str]
 ) -> list[_Log]:
     """Return the logs with reference markers, the baseline first; add remarks on the others."""
     logs: list[_Log] = []
@@ -123,18 +123,18 @@ def _read_logs(
 class _Log:
     """A log: its rig, the size of the images by camera, and its windows."""
 
-    path: Path
+    path: LogLocation
     rig: Rig
     sizes_px: Mapping[str, tuple[int, int]]
     windows: DriftLog
 
 
-def _start_ns(path: Path) -> int:
+def _start_ns(path: LogLocation) -> int:
     with Session([path]) as session:
         return session.start_ns
 
 
-def _read_log(path: Path, name: str, rig: Rig | None) -> _Log:
+def _read_log(path: LogLocation, name: str, rig: Rig | None) -> _Log:
     with Session([path]) as session:
         rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
         if not rigs or not rigs[-1].reference_markers:
@@ -172,8 +172,8 @@ def _check_same(log: _Log, first: _Log) -> None:
 
 
 def _find_cameras(
-    paths: Sequence[Path], until_ns: int
-) -> tuple[str, tuple[Path, str], dict[str, FloorCamera]]:
+    paths: Sequence[LogLocation], until_ns: int
+) -> tuple[str, tuple[LogLocation, str], dict[str, FloorCamera]]:
     """Return the name and the source of the first model with camera poses, and its cameras."""
     for path in paths:
         with Session([path]) as session:

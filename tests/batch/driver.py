@@ -1,4 +1,4 @@
-"""Program for the tests of batches: run a work of ``tests.batch.works`` on logs, with local or other workers.
+"""Program for the tests of batches: run a work of the tests on logs, with local or other workers.
 
 It is a separate process, so that no thread or socket of Dask stays in the process of the tests. Its argument
 is JSON; it prints the results as JSON, or the error.
@@ -17,6 +17,7 @@ from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import BatchTask
 from ipsys_log.batch.workers import open_workers
 from ipsys_log.errors import IpsysError
+from tests.batch.piece_works import replay_pieces
 from tests.batch.works import PATIENCE_S, replay_and_note
 
 
@@ -32,9 +33,11 @@ def main(text: str) -> None:
         tls_key=_path(given.get("tls_key")),
     )
     try:
-        with open_workers(settings, len(logs)) as workers:
+        with open_workers(settings, request.get("tasks", len(logs))) as workers:
             workers.client.wait_for_workers(1, timeout=PATIENCE_S)
             task = BatchTask(replay_and_note, {"notes": Path(request["notes"])})
+            if request.get("pieces"):
+                task = BatchTask(replay_pieces, divides=True)
             results = [asdict(result) for result in run_batch(workers, task, logs)]
     except IpsysError as error:
         sys.stdout.write(json.dumps({"error": str(error)}))

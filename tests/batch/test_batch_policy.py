@@ -17,10 +17,20 @@ from hypothesis import strategies as st
 from ipsys_log.batch.execution import MOST_ENDED_WORKERS, run_batch
 from ipsys_log.batch.exports import check_exports
 from ipsys_log.batch.settings import WorkerSettings
-from ipsys_log.batch.tasks import BatchTask, LogResult, VersionError, perform
+from ipsys_log.batch.tasks import (
+    BatchTask,
+    LogPieces,
+    LogResult,
+    PieceState,
+    VersionError,
+    perform,
+    perform_or_divide,
+)
 from ipsys_log.batch.workers import Workers
 from ipsys_log.errors import IpsysError, WriteError
 from ipsys_log.log.log_files import expand_folders
+from ipsys_log.runs.piece_folder import PieceTask
+from ipsys_log.runs.pieces import Piece, PieceRun
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
 
@@ -28,18 +38,19 @@ distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'i
 class Future:
     """A future that is done when its scheduler says so."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, piece: PieceTask | None) -> None:
+        self.path, self.piece = path, piece
+        self.answer: Any = None
         self.error: Exception | None = None
         self.callback: Callable[[Future], None] = lambda future: None
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         self.callback = callback
 
-    def result(self) -> LogResult:
+    def result(self) -> Any:
         if self.error is not None:
             raise self.error
-        return LogResult(str(self.path), "computed")
+        return self.answer
 
     def release(self) -> None:
         """Do nothing: the scheduler has forgotten the future already."""
@@ -48,37 +59,71 @@ class Future:
 class Scheduler:
     """A scheduler whose workers end in the tasks of some logs, with all other tasks that run meanwhile.
 
-    It repeats a task itself ``retries`` times before it reports the end of a worker.
+    It repeats a task itself ``retries`` times before it reports the end of a worker. The logs in ``long``
+    have this number of pieces, and the deadly ones among them end their workers in their first piece only.
     """
 
-    def __init__(self, deadly: set[str], order: list[int], losses: int = 0, retries: int = 0) -> None:
+    def __init__(
+        self,
+        deadly: set[str],
+        order: list[int],
+        losses: int = 0,
+        retries: int = 0,
+        long: dict[str, int] | None = None,
+        other_software: bool = False,
+    ) -> None:
         self.deadly, self.order, self.losses, self.retries = deadly, order, losses, retries
+        self.long, self.other_software = long or {}, other_software
         self.status, self.most = "running", 0
         self.running: list[Future] = []
         self.starts: Counter[str] = Counter()
+        self.stored: set[tuple[str, int]] = set()
+        self.forgets = False
 
-    def submit(self, _perform: Any, _task: BatchTask, path: Path, **_: Any) -> Future:
-        future = Future(path)
-        self.starts[path.name] += 1
+    def submit(
+        self, work: Any, _task: BatchTask, path: Path, piece: PieceTask | None = None, **_: Any
+    ) -> Future:
+        future = Future(path, piece)
+        if piece is None:
+            future.answer = self._answer(path, work is perform_or_divide)
+        name = path.name if piece is None else f"{path.name}/{piece.key}"
+        self.starts[name] += 1
         self.running.append(future)
         self.most = max(self.most, len(self.running))
         return future
+
+    def _answer(self, path: Path, may_divide: bool) -> LogResult | LogPieces:
+        count = self.long.get(path.name, 0) if may_divide else 0
+        tasks = [n for n in range(count) if (path.name, n) not in self.stored]
+        return (
+            LogPieces(tuple(map(_piece, tasks))) if tasks else LogResult(str(path), "computed", pieces=count)
+        )
 
     def advance(self) -> None:
         """End one task, or all of them if their worker ends."""
         place = self.order.pop() if self.order else 0
         future = self.running[place % len(self.running)]
         ended = [future]
-        if future.path.name in self.deadly:
+        is_first = future.piece.key == "0" if future.piece else future.path.name not in self.long
+        if future.path.name in self.deadly and is_first:
             ended = [*self.running]
             for one in ended:
                 one.error = distributed.KilledWorker("task", SimpleNamespace(address="here"), self.retries)
         elif self.losses:
             self.losses -= 1
             future.error = distributed.CancelledError("lost")
+        elif future.piece is not None:
+            future.answer = PieceState(other_software=self.other_software)
+            if not (self.other_software or self.forgets):
+                self.stored.add((future.path.name, int(future.piece.key)))
         for one in ended:
             self.running.remove(one)
             one.callback(one)
+
+
+def _piece(number: int) -> PieceTask:
+    run = PieceRun(paths=(), stage="", parameters={}, topics=(), lenses={})
+    return PieceTask(run, Piece("red", number, number + 1), str(number), Path("pieces"), {})
 
 
 def run(
@@ -96,7 +141,8 @@ def run(
 
     with monkeypatch.context() as patch:
         patch.setattr("ipsys_log.batch.execution.SimpleQueue", Queue)
-        results = list(run_batch(workers, BatchTask(lambda path: LogResult("", "")), paths))
+        task = BatchTask(lambda path: LogResult("", ""), divides=True)
+        results = list(run_batch(workers, task, paths))
     assert sorted(result.log for result in results) == sorted(map(str, paths))
     return {Path(result.log).name: result for result in results}
 
@@ -119,6 +165,54 @@ def test_only_logs_that_end_their_workers_fail(
     assert {name for name, result in results.items() if not result.good} == names
     assert all(scheduler.starts[name] * (retries + 1) >= MOST_ENDED_WORKERS for name in names)
     assert scheduler.most <= window
+
+
+@given(
+    counts=st.lists(st.integers(0, 7), min_size=1, max_size=8),
+    window=st.integers(1, 6),
+    deadly=st.sets(st.integers(0, 7), max_size=2),
+    order=st.lists(st.integers(0, 5), max_size=60),
+    retries=st.sampled_from([0, 3]),
+)
+def test_deadly_piece_fails_only_its_log(
+    counts: list[int], window: int, deadly: set[int], order: list[int], retries: int
+) -> None:
+    long = {f"{number}.mcap": count for number, count in enumerate(counts) if count}
+    names = {f"{number}.mcap" for number in deadly if number < len(counts)}
+    scheduler = Scheduler(names, order, retries=retries, long=long)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        results = run(
+            scheduler, [Path(f"{number}.mcap") for number in range(len(counts))], window, monkeypatch
+        )
+    assert {name for name, result in results.items() if not result.good} == names
+    assert all("in the piece of red" in results[name].text for name in names & long.keys())
+    for name in long.keys() - names:
+        assert {(name, number) for number in range(long[name])} <= scheduler.stored
+    assert scheduler.most <= window
+
+
+def test_pieces_of_a_log_run_once_and_on_all_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    scheduler = Scheduler(set(), [2, 0, 1, 2, 2], long={"a.mcap": 9})
+    results = run(scheduler, [Path("a.mcap")], 3, monkeypatch)
+    assert results["a.mcap"].pieces == 9
+    assert scheduler.most == 3
+    assert scheduler.starts == {"a.mcap": 2, **{f"a.mcap/{number}": 1 for number in range(9)}}
+
+
+def test_log_is_one_task_if_workers_have_other_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    scheduler = Scheduler(set(), [], long={"a.mcap": 9}, other_software=True)
+    results = run(scheduler, [Path("a.mcap")], 3, monkeypatch)
+    assert (results["a.mcap"].state, results["a.mcap"].pieces) == ("computed", 0)
+
+
+def test_pieces_that_others_cannot_see_fail_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    scheduler = Scheduler(set(), [], long={"a.mcap": 2})
+    scheduler.forgets = True
+    results = run(scheduler, [Path("a.mcap"), Path("b.mcap")], 2, monkeypatch)
+    assert results["b.mcap"].good
+    assert results["a.mcap"].text == (
+        "its pieces are not in pieces: all workers must see this folder; use a shared file system"
+    )
 
 
 def test_log_that_ends_four_workers_alone_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

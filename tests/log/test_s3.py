@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,12 @@ import pytest
 
 import ipsys_log
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.location import find_logs
+from ipsys_log.log import remote_object
+from ipsys_log.log.location import find_logs, parse_location
+from ipsys_log.log.log_files import states_below
 from ipsys_log.log.remote_object import open_object
 from tests.conftest import ROOT, Ipsys
+from tests.s3_server import open_bucket, put, serve_s3
 
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
 # The import of the server takes seconds; s3fs closes its connections after the test.
@@ -22,37 +24,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Serve S3 on loopback."""
-    from moto.server import ThreadedMotoServer
-
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
+    with serve_s3() as address:
+        yield address
 
 
 @pytest.fixture
 def bucket(address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Return a bucket ``logs``; the environment names its server, as a user does."""
-    import boto3
-    import s3fs
-
-    s3fs.S3FileSystem.clear_instance_cache()
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "testing")
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    monkeypatch.setenv("AWS_ENDPOINT_URL", address)
-    bucket = boto3.resource("s3").create_bucket(Bucket="logs")
-    yield bucket
-    bucket.objects.all().delete()
-    bucket.delete()
-
-
-def put(bucket: Any, key: str, data: bytes) -> str:
-    bucket.put_object(Key=key, Body=data)
-    return f"s3://logs/{key}"
+    with open_bucket(address, monkeypatch) as bucket:
+        yield bucket
 
 
 def test_results_from_s3_are_those_of_the_file(
@@ -99,6 +78,21 @@ def test_pattern_matches_more_objects_than_one_page_has(bucket: Any, ipsys: Ipsy
     assert done.err == (
         "ipsys: s3://logs/2028-*/lab.mcap: no object matches; check the pattern and the permission to list\n"
     )
+
+
+def test_states_of_many_objects_come_with_their_list(bucket: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from moto.backends import get_backend
+
+    (store,) = get_backend("s3")["123456789012"].values()
+    for number in range(1100):
+        store.put_object("logs", f"lab/{number:04}/a.mcap", b"x" * (number % 7))
+    store.put_object("logs", "lab/0001/notes.txt", b"")
+    with monkeypatch.context() as patch:  # a request for each object would fail
+        patch.setattr(remote_object, "open_object", None)
+        states = {name: state for name, _, state in states_below(parse_location("s3://logs/lab"))}
+    assert [*states] == [f"{number:04}/a.mcap" for number in range(1100)]
+    assert [state.size for state in states.values()] == [number % 7 for number in range(1100)]
+    assert len({state.version.partition("ETag=")[2][:34] for state in states.values()}) == 7
 
 
 def test_logs_of_a_pattern_are_read_as_one(bucket: Any) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.pipeline import replay
-from ipsys_log.runs import workers
+from ipsys_log.runs import pieces, workers
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 from ipsys_log.runs.workers import LocalWorkers
@@ -28,7 +28,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(autouse=True)
 def _workers_for_short_logs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_MIN_FRAMES", 1)
+    monkeypatch.setattr(pieces, "_MIN_FRAMES", 1)
 
 
 def newest_worker_first(receivers: Sequence[Any]) -> list[Any]:

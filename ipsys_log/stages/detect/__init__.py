@@ -360,7 +360,7 @@ def _resets(options: Mapping[str, str]) -> Resets:
 def _pieces(parameters: Mapping[str, str]) -> Pieces:
     """Return how the frames of a camera between two resets are processed alone."""
     resets = _resets(parameters)
-    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports)
+    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports, (OtherSize,))
 
 
 def _why_stock(camera: str) -> str:

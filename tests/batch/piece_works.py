@@ -1,0 +1,53 @@
+"""The work of the tests of pieces: it notes each start of a piece, ends its worker, or waits to be killed.
+
+Each worker that gets a task of this work imports this module. The environment names the folder for notes.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.batch import tasks
+from ipsys_log.batch.tasks import LogResult, replay_log
+from ipsys_log.log.location import LogLocation
+from ipsys_log.runs import pieces
+from ipsys_log.runs.piece_folder import PieceTask, store_piece
+from tests.batch.works import DEADLY, HELD, PATIENCE_S
+
+NOTES = "IPSYS_TEST_NOTES"
+# Short enough for several pieces of each camera in a small log.
+PARAMETERS = {"reset_s": "2"}
+UNTIL = "camera-frame"
+
+
+def replay_pieces(path: LogLocation, **options: Any) -> LogResult:
+    """Replay a small log as a long one."""
+    return replay_log(path, until=UNTIL, parameters=PARAMETERS, **options)
+
+
+def _store_and_note(task: PieceTask) -> None:
+    """Store a piece. The first piece of one log ends each worker; that of another log waits once."""
+    notes = Path(os.environ[NOTES])
+    log = Path(str(task.run.paths[0])).name
+    with (notes / f"{log}-{task.key}").open("a") as file:
+        file.write("x")
+    if log == DEADLY:
+        with suppress(FileExistsError):  # the first piece that starts
+            (notes / "deadly_piece").symlink_to(task.key)
+        if str((notes / "deadly_piece").readlink()) == task.key:
+            os.kill(os.getpid(), signal.SIGKILL)
+    if log == HELD and not (notes / "killed").exists():
+        (notes / "killed").write_text(task.key)
+        (notes / "pid").write_text(str(os.getpid()))
+        time.sleep(PATIENCE_S)
+    store_piece(task)
+
+
+if NOTES in os.environ:
+    vars(tasks)["store_piece"] = _store_and_note
+    pieces._MIN_FRAMES = 1

@@ -1,0 +1,100 @@
+"""Long logs in batches with real workers: the bytes of one process, and killed workers during a piece."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ipsys_log import api
+from ipsys_log.batch.execution import MOST_ENDED_WORKERS
+from tests.batch.piece_works import NOTES, PARAMETERS, UNTIL
+from tests.batch.works import DEADLY, HELD, PATIENCE_S, wait_for
+from tests.conftest import ROOT
+
+pytestmark = pytest.mark.slow
+pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
+
+
+@pytest.fixture(scope="module")
+def replayed(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Return the bytes of the log after the single command in one process."""
+    log = Path(shutil.copy(lab_log, tmp_path_factory.mktemp("single") / "log.mcap"))
+    api.replay(log, until=UNTIL, parameters=PARAMETERS, jobs=1)
+    return log.read_bytes()
+
+
+def drive(logs: list[Path], notes: Path, workers: int) -> dict[str, Any]:
+    """Replay logs in pieces by a separate program; return the results by name."""
+    notes.mkdir()
+    request = {
+        "logs": logs,
+        "notes": notes,
+        "workers": {"workers": workers},
+        "tasks": workers,
+        "pieces": True,
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.batch.driver", json.dumps(request, default=str)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=2 * PATIENCE_S,
+        check=False,
+        env={**os.environ, NOTES: str(notes)},
+    )
+    assert done.returncode == 0, done.stderr
+    return {Path(result["log"]).name: result for result in json.loads(done.stdout)["results"]}
+
+
+def starts(notes: Path, log: str) -> dict[str, int]:
+    """Return the number of starts of each piece of a log."""
+    return {path.name.removeprefix(f"{log}-"): len(path.read_text()) for path in notes.glob(f"{log}-*")}
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_pieces_on_workers_give_the_bytes_of_one_process(
+    lab_log: Path, tmp_path: Path, replayed: bytes, workers: int
+) -> None:
+    log = Path(shutil.copy(lab_log, tmp_path / "log.mcap"))
+    (result,) = drive([log], tmp_path / "notes", workers).values()
+    assert (result["state"], result["lost_attempts"]) == ("computed", 0), result
+    assert set(starts(tmp_path / "notes", "log.mcap").values()) == {1}
+    assert len(starts(tmp_path / "notes", "log.mcap")) == result["pieces"] > 5
+    assert log.read_bytes() == replayed
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log.mcap", "notes"]
+
+
+def test_killed_worker_costs_only_its_piece(lab_log: Path, tmp_path: Path, replayed: bytes) -> None:
+    """One piece is killed in its middle and done again; one piece ends all its workers and is named."""
+    (tmp_path / "logs").mkdir()
+    logs = [Path(shutil.copy(lab_log, tmp_path / "logs" / name)) for name in (HELD, DEADLY)]
+    notes = tmp_path / "notes"
+
+    def kill() -> None:
+        wait_for(notes / "pid")
+        os.kill(int((notes / "pid").read_text()), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    results = drive(logs, notes, workers=2)
+    killer.join()
+    killed = (notes / "killed").read_text()
+    counts = starts(notes, HELD)
+    assert results[HELD]["state"] == "computed", results
+    assert {key for key, count in counts.items() if count > 1} == {killed}
+    assert logs[0].read_bytes() == replayed
+    failed = results[DEADLY]
+    assert f"its worker ended {MOST_ENDED_WORKERS} times in the piece of " in failed["text"]
+    assert logs[1].read_bytes() == lab_log.read_bytes()
+    # The pieces that were done stay for the next call.
+    kept = list((tmp_path / "logs" / f"{DEADLY}.pieces").iterdir())
+    assert len(kept) == len(starts(notes, DEADLY)) - 1

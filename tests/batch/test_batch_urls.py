@@ -1,0 +1,136 @@
+"""Batches and catalogues of logs in an S3 server on loopback: derived logs, pieces, and changed objects."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ipsys_log import api
+from ipsys_log.batch.tasks import (
+    BatchTask,
+    LogPieces,
+    LogResult,
+    perform_or_divide,
+    perform_piece,
+    replay_log,
+)
+from ipsys_log.exchange.parquet_rows import read_rows
+from ipsys_log.log.location import LogUrl
+from ipsys_log.runs import pieces
+from tests.batch.piece_works import PARAMETERS, UNTIL
+from tests.batch.works import PATIENCE_S
+from tests.conftest import ROOT, Ipsys
+from tests.s3_server import open_bucket, put, serve_s3
+
+# The import of the server takes seconds; s3fs closes its connections after the test.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+
+PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with serve_s3() as address:
+        yield address
+
+
+@pytest.fixture
+def bucket(address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with open_bucket(address, monkeypatch) as bucket:
+        yield bucket
+
+
+def batch(folder: Path, *arguments: object) -> dict[str, Any]:
+    """Run a command of the group as a program; return its JSON."""
+    done = subprocess.run(
+        [sys.executable, "-m", "ipsys_log", "batch", *map(str, arguments), "--json"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.stdout, done.stderr
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+def test_results_of_objects_are_in_derived_logs(bucket: Any, tmp_path: Path) -> None:
+    """The logs of a pattern keep their folders; a second call finds their results."""
+    pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
+    for month in ("01", "02"):
+        put(bucket, f"2026-{month}/lab.mcap", PAPER_LAB.read_bytes())
+    api.replay(PAPER_LAB, models=("rigid",), output=tmp_path / "alone.mcap")
+    command = ("replay", "s3://logs/2026-*/lab.mcap", "--model", "rigid", "-o", "out", "--workers", 1)
+    assert batch(tmp_path, *command)["states"] == {"computed": 2}
+    derived = [tmp_path / "out" / f"2026-{month}" / "lab.derived.mcap" for month in ("01", "02")]
+    assert sorted(path for path in (tmp_path / "out").rglob("*") if path.is_file()) == derived
+    assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
+    put(bucket, "2026-03/lab.mcap", b"no log")
+    result = batch(tmp_path, *command)
+    assert result["states"] == {"up to date": 2, "failed": 1}
+    assert result["results"][2]["log"] == "s3://logs/2026-03/lab.mcap"
+    assert len(result["results"][2]["text"].splitlines()) == 1
+
+
+def test_pieces_of_an_object_give_the_bytes_of_the_file(
+    bucket: Any, lab_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pieces, "_MIN_FRAMES", 1)
+    url = LogUrl(put(bucket, "lab.mcap", lab_log.read_bytes()))
+    options = {"until": UNTIL, "parameters": PARAMETERS, "folder": tmp_path}
+    task = BatchTask(replay_log, options, divides=True)
+    divided = perform_or_divide(task, url)
+    assert isinstance(divided, LogPieces)
+    for piece in reversed(pickle.loads(pickle.dumps(divided.tasks))):  # as on another machine
+        assert perform_piece(task, url, piece).failure is None
+    result = perform_or_divide(task, url)
+    assert isinstance(result, LogResult)
+    assert (result.state, result.pieces) == ("computed", len(divided.tasks))
+    api.replay(lab_log, output=tmp_path / "alone.mcap", until=UNTIL, parameters=PARAMETERS, jobs=1)
+    assert (tmp_path / "lab.derived.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+
+
+def test_object_that_changes_between_pieces_fails(
+    bucket: Any, lab_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pieces, "_MIN_FRAMES", 1)
+    url = LogUrl(put(bucket, "lab.mcap", lab_log.read_bytes()))
+    task = BatchTask(replay_log, {"until": UNTIL, "parameters": PARAMETERS, "folder": tmp_path}, divides=True)
+    divided = perform_or_divide(task, url)
+    assert isinstance(divided, LogPieces)
+    put(bucket, "lab.mcap", PAPER_LAB.read_bytes())
+    state = perform_piece(task, url, divided.tasks[0])
+    assert state.failure is not None
+    assert state.failure.text == "changed while it was read: run the command again"
+    assert not list(tmp_path.glob("*.mcap"))
+
+
+def test_catalogue_of_a_bucket_reads_only_changed_objects(bucket: Any, tmp_path: Path, ipsys: Ipsys) -> None:
+    for name in ("a", "b", "c"):
+        put(bucket, f"2026/{name}.mcap", PAPER_LAB.read_bytes())
+    target = tmp_path / "logs.parquet"
+
+    def update(*place: str) -> dict[str, Any]:
+        done = ipsys("catalogue", *place, "-o", target, "--json")
+        assert done.code == 0, done.err
+        answer: dict[str, Any] = json.loads(done.out)
+        return answer
+
+    assert update("s3://logs/2026") == {"logs": 3, "read": 3, "removed": 0, "errors": {}}
+    (row, *_) = read_rows(target)[1]
+    assert (row["log"], row["bytes"], row["measurements"]) == ("a.mcap", PAPER_LAB.stat().st_size, 114)
+    assert update("s3://logs/2026")["read"] == 0
+    # Another content of the same length.
+    put(bucket, "2026/b.mcap", bytes(PAPER_LAB.stat().st_size))
+    bucket.Object("2026/c.mcap").delete()
+    answer = update("s3://logs/2026/*.mcap")
+    assert (answer["logs"], answer["read"], answer["removed"]) == (2, 1, 1)
+    assert list(answer["errors"]) == ["b.mcap"]

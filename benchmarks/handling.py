@@ -4,10 +4,10 @@
     python benchmarks/handling.py --handling-gb 5 --rounds 1
 
 Two logs of cameras have the same times, with images of 300 kB (random bytes, which no program can compress)
-and small messages. In turns, ``cp`` copies them, and ipsys cuts, compacts, merges and checks them, and saves a
-recording for Rerun (``view``), each in a new process. Each turn begins with the logs out of the page cache,
-and ends when the new file is on the disk. Ratios are wall time for each written (or checked) byte. ``crc`` is the time of the CRC-32 of as many bytes.
-Memory is RssAnon of the process at most, read every 10 ms.
+and small messages. In turns, ``cp`` copies them, and ipsys cuts, compacts, merges and checks them, and saves
+a recording for Rerun (``view``), each in a new process. Each turn begins with the logs out of the page cache,
+and ends when the new file is on the disk. Ratios are wall time for each written (or checked) byte. ``crc`` is
+the time of the CRC-32 of as many bytes. Memory is RssAnon of the process at most, read every 10 ms.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@
     python benchmarks/handling.py --handling-gb 5 --rounds 1
 
 Two logs of cameras have the same times, with images of 300 kB (random bytes, which no program can compress)
-and small messages. In turns, ``cp`` copies them, and ipsys cuts, compacts, merges and checks them, each in a
-new process. Each turn begins with the logs out of the page cache, and ends when the new file is on the disk.
-Ratios are wall time for each written (or checked) byte. ``crc`` is the time of the CRC-32 of as many bytes.
-Memory is RssAnon of the process at most, read every 10 ms.
+and small messages. In turns, ``cp`` copies them, and ipsys cuts, compacts, merges and checks them, and saves
+a recording for Rerun (``view``), each in a new process. Each turn begins with the logs out of the page cache,
+and ends when the new file is on the disk. Ratios are wall time for each written (or checked) byte. ``crc`` is
+the time of the CRC-32 of as many bytes. Memory is RssAnon of the process at most, read every 10 ms.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ PERIOD_NS = 33_333_333
 _EPOCH_NS = 1_700_000_000_000_000_000
 _CAMERAS = (("red", "white"), ("black",))
 _EVERY_S = 0.01
+_JPEG_START = b"\xff\xd8\xff"
 _KEPT = (0.1, 0.9)  # of the time, in the cut
 
 # Makes a new file of logs.
@@ -47,7 +48,8 @@ Verb = Callable[[Sequence[Path], Path], None]
 
 def _record(path: Path, cameras: Sequence[str], instants: int) -> None:
     chance = random.Random(len(cameras))
-    images = [chance.randbytes(IMAGE_BYTES) for _ in range(30)]
+    # Viewers refuse an image that does not begin as a JPEG.
+    images = [_JPEG_START + chance.randbytes(IMAGE_BYTES - len(_JPEG_START)) for _ in range(30)]
     with LogWriter.create(path) as writer:
         for camera in cameras:
             schema = Schema("foxglove.CompressedImage", "protobuf", schema_data("foxglove.CompressedImage"))
@@ -96,6 +98,16 @@ def _merge(logs: Sequence[Path], merged: Path) -> None:
     merge(logs, merged, [LogOffset() for _ in logs])
 
 
+def _view(logs: Sequence[Path], recording: Path) -> None:
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.sinks.rerun.recording import write_recording
+
+    with Session([logs[0]]) as session:
+        write_recording(session, save=recording)
+    with recording.open("rb") as file:
+        os.fsync(file.fileno())
+
+
 def _check(logs: Sequence[Path], _copy: Path) -> None:
     from ipsys_log.soundness.check import check_logs
 
@@ -103,7 +115,7 @@ def _check(logs: Sequence[Path], _copy: Path) -> None:
 
 
 _VERBS: dict[str, Verb] = {
-    "cp": _cp, "crc": _crc, "cut": _cut, "compact": _compact, "merge": _merge, "check": _check
+    "cp": _cp, "crc": _crc, "cut": _cut, "compact": _compact, "merge": _merge, "check": _check, "view": _view
 }  # fmt: skip
 
 
@@ -149,7 +161,7 @@ class Memory:
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Copy, cut, compact, merge and check the logs in turns."""
+    """Copy, cut, compact, merge, check and view the logs in turns."""
     report = Report("handling")
     instants = 40 if options.smoke else round(options.handling_gb * 1e9 / (2 * IMAGE_BYTES))
     CACHE.mkdir(parents=True, exist_ok=True)
@@ -160,11 +172,11 @@ def measure(options: argparse.Namespace) -> Report:
         contenders = [Contender(name, _turn, (name, logs, Path(folder) / f"{name}.mcap")) for name in _VERBS]
         timings = race(contenders, 1, options.rounds)
         report.remarks.append(f"logs of {' and '.join(f'{log.stat().st_size / 1e9:.2f}' for log in logs)} GB")
-    for name in ("cut", "compact", "merge", "check"):
-        limit = None if name == "check" else ("<=", 2.0)
+    for name in ("cut", "compact", "merge", "check", "view"):
+        limit = None if name in ("check", "view") else ("<=", 2.0)
         report.rows.append(Row(f"{name} / cp", _ratios(timings[name], timings["cp"]), wanted=limit))
     report.rows.append(Row("crc / cp", _ratios(timings["crc"], timings["cp"])))
-    for name in ("cut", "compact", "merge", "check"):
+    for name in ("cut", "compact", "merge", "check", "view"):
         report.rows.append(Row(f"{name}, anonymous memory", (timings[name].kept[0][1],), "MB", ("<=", 300.0)))
     report.rows.append(Row("cp", tuple(_s_per_gb(timings["cp"])), "s/GB"))
     report.details = {name: {"wall_s": one.wall_s, "kept": one.kept} for name, one in timings.items()}

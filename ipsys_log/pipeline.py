@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -56,9 +57,11 @@ from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
 from ipsys_log.runs.model_checks import check_fits
+from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.pieces import PieceWorkers
+from ipsys_log.runs.preload import preload
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
@@ -106,20 +109,32 @@ def replay(
     check_inputs(paths, request, models, stages)
     outcomes: list[Outcome] = []
     unchecked = list(models) if len(models) > 1 else []
+    fits = any(MODEL in stage.writes for stage in stages)
 
-    local = LocalWorkers(jobs)
+    local, one_pass = LocalWorkers(jobs), OnePass(request, stages[-1])
 
-    def make(task: Task, session: Session, name: str) -> Iterator[Message]:
+    def make(
+        task: Task, session: Session, name: str, following: Sequence[Stage], model: str | None
+    ) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
+        waiting = one_pass.results(session, task, name, progress)
+        if waiting is not None:
+            yield from waiting
+            return
         with one_blas_thread():
             if MODEL in task.stage.writes and task.foreign == () and unchecked:
                 check_fits(session, request, task.inputs, unchecked)
                 unchecked.clear()
-            yield from compute_messages(task, session, name, progress, workers or local)
+            messages = compute_messages(task, session, name, progress, workers or local)
+            if task.stage.in_threads and fits:
+                messages = preload(messages, models)
+            yield from one_pass.follow(messages, session, task, name, following, model)
 
-    with open_target(paths, output) as (logs, target), local:
+    with open_target(paths, output) as (logs, target), local, one_pass:
 
-        def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
+        def do(
+            stage: Stage, following: Sequence[Stage], inputs: dict[Channel, str], model: str | None
+        ) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""
             with Session(logs) as session:
                 if MODEL in stage.writes and request.model_from is not None:
@@ -128,20 +143,20 @@ def replay(
                     options = request.options(model)
                     task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
                 if isinstance(task, Task):
-                    outcomes.append(run_stage(session, target, task, request, stages[-1], make, say))
+                    compute = partial(make, following=following, model=model)
+                    outcomes.append(run_stage(session, target, task, request, stages[-1], compute, say))
                     task = outcomes[-1].run
             inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
 
+        def do_all(parts: Sequence[Stage], inputs: dict[Channel, str], model: str | None = None) -> None:
+            for number, stage in enumerate(parts, 1):
+                do(stage, parts[number:], inputs, model)
+
         shared: dict[Channel, str] = {}
-        for stage in stages:
-            if not is_of_model(stage):
-                do(stage, shared)
+        do_all([stage for stage in stages if not is_of_model(stage)], shared)
         for model in models:
-            inputs = dict(shared)
             try:
-                for stage in stages:
-                    if is_of_model(stage):
-                        do(stage, inputs, model)
+                do_all([stage for stage in stages if is_of_model(stage)], dict(shared), model)
             except FitError as error:
                 # The checks before cannot know if corners determine all cameras.
                 if model in request.models or not reads_corners(model):

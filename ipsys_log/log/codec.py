@@ -88,6 +88,8 @@ def encode(payload: Any) -> bytes:
     2.1
     """
     kind: type = type(payload)
+    if kind is messages.Encoded:
+        return payload.data  # type: ignore[no-any-return]
     for name in _bytes_fields(kind):
         if len(getattr(payload, name)) >= _LONG:
             return _encode_around(payload, name)

@@ -43,7 +43,18 @@ from ipsys_log.messages.images import (
 from ipsys_log.messages.markers import CameraPoint, CameraPoints, Marker, MarkerPose, Markers
 from ipsys_log.messages.measurements import Distance, Interval, Measurement, WorldPoint
 from ipsys_log.messages.merges import Merge, MergedLog
-from ipsys_log.messages.message import Corners, Floats, Mat33, Mat34, Mat88, Message, TimeNs, Vec3
+from ipsys_log.messages.message import (
+    Corners,
+    Encoded,
+    Floats,
+    Mat33,
+    Mat34,
+    Mat88,
+    Message,
+    TimeNs,
+    Vec3,
+    kind_of,
+)
 from ipsys_log.messages.models import (
     CameraEvaluation,
     CameraModel,
@@ -111,6 +122,7 @@ __all__ = [
     "Corners",
     "Cut",
     "Distance",
+    "Encoded",
     "ErrorStatistics",
     "Evaluation",
     "Event",
@@ -167,4 +179,5 @@ __all__ = [
     "calibration_topic",
     "clock_topic",
     "image_topic",
+    "kind_of",
 ]

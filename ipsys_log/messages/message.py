@@ -8,7 +8,18 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Corners", "Floats", "Mat33", "Mat34", "Mat88", "Message", "TimeNs", "Vec3"]
+__all__ = [
+    "Corners",
+    "Encoded",
+    "Floats",
+    "Mat33",
+    "Mat34",
+    "Mat88",
+    "Message",
+    "TimeNs",
+    "Vec3",
+    "kind_of",
+]
 
 TimeNs = Annotated[int, "google.protobuf.Timestamp"]
 Floats = Annotated[NDArray[np.float64], (-1,)]
@@ -31,3 +42,16 @@ class Message:
     publish_time_ns: int
     payload: Any
     camera: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Encoded:
+    """A payload as the bytes of the log, on its way into the log, and its type."""
+
+    kind: type
+    data: bytes
+
+
+def kind_of(payload: Any) -> type:
+    """Return the type of a payload, encoded or not."""
+    return payload.kind if isinstance(payload, Encoded) else type(payload)

@@ -13,26 +13,24 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     ChannelWritten,
-    CompressedVideo,
     Event,
     Lens,
     Message,
     Model,
     Run,
-    SkippedVideo,
 )
-from ipsys_log.messages.channels import EVENTS, MODEL, RIG, Channel, channel_of
+from ipsys_log.messages.channels import MODEL, Channel, channel_of
 from ipsys_log.messages.stage import Stage, Timed
 from ipsys_log.rig.file import hide_passwords
 from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
+from ipsys_log.runs.inputs import inputs
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
-from ipsys_log.runs.pieces import PieceWorkers, given_settings, merge_pieces, plan_pieces
+from ipsys_log.runs.pieces import PieceWorkers, merge_pieces, plan_pieces
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.states import Recorded, recorded_stages
 from ipsys_log.runs.stream import WiredStage, in_threads, run, wire
-from ipsys_log.stages.detect import skipped_frames
 from ipsys_log.units import format_time
 
 __all__ = [
@@ -42,7 +40,6 @@ __all__ = [
     "copy_messages",
     "find_unfinished",
     "has_given_name",
-    "inputs",
     "missing_messages",
     "record_of",
     "run_stage",
@@ -273,30 +270,6 @@ def record_of(session: Session, task: Task) -> Run:
         input_runs=tuple(sorted(input_runs)),
         inputs=(*read_channels(session, task.topics), *task.foreign),
     )
-
-
-def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
-    """Yield the input of a causal stage: settings before the first frame, then its channels in log order.
-
-    The first rig and intrinsics of the log are valid from its start, even if they were recorded a little
-    later. Settings given by the user come first.
-    """
-    yield from given_settings(session, task.rig, task.lenses)
-    for topic in sorted(task.topics):
-        if topic in (*session.topics(RIG), *session.calibrations.values()):
-            yield next(session.messages([topic]))
-    total = sum(session.count(topic) for topic in task.topics)
-    progress(task.stage.name, 0, total)
-    skipped = (
-        skipped_frames(session.payloads(session.topics(EVENTS))) if "as_live" in task.parameters else set()
-    )
-    for done, message in enumerate(session.messages(task.topics), 1):
-        if message.log_time_ns not in skipped:
-            yield message
-        elif isinstance(message.payload, CompressedVideo):
-            # The next frames need it. Frames that live processing skipped before a keyframe have no effect.
-            yield replace(message, payload=SkippedVideo(message.payload))
-        progress(task.stage.name, done, total)
 
 
 def compute_messages(

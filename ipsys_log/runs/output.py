@@ -20,7 +20,7 @@ from ipsys_log.log.location import LogLocation, LogUrl, is_one_of
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.messages import ChannelWritten, Message, Rig, Run
+from ipsys_log.messages import ChannelWritten, Message, Rig, Run, kind_of
 from ipsys_log.rig.file import hide_passwords
 
 __all__ = [
@@ -55,7 +55,7 @@ def write_message(
     writer: LogWriter, message: Message, counts: dict[str, int], data: bytes | None = None
 ) -> None:
     """Write a message to an open log, and count it by its topic; ``data`` is that of :func:`serialize`."""
-    name = schema_name(type(message.payload))
+    name = schema_name(kind_of(message.payload))
     # A camera can begin to send another message type: this check refuses another schema on a known topic.
     if message.topic not in counts or message.camera is not None:
         writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))

@@ -24,11 +24,12 @@ from ipsys_log.messages import (
     RIG_TOPIC,
     CameraCalibration,
     CompressedVideo,
+    Encoded,
     Message,
     Rig,
     calibration_topic,
 )
-from ipsys_log.messages.channels import EVENTS, RIG
+from ipsys_log.messages.channels import ANNOTATIONS, EVENTS, RIG
 from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.stage import Pieces
 from ipsys_log.runs.blas import one_blas_thread
@@ -120,7 +121,7 @@ class Piece(NamedTuple):
 
 
 class FrameResult(NamedTuple):
-    """The publish time of a frame in ns, and the payloads that were made from it."""
+    """The publish time of a frame in ns, and the payloads that were made from it, some of them encoded."""
 
     publish_time_ns: int
     payloads: tuple[Any, ...]
@@ -244,12 +245,18 @@ def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:
     try:
         for message in _messages(session, run, piece):
             is_left_out = message.topic == topic and message.log_time_ns in run.skipped
-            payloads = () if is_left_out else tuple(step(message))
+            payloads = () if is_left_out else tuple(map(_encode_drawing, step(message)))
             if message.topic == topic:
                 frames.append(FrameResult(message.publish_time_ns, payloads))
     except IpsysError as error:
         return PieceResult(frames, error)
     return PieceResult(frames)
+
+
+def _encode_drawing(payload: Any) -> Any:
+    """Encode what only viewers read: its many small parts would go to another process one by one."""
+    kind = type(payload)
+    return Encoded(kind, encode(payload)) if kind in ANNOTATIONS.payloads else payload
 
 
 def given_settings(

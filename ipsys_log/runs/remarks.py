@@ -9,7 +9,7 @@ from statistics import median
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
-from ipsys_log.messages import Event, Markers, Message, Positions
+from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
 from ipsys_log.messages.channels import MARKERS, POSITIONS
 from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
@@ -65,7 +65,7 @@ class Remarks:
             self._markers += len(payload.markers)
             offsets = self._offsets_px.setdefault(str(message.camera), array("d"))
             offsets.extend(m.edge_offset_px for m in payload.markers if m.edge_offset_px is not None)
-        elif isinstance(payload, Positions):
+        elif kind_of(payload) is Positions:
             self._located.add(message.camera)
 
     def _check_detection(self) -> None:

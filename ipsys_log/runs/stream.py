@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 
 from ipsys_log.log.contents import run_of_topic
-from ipsys_log.messages import FrameTransforms, Message
+from ipsys_log.messages import FrameTransforms, Message, kind_of
 from ipsys_log.messages.channels import Channel, channel_of
 from ipsys_log.messages.stage import Stage, Step
 
@@ -44,7 +44,7 @@ class WiredStage:
 
     def topic_of(self, payload: Any, camera: str | None) -> str:
         """Return the topic that a payload of this stage goes to."""
-        return self.stage.channel_for(type(payload)).topic_of(self.run, camera)
+        return self.stage.channel_for(kind_of(payload)).topic_of(self.run, camera)
 
 
 def wire(stage: Stage, run: str, inputs: Mapping[Channel, str], step: Step) -> WiredStage:

@@ -12,7 +12,9 @@ import pickle
 import subprocess
 import sys
 import traceback
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -25,6 +27,8 @@ __all__ = ["LocalWorkers", "available_cores", "serve"]
 
 # Number of pieces for each worker that may be finished before the pieces in front of them.
 _AHEAD = 2
+# A worker has the next piece already when it finishes one: this process may be busy with writing.
+_PIECES_OF_WORKER = 2
 # The path of modules is that of this process: the folder of the user has no part in it.
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
@@ -45,10 +49,10 @@ class _Failure(NamedTuple):
 
 
 class _Worker:
-    """A worker process, its pipe, and the number of the piece that it computes now."""
+    """A worker process, its pipe, and the numbers of the pieces that it has, in their order."""
 
-    def __init__(self, run: PieceRun) -> None:
-        self.piece: int | None = None
+    def __init__(self) -> None:
+        self.pieces: deque[int] = deque()
         command = [sys.executable, "-P", "-c", _START, json.dumps([path for path in sys.path if path])]
         self.process = subprocess.Popen(
             command,
@@ -63,25 +67,27 @@ class _Worker:
         self.receiver = Connection(os.dup(self.process.stdout.fileno()), writable=False)
         self.process.stdin.close()
         self.process.stdout.close()
-        self._run = run
-        self._has_run = False
+
+    def begin(self, run: PieceRun) -> None:
+        """Send the run of the pieces that follow."""
+        self._send(run)
 
     def send(self, number: int, piece: Piece) -> None:
+        self._send(piece)
+        self.pieces.append(number)
+
+    def _send(self, what: PieceRun | Piece) -> None:
         try:
-            if not self._has_run:
-                self._sender.send(self._run)
-                self._has_run = True
-            self._sender.send(piece)
+            self._sender.send(what)
         except OSError:
             raise self._ended() from None
-        self.piece = number
 
     def receive(self) -> PieceResult:
         try:
             answer = self.receiver.recv()
         except (EOFError, OSError):
             raise self._ended() from None
-        self.piece = None
+        self.pieces.popleft()
         if isinstance(answer, _Failure):
             answer.error.add_note(f"in a worker process:\n{answer.trace}")
             raise answer.error
@@ -142,31 +148,42 @@ class LocalWorkers:
         Exception
             An error in a worker, with a note of its traceback.
         """
-        pieces = plan.pieces
         limit = _AHEAD * self.jobs + len(plan.frames.cameras)
         finished: dict[int, PieceResult] = {}
-        sent = 0
+        waiting = deque(enumerate(plan.pieces))
         try:
-            for _ in range(min(self.jobs, len(pieces))):
-                with undivided():
-                    self._workers.append(_Worker(plan.run))
-            for number in range(len(pieces)):
+            self._start(min(self.jobs, len(plan.pieces)))
+            for worker in self._workers:
+                worker.begin(plan.run)
+            for number in range(len(plan.pieces)):
+                self._feed(waiting, number + limit)
                 while number not in finished:
-                    for worker in self._workers:
-                        if worker.piece is None and sent < min(len(pieces), number + limit):
-                            worker.send(sent, pieces[sent])
-                            sent += 1
                     self._receive(finished)
+                    self._feed(waiting, number + limit)
                 yield finished.pop(number)
         finally:
             self._stop()
 
+    def _start(self, count: int) -> None:
+        """Start workers up to a number of them."""
+        while len(self._workers) < count:
+            with undivided():
+                self._workers.append(_Worker())
+
+    def _feed(self, waiting: deque[tuple[int, Piece]], stop: int) -> None:
+        """Send pieces with numbers below ``stop``: first to idle workers, then one more to each of them."""
+        for most in range(1, _PIECES_OF_WORKER + 1):
+            for worker in self._workers:
+                if waiting and waiting[0][0] < stop and len(worker.pieces) < most:
+                    worker.send(*waiting.popleft())
+
     def _receive(self, finished: dict[int, PieceResult]) -> None:
         """Wait for results, and add them by the numbers of their pieces."""
-        ready: Sequence[Any] = wait([worker.receiver for worker in self._workers if worker.piece is not None])
-        for worker in self._workers:
-            if worker.piece is not None and worker.receiver in ready:
-                number = worker.piece
+        busy = [worker for worker in self._workers if worker.pieces]
+        ready: Sequence[Any] = wait([worker.receiver for worker in busy])
+        for worker in busy:
+            if worker.receiver in ready:
+                number = worker.pieces[0]
                 finished[number] = worker.receive()
 
     def _stop(self) -> None:
@@ -187,10 +204,14 @@ def serve() -> None:
 
 def _serve(receiver: Connection, sender: Connection) -> None:
     run = receiver.recv()
+    sent: Future[None] | None = None
     try:
-        answers = _answers(run, receiver)
-        for answer in answers:
-            sender.send(answer)
+        # The next piece is computed while the other process has no time to read a result.
+        with ThreadPoolExecutor(1) as thread:
+            for answer in _answers(run, receiver):
+                if sent is not None:
+                    sent.result()
+                sent = thread.submit(sender.send, answer)
     except (EOFError, ConnectionError):
         raise
     except Exception as error:

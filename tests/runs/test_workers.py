@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing.connection
 import shutil
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,9 +59,9 @@ def _count_workers(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     started: list[Any] = []
     create = workers._Worker.__init__
 
-    def counted(self: Any, run: PieceRun) -> None:
+    def counted(self: Any) -> None:
         started.append(self)
-        create(self, run)
+        create(self)
 
     monkeypatch.setattr(workers._Worker, "__init__", counted)
     return started
@@ -119,7 +120,8 @@ def test_log_that_disappears_is_an_error_of_one_line(lab: Path) -> None:
 
 
 def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
-    worker = workers._Worker(_run(lab_log))
+    worker = workers._Worker()
+    worker.begin(_run(lab_log))
     worker.send(0, Piece("red", 0, 1))
     assert worker.receive().frames == []
     worker.close()
@@ -148,20 +150,34 @@ def test_results_wait_for_at_most_some_pieces(monkeypatch: pytest.MonkeyPatch) -
     assert sent == list(range(100))
 
 
+def test_busy_worker_has_its_next_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker does not wait while this process writes the results before."""
+    sent: list[int] = []
+    _pretend(monkeypatch, sent)
+    monkeypatch.setattr(workers, "wait", lambda receivers: list(receivers)[:1])
+    with LocalWorkers(2) as local:
+        results = local.compute(_plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(9))))
+        next(results)
+        # Before the first result is used, each worker has a piece in work and another one.
+        assert [list(worker.pieces) for worker in local._workers] == [[2, 4], [1, 3]]
+
+
 def _pretend(monkeypatch: pytest.MonkeyPatch, sent: list[int]) -> None:
     """Replace the processes by objects that have a result at once."""
 
     class Pretended:
-        def __init__(self, _run: PieceRun) -> None:
-            self.piece: int | None = None
+        def __init__(self) -> None:
+            self.pieces: deque[int] = deque()
             self.receiver = self
 
+        def begin(self, _run: PieceRun) -> None: ...
+
         def send(self, number: int, _piece: Piece) -> None:
-            self.piece = number
+            self.pieces.append(number)
             sent.append(number)
 
         def receive(self) -> Any:
-            self.piece = None
+            self.pieces.popleft()
             return object()
 
         def stop(self) -> None: ...

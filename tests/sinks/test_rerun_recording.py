@@ -35,7 +35,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.runs.output import write_log
-from ipsys_log.sinks.rerun.messages import RerunSink, rerun_image
+from ipsys_log.sinks.rerun.messages import RerunSink, encoded_frame, raw_image
 from ipsys_log.sinks.rerun.recording import write_recording
 
 START_NS = 1_700_000_000_000_000_001
@@ -339,9 +339,57 @@ def test_named_runs_include_their_input_markers(log: Path, tmp_path: Path) -> No
         assert write_recording(session, ["poly"], tmp_path / "out.rrd").markers == "stock"
 
 
+def content_of(path: Path) -> dict[tuple[str, str], list[tuple[int, int, str]]]:
+    """Return the values of a recording with their times, by entity and component."""
+    found: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        if "log_time" not in batch.schema.names:  # the description of the recording
+            continue
+        times = [batch.column(name).cast("int64").to_pylist() for name in ("publish_time", "log_time")]
+        for name in (name for name in batch.schema.names if ":" in name):
+            values = batch.column(name).to_pylist()
+            given = [row for row in zip(*times, map(repr, values), strict=True) if row[2] != "None"]
+            found.setdefault((chunk.entity_path, name), []).extend(given)
+    return {key: sorted(rows_) for key, rows_ in found.items() if rows_}
+
+
+def test_recording_is_the_same_with_any_batches(
+    saved: Path, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without batches, each row is drawn alone: a recording then shows what each message gives."""
+    path = tmp_path / "single.rrd"
+    monkeypatch.setattr("ipsys_log.sinks.rerun.recording._BATCH", 1)
+    monkeypatch.setattr("ipsys_log.sinks.rerun.messages._MOST_WAITING_BYTES", 1)
+    with Session([log]) as session:
+        write_recording(session, save=path)
+    assert content_of(path) == content_of(saved)
+
+
+def test_damaged_frame_hides_the_frame_before_it(tmp_path: Path) -> None:
+    """The frames wait for their batch; the one that cannot be drawn must come after them."""
+    data = (jpeg(1), jpeg(2), b"damaged", jpeg(3))
+    frames = [
+        Message(
+            "/cameras/red/image", time_ns, time_ns, CompressedImage(time_ns, "red", bytes_, "jpeg"), "red"
+        )
+        for time_ns, bytes_ in zip(TIMES_NS, data, strict=False)
+    ]
+    path = drawn_by(tmp_path / "damaged.rrd", frames)
+    drawn = rows(path, "/cameras/red/image", "EncodedImage:blob")
+    assert [row[0] for row in drawn] == [TIMES_NS[0], TIMES_NS[1], TIMES_NS[3]]
+    assert [row[0] for row in rows(path, "/cameras/red/image", "Clear:is_recursive")] == [TIMES_NS[2]]
+    order = [
+        chunk.num_rows
+        for chunk in RrdReader(path).stream().to_chunks()
+        if chunk.entity_path == "/cameras/red/image"
+    ]
+    assert order == [2, 1, 1]
+
+
 def test_raw_frames_lose_the_padding_of_their_rows() -> None:
     pixels = np.arange(2 * 8, dtype=np.uint8).reshape(2, 8)
-    image = rerun_image(RawImage(0, "red", 2, 2, "bgr8", 8, pixels.tobytes()))
+    image = raw_image(RawImage(0, "red", 2, 2, "bgr8", 8, pixels.tobytes()))
     assert isinstance(image, rr.Image)
     assert image.buffer is not None
     assert bytes(image.buffer.as_arrow_array().to_pylist()[0]) == pixels[:, :6].tobytes()
@@ -358,4 +406,4 @@ def test_raw_frames_lose_the_padding_of_their_rows() -> None:
 )
 def test_frames_that_cannot_be_drawn_say_why(frame: CompressedImage | RawImage, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
-        rerun_image(frame)
+        raw_image(frame) if isinstance(frame, RawImage) else encoded_frame(frame)

@@ -26,7 +26,7 @@ from ipsys_log.sinks.colours import MARKER_COLOUR, TRUTH_COLOUR, camera_colours,
 from ipsys_log.sinks.rerun.scene import TIMELINES
 from ipsys_log.sinks.rerun.trails import Fading, Segment, Trails
 
-__all__ = ["RerunSink", "rerun_image", "trail_entity"]
+__all__ = ["RerunSink", "encoded_frame", "raw_image", "trail_entity"]
 
 # Colour model and channels by pixel encoding, all with 8 bits.
 _RAW = {
@@ -39,32 +39,41 @@ _RAW = {
     "bgra8": (rr.ColorModel.BGRA, 4),
 }
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265}
+# Frames of all cameras that wait for their batch: larger batches are not faster.
+_MOST_WAITING_BYTES = 16 << 20
+
+Entity = tuple[str, ...]
+Kind = Any  # a Rerun archetype, such as rr.Points3D
+Fields = Mapping[str, Any]
 
 
-def rerun_image(
-    frame: CompressedImage | CompressedVideo | RawImage,
-) -> rr.EncodedImage | rr.VideoStream | rr.Image:
-    """Return a frame for Rerun; JPEG, PNG and video are neither decoded nor converted to another format.
+def encoded_frame(frame: CompressedImage | CompressedVideo) -> tuple[Kind, Fields]:
+    """Return the archetype of a frame and its fields, of one row; nothing is decoded or encoded again.
 
     Raises
     ------
     ValueError
         The frame is no image that can be drawn; the text gives the reason.
     """
-    if isinstance(frame, RawImage):
-        return _raw_image(frame)
     if isinstance(frame, CompressedVideo):
         if frame.format not in _CODECS:
             raise ValueError(f"video format {frame.format!r} cannot be drawn (only {', '.join(_CODECS)})")
-        return rr.VideoStream(_CODECS[frame.format], sample=frame.data)
+        return rr.VideoStream, {"codec": [_CODECS[frame.format]], "sample": [frame.data]}
     if frame.data[:3] == b"\xff\xd8\xff":
-        return rr.EncodedImage(contents=frame.data, media_type="image/jpeg")
+        return rr.EncodedImage, {"blob": [frame.data], "media_type": ["image/jpeg"]}
     if frame.data[:8] == b"\x89PNG\r\n\x1a\n":
-        return rr.EncodedImage(contents=frame.data, media_type="image/png")
+        return rr.EncodedImage, {"blob": [frame.data], "media_type": ["image/png"]}
     raise ValueError(f"{len(frame.data)} bytes are not a JPEG or PNG ({frame.format or 'no format given'})")
 
 
-def _raw_image(frame: RawImage) -> rr.Image:
+def raw_image(frame: RawImage) -> rr.Image:
+    """Return a frame of pixels without the padding of its rows.
+
+    Raises
+    ------
+    ValueError
+        The pixel encoding cannot be drawn, or bytes are missing.
+    """
     if frame.encoding not in _RAW:
         raise ValueError(f"pixel encoding {frame.encoding!r} cannot be drawn (only {', '.join(_RAW)})")
     model, channels = _RAW[frame.encoding]
@@ -75,10 +84,6 @@ def _raw_image(frame: RawImage) -> rr.Image:
     pixels = np.ascontiguousarray(rows[:, :used]).reshape(frame.height, frame.width, channels)
     return rr.Image(pixels[..., 0] if channels == 1 else pixels, color_model=model)
 
-
-Entity = tuple[str, ...]
-Kind = Any  # a Rerun archetype, such as rr.Points3D
-Fields = Mapping[str, Any]
 
 # Rerun counts pixels from the first pixel's corner, OpenCV from its centre.
 _CORNER_FROM_CENTRE_PX = 0.5
@@ -140,6 +145,7 @@ class RerunSink:
         self._runs = tuple(runs)
         self._robots: dict[tuple[str | None, str], int] = {}
         self._waiting: dict[Entity, tuple[Kind, list[tuple[Message | Segment, Fields]]]] = {}
+        self._waiting_bytes = 0
         self._looks: dict[Entity, _Look] = {}
         self._fading = Fading(self._clear)
         self._trails = Trails(self._draw_segment)
@@ -164,6 +170,7 @@ class RerunSink:
         """Draw the waiting rows: drawing many rows of an entity at once is many times faster."""
         for entity in list(self._waiting):
             self._send(entity)
+        self._waiting_bytes = 0
 
     def close(self) -> None:
         """Draw all waiting rows."""
@@ -231,12 +238,24 @@ class RerunSink:
     def _draw_image(self, message: Message) -> None:
         entity = ("cameras", str(message.camera), "image")
         try:
-            self._log(message, entity, rerun_image(message.payload))
+            if isinstance(message.payload, RawImage):
+                self._log(message, entity, raw_image(message.payload))
+            else:
+                self._add_frame(message, entity, *encoded_frame(message.payload))
         except ValueError as error:
+            self._send(entity)
             self._log(message, entity, rr.Clear(recursive=False))
             self._log(message, ("events", "frames"), rr.TextLog(f"{message.topic}: {error}", level="WARN"))
             return
         self._fading.seen(entity, message, self._fade_ns.get(message.topic, 0))
+
+    def _add_frame(self, message: Message, entity: Entity, kind: Kind, fields: Fields) -> None:
+        if self._waiting.get(entity, (kind,))[0] is not kind:
+            self._send(entity)
+        self._add(message, entity, kind, fields)
+        self._waiting_bytes += len(message.payload.data)
+        if self._waiting_bytes >= _MOST_WAITING_BYTES:
+            self.flush()
 
     def _draw_markers(self, message: Message) -> None:
         entity = ("cameras", str(message.camera), "image", "markers")

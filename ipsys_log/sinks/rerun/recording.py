@@ -126,7 +126,7 @@ _FRAME_FACTOR = 10
 # Titles of the plots, with their units.
 _PLOTS = {DISAGREEMENT: "Disagreement of cameras, mm", LATENCY_MS: "Latency, ms"}
 # Number of messages between two writes to the viewer: enough for its speed, small in memory.
-_BATCH = 64
+_BATCH = 1024
 
 
 def write_recording(session: Session, runs: Sequence[str] = (), save: Path | None = None) -> Shown:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
 from ipsys_log.tracking.history import HISTORY_NS, History, Record, Sighted
 from ipsys_log.tracking.motion import MotionNoise
+from ipsys_log.tracking.unseen_growth import UnseenGrowth
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Pose", "Robot", "RobotTracks", "TrackSettings", "gather_sightings"]
@@ -77,11 +78,12 @@ class Pose(NamedTuple):
 class _Track:
     """A track, and the sightings that contradict it: a rival track of the same robot.
 
-    ``sightings`` counts those of the track, ``hits`` the consecutive ones of the rival, and ``late`` those
-    that are too late.
+    ``growth`` is that of its covariance without sightings. ``sightings`` counts those of the track, ``hits``
+    the consecutive ones of the rival, and ``late`` those that are too late.
     """
 
     history: History
+    growth: UnseenGrowth = field(default_factory=UnseenGrowth)
     sightings: int = 0
     has_covariance: bool = True
     rival: History | None = None
@@ -189,7 +191,8 @@ class RobotTracks:
             return []
         last = _gather([track.history.newest for _, track, _ in coasting])
         ages_s = np.array([age_ns for _, _, age_ns in coasting]) / NS_PER_S
-        states = predict(last, ages_s, settings.motion)
+        scales = np.array([track.growth.scale for _, track, _ in coasting])
+        states = predict(last, ages_s, settings.motion, scales)
         spreads_m2 = states.covariances[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1)
         for _, track, _ in coasting:
             track.history.rows_ns.add(time_ns)
@@ -276,6 +279,8 @@ class RobotTracks:
             if place == len(track.history.records):
                 track.has_covariance = batch.has_covariance[row]
         self._filter_again(later)
+        for track, _, _ in later:
+            track.growth.learn(track.history, self._settings.motion)
         return accepted
 
     def _states_after(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import Model, Position, Rig
 from ipsys_log.tracking.filter import States
 from ipsys_log.tracking.frame_reader import FrameReader
-from ipsys_log.tracking.history import Sighted
+from ipsys_log.tracking.history import Sighted, combine_seen
 from ipsys_log.tracking.motion import MOTION
 from ipsys_log.tracking.smoother import smooth_track
 from ipsys_log.tracking.tracks import Pose, Robot, RobotTracks, TrackSettings, gather_sightings
@@ -132,7 +132,7 @@ class _Smoother:
                         times_ns[place],
                         states,
                         place - first,
-                        *_recent(records[window]),
+                        *combine_seen(tuple((one.camera, one.inside) for one in records[window])),
                         known[records[place].sighting],
                         age_ns=times_ns[place] - times_ns[0],
                     )
@@ -143,9 +143,3 @@ class _Smoother:
         self.done += sightings
         # Each sighting is filtered, and then smoothed.
         self.progress(self.done / self.count / 2)
-
-
-def _recent(records: Sequence[Sighted]) -> tuple[tuple[str, ...], bool | None]:
-    """Return the cameras of recent sightings, and whether one of them is inside the calibrated volume."""
-    flags = [one.inside for one in records if one.inside is not None]
-    return tuple(sorted({one.camera for one in records})), any(flags) if flags else None

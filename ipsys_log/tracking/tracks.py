@@ -275,12 +275,14 @@ class RobotTracks:
                 continue
             track.rival, track.hits, track.late = None, 0, 0
             track.sightings += 1
-            later.append((track, place, [record, *track.history.records[place:]]))
-            if place == len(track.history.records):
-                track.has_covariance = batch.has_covariance[row]
+            if place < len(track.history.records):
+                later.append((track, place, [record, *track.history.records[place:]]))
+                continue
+            track.history.append(record)
+            track.has_covariance = batch.has_covariance[row]
+            if record.time_ns >= track.growth.due_ns:
+                track.growth.learn(track.history, self._settings.motion)
         self._filter_again(later)
-        for track, _, _ in later:
-            track.growth.learn(track.history, self._settings.motion)
         return accepted
 
     def _states_after(
@@ -338,7 +340,7 @@ class RobotTracks:
         own = record._replace(states=states, state=0)
         if hits == 1 or rival is None:
             rival = History(complete=self._complete)
-        rival.replace_from(len(rival.records), [own])
+        rival.append(own)
         track.rival, track.hits = rival, hits
         if hits < min(self._settings.restart, track.sightings):
             return False
@@ -353,15 +355,14 @@ class RobotTracks:
         if time_ns in track.history.rows_ns:
             return None
         track.history.rows_ns.add(time_ns)
-        recent = track.history.recent(time_ns, self._settings.window_ns)
-        flags = [record.inside for record in recent if record.inside is not None]
+        last, cameras, inside = track.history.recent(time_ns, self._settings.window_ns)
         return Pose(
             robot,
             time_ns,
-            recent[-1].states,
-            recent[-1].state,
-            tuple(sorted({record.camera for record in recent})),
-            any(flags) if flags else None,
+            last.states,
+            last.state,
+            cameras,
+            inside,
             batch.has_covariance[row],
             age_ns=time_ns - track.history.began_ns,
         )

@@ -29,7 +29,7 @@ class UnseenGrowth:
     Attributes
     ----------
     weight, total : sum of the weights of the comparisons, and of their weighted squared errors.
-    due_ns : time of the next comparison.
+    due_ns : earliest time of the next comparison.
     """
 
     weight: float = 0.0
@@ -42,7 +42,7 @@ class UnseenGrowth:
         return min(max((_PRIOR + self.total) / (_PRIOR + self.weight), _LEAST), _LARGEST)
 
     def learn(self, history: History, noise: MotionNoise) -> None:
-        """Compare the newest position of a history with its prediction, if a comparison is due.
+        """Compare the newest position of a history with its prediction, if the history is long enough.
 
         A comparison has the weight of the accelerations in the variance of the prediction: a new track, whose
         velocity is not known, tells nothing about them.
@@ -53,8 +53,6 @@ class UnseenGrowth:
         noise : the usual motion.
         """
         newest = history.newest
-        if newest.time_ns < self.due_ns:
-            return
         place = history.place_of(newest.time_ns - _AHEAD_NS)
         if not place:
             return

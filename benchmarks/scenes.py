@@ -24,7 +24,7 @@ from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 
-__all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "truth", "with_restarts"]
+__all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "simulator_key", "truth", "with_restarts"]
 
 CACHE = Path(__file__).resolve().parent.parent / ".cache" / "bench"
 
@@ -43,15 +43,19 @@ class Truth:
 
 def drawn(settings: LabSettings) -> Path:
     """Return the log of a session of the simulated lab; render it if it does not exist yet."""
-    # Another simulator or another JPEG encoder gives other frames.
-    key = hashlib.blake2b(f"{settings} {cv2.__version__}".encode(), digest_size=8)
-    for source in sorted(Path(simulation.__file__).parent.glob("*.py")):
-        key.update(source.read_bytes())
-    path = CACHE / f"{key.hexdigest()}.mcap"
+    path = CACHE / f"{simulator_key(str(settings))}.mcap"
     if not path.exists():
         CACHE.mkdir(parents=True, exist_ok=True)
         write_log(path, simulate(settings))
     return path
+
+
+def simulator_key(settings: str) -> str:
+    """Return a key of the frames of a session: another simulator or JPEG encoder gives other frames."""
+    key = hashlib.blake2b(f"{settings} {cv2.__version__}".encode(), digest_size=8)
+    for source in sorted(Path(simulation.__file__).parent.glob("*.py")):
+        key.update(source.read_bytes())
+    return key.hexdigest()
 
 
 def with_restarts(path: Path, rows: int = 1) -> Path | None:

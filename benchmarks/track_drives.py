@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from pathlib import Path
 
 import numpy as np
 from geometric_labs import Scene, Session, fit_session, make_session
 from numpy.typing import NDArray
+from rendered_sessions import rendered_session
 
 from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.payload import JOINT, joint_payload
@@ -19,6 +21,7 @@ from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.geometric_sightings import start_ns
+from ipsys_log.simulation.pace import Pace, Stops, draw_pace
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.stages.fit import fit_model
@@ -32,6 +35,8 @@ Times = NDArray[np.int64]
 
 # The drive has this seed besides that of its lab, for other noise.
 _OTHER_NOISE = 500_000
+# The stops of the robots have their own random numbers.
+_STOPS_STREAM = 2
 _CLOCKS_S, _DELAYS_S = 0.025, (0.0, 0.011, 0.022)
 _ROW_TIME_NS = 31_000
 _ROBOTS, _RATE_HZ = 3, 30.0
@@ -47,9 +52,10 @@ CALIBRATIONS: dict[str, tuple[str, bool]] = {
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The condition of a drive, by its name: speed, shutter, clocks, and unevenness of the floor.
+    """The condition of a drive, by its name: speed, shutter, clocks, unevenness of the floor, and stops.
 
-    With ``unknown_clocks``, the stamps of each camera have an unknown offset of up to 25 ms.
+    With ``unknown_clocks``, the stamps of each camera have an unknown offset of up to 25 ms. With ``keep``, a
+    folder, markers come from images, which are rendered once (``rendered_sessions.py``).
     """
 
     name: str
@@ -58,6 +64,8 @@ class Condition:
     unknown_clocks: bool = False
     floor_rms_m: float = 0.0
     height_sigma_m: float = 0.0
+    stops: Stops | None = None
+    keep: Path | None = None
 
     def settings(self, lab: LabSettings, points: int) -> GeometricSettings:
         """Return the settings of a session of the lab under this condition."""
@@ -73,17 +81,26 @@ class Condition:
 
 def calibrate(condition: Condition, name: str, seed: int) -> Model:
     """Return a calibration of a lab, by its name in ``CALIBRATIONS``; the speed of its drive is usual."""
-    return _calibrate(replace(condition, name="", speed_m_s=0.5), name, seed)
+    return _calibrate(replace(condition, name="", speed_m_s=0.5, stops=None), name, seed)
 
 
 @cache
 def _calibrate(condition: Condition, name: str, seed: int) -> Model:
     model, drives = CALIBRATIONS[name]
     settings = LabSettings(rate_hz=10.0, drive_s=120.0 if drives else 0.0, markers=1 if drives else 3)
-    session: Session = make_session(Scene(name, condition.settings(settings, 75)), seed)
+    session = _session(condition, Scene(name, condition.settings(settings, 75)), seed)
     if model == JOINT:
         return joint_payload(fit_session(session), session.pairs, 0)
     return fit_model(model, session.pairs, 0)
+
+
+def _session(condition: Condition, scene: Scene, seed: int) -> Session:
+    if condition.keep is None:
+        session: Session = make_session(scene, seed)
+        return session
+    lab = build_lab(scene.seeded(seed))
+    messages = rendered_session(lab, condition.keep)
+    return Session(lab, messages, next(one.payload for one in messages if isinstance(one.payload, Rig)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,8 +181,10 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
     )
     lab = build_lab(condition.settings(settings, 0))
     noise = replace(lab.settings, lab=replace(lab.settings.lab, seed=seed + _OTHER_NOISE))
-    lab = replace(lab, settings=noise, drive=replace(lab.drive, mirrored=not lab.drive.mirrored))
-    messages = list(simulate_session(lab))
+    drive = replace(lab.drive, mirrored=not lab.drive.mirrored, paces=_paces(condition, seed, duration_s))
+    lab = replace(lab, settings=noise, drive=drive)
+    keep = condition.keep
+    messages = list(simulate_session(lab)) if keep is None else rendered_session(lab, keep)
     # The time of the joint model is that of its first camera.
     late_ns = lab.clock_offsets_ns[model.cameras[0].camera] if model.name == JOINT else 0
     return SeenDrive(
@@ -175,6 +194,15 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
         Truth(lab, late_ns),
         {camera.name: camera.origin_m[:2] for camera in lab.cameras},
     )
+
+
+def _paces(condition: Condition, seed: int, duration_s: float) -> dict[int, Pace]:
+    if condition.stops is None:
+        return {}
+    rng = np.random.default_rng([seed, _STOPS_STREAM])
+    return {
+        robot: draw_pace(condition.stops, condition.speed_m_s, duration_s, rng) for robot in range(_ROBOTS)
+    }
 
 
 def cover(drive: SeenDrive, gaps_ns: Sequence[tuple[int, int]]) -> SeenDrive:

@@ -33,6 +33,8 @@ _HAND_OVER_NS = 100_000_000
 _GRID_NS = 1_000_000
 # All cameras are covered for a while, again and again; the errors are sampled in these gaps.
 _GAP_NS, _GAP_EVERY_NS, _GAP_STEP_NS = 600_000_000, 3_000_000_000, 50_000_000
+# A robot is seen for at least this time before each gap. The times of the gaps have their own random numbers.
+_SEEN_NS, _GAP_STREAM = 1_200_000_000, 1
 _MM = 1000.0
 
 
@@ -84,10 +86,15 @@ def compute_lab_errors(
 
 
 def find_gaps(drive: SeenDrive) -> list[tuple[int, int]]:
-    """Return intervals in which all cameras are covered: 0.6 s in every 3 s."""
+    """Return intervals in which all cameras are covered: 0.6 s in every 3 s, at times from the lab's seed.
+
+    With fixed times, the first robot would meet the same bends in every lab.
+    """
     first_ns, last_ns = drive.positions[0].publish_time_ns, drive.positions[-1].publish_time_ns
-    starts = np.arange(first_ns + _GAP_EVERY_NS - _GAP_NS, last_ns - 2 * _GAP_NS, _GAP_EVERY_NS)
-    return [(start, start + _GAP_NS) for start in starts.tolist()]
+    periods_ns = np.arange(first_ns, last_ns - _GAP_EVERY_NS, _GAP_EVERY_NS)
+    rng = np.random.default_rng([drive.truth.lab.settings.lab.seed, _GAP_STREAM])
+    starts_ns = periods_ns + rng.integers(_SEEN_NS, _GAP_EVERY_NS - _GAP_NS, len(periods_ns), endpoint=True)
+    return [(start_ns, start_ns + _GAP_NS) for start_ns in starts_ns.tolist()]
 
 
 def compute_coasting_errors(

@@ -13,6 +13,9 @@ each instant. A step is the change of the error between two rows up to 60 ms apa
 the cameras of the last 100 ms changes. Steps and velocities have 95th percentiles over all labs and robots.
 The script prints tables, and writes JSON with -o.
 
+``--rendered`` renders the labs and detects their markers. Each session is rendered once into the folder of
+``--keep``; a run that was interrupted continues there. The log of a session is in it without its images.
+
 ``--track-coverage`` compares covariances with errors in many labs, with short drives (``track_coverage.py``).
 """
 
@@ -22,9 +25,11 @@ import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from results import Report, command
 from rounds import Row
+from scenes import CACHE
 from threadpoolctl import threadpool_limits
 from track_contenders import COASTING, CONTENDERS
 from track_coverage import COVERAGE_DRIVE_S, coverage_of_lab, coverage_table
@@ -40,11 +45,14 @@ from track_errors import (
 
 from ipsys_log.errors import FitError
 from ipsys_log.joint.payload import JOINT
+from ipsys_log.simulation.pace import Stops
 
 __all__ = ["measure"]
 
 # No other part of the project uses these seeds.
 _FIRST_SEED = 3000
+# The acceleration is the default limit of the DWB controller of Nav2, whose robot drives at 0.26 m/s.
+_STOPS = Stops(legs_s=6.0, stands_s=2.0, acceleration_m_s2=2.5)
 _CONDITIONS = (
     Condition("0.26_m_s", 0.26),
     Condition("1_m_s", 1.0),
@@ -54,6 +62,8 @@ _CONDITIONS = (
     Condition("1_m_s, clocks", 1.0, unknown_clocks=True),
     Condition("0.26_m_s, uneven", 0.26, floor_rms_m=0.0015),
     Condition("1_m_s, uneven", 1.0, floor_rms_m=0.0015),
+    Condition("0.26_m_s, stops", 0.26, stops=_STOPS),
+    Condition("1_m_s, stops", 1.0, stops=_STOPS),
 )
 # Only a joint calibration with a drive estimates clock offsets.
 _ESTIMATES_CLOCKS = "joint, drive"
@@ -97,9 +107,7 @@ def measure(options: argparse.Namespace) -> Report:
         _add_coverage(report, options)
         return report
     sigma_m = options.height_sigma_mm / 1000
-    conditions = [
-        replace(one, height_sigma_m=sigma_m) for one in _CONDITIONS if options.condition in one.name
-    ]
+    conditions = [replace(one, height_sigma_m=sigma_m) for one in _chosen(options)]
     models = options.calibrations.split(";") if options.calibrations else list(CALIBRATIONS)
     contenders = options.contenders.split(",") if options.contenders else list(CONTENDERS)
     for names, known, kind in ((models, CALIBRATIONS, "calibration"), (contenders, CONTENDERS, "contender")):
@@ -115,9 +123,21 @@ def measure(options: argparse.Namespace) -> Report:
     return report
 
 
+def _chosen(options: argparse.Namespace) -> list[Condition]:
+    """Return the conditions that the options select; those with images if there shall be images."""
+    chosen = [one for one in _CONDITIONS if options.condition in one.name]
+    if not options.rendered:
+        return chosen
+    return [
+        replace(one, name=f"{one.name}, rendered", keep=Path(options.keep))
+        for one in chosen
+        if not one.floor_rms_m
+    ]
+
+
 def _add_coverage(report: Report, options: argparse.Namespace) -> None:
     """Add the coverage of the covariances of ``joint``: a table for each condition."""
-    conditions = [one for one in _CONDITIONS if options.condition in one.name]
+    conditions = _chosen(options)
     seeds = range(_FIRST_SEED, _FIRST_SEED + (1 if options.smoke else options.drive_labs))
     with threadpool_limits(1):
         for condition in conditions[:1] if options.smoke else conditions:
@@ -242,6 +262,8 @@ def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--drive-s", type=float, default=20.0, help="duration of a drive in s")
     parser.add_argument("--height-sigma-mm", type=float, default=0.0, help="sigma of the robots' heights")
     parser.add_argument("--condition", default="", help="only conditions with this in their name")
+    parser.add_argument("--rendered", action="store_true", help="render the labs: about 3 minutes for each")
+    parser.add_argument("--keep", default=str(CACHE / "labs"), help="folder of the rendered labs")
     parser.add_argument("--calibrations", default="", help=f"of {'; '.join(CALIBRATIONS)}")
     parser.add_argument("--contenders", default="", help=f"of {', '.join(CONTENDERS)}")
 

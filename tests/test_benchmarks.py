@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -270,3 +271,23 @@ def test_drift_benchmark_finds_a_large_knock() -> None:
     assert lines[0] == "3 undisturbed logs: 0 false alarms"
     assert "1 of 1" in lines[-1]
     assert max(map(len, lines)) <= 80
+
+
+def test_cameras_are_covered_at_other_times_in_each_lab(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With equal times, the first robot would be unseen in the same bends in all labs."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    find_gaps = importlib.import_module("track_errors").find_gaps
+    frames = [SimpleNamespace(publish_time_ns=n * 10**9) for n in (0, 20)]
+
+    def gaps_of(seed: int) -> np.ndarray:
+        lab = SimpleNamespace(settings=SimpleNamespace(lab=SimpleNamespace(seed=seed)))
+        drive = SimpleNamespace(positions=frames, truth=SimpleNamespace(lab=lab))
+        return np.array(find_gaps(drive)) / 1e9
+
+    gaps_s = np.array([gaps_of(seed) for seed in range(100)])
+    assert gaps_s.shape == (100, 6, 2)
+    np.testing.assert_array_equal(gaps_s[0], gaps_of(0))
+    np.testing.assert_allclose(gaps_s[:, :, 1] - gaps_s[:, :, 0], 0.6)
+    assert (gaps_s[:, 1:, 0] - gaps_s[:, :-1, 1]).min() > 1.1
+    assert gaps_s[:, :, 0].std(axis=0).min() > 0.25
+    assert gaps_s.max() < 20

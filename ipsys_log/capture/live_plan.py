@@ -85,6 +85,9 @@ class _LiveView:
             return [] if self.model is None else [self.model]
         return [message.payload for message in self.messages(channel)]
 
+    def count(self, *channels: Channel) -> int:
+        return sum(1 for _ in self.messages(*channels))
+
     def last_ns(self, *channels: Channel) -> int:
         return max((message.publish_time_ns for message in self.messages(*channels)), default=0)
 

@@ -48,6 +48,9 @@ class StageView(Protocol):
     def payloads(self, channel: Channel, /) -> list[Any]:
         """Return the payloads of a channel."""
 
+    def count(self, *channels: Channel) -> int:
+        """Return the number of messages of some channels."""
+
     def last_ns(self, *channels: Channel) -> int:
         """Return the publish time of the last message of some channels."""
 

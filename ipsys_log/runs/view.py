@@ -71,6 +71,10 @@ class LogView:
         """Return the payloads of a channel."""
         return self.session.payloads(self.topics(channel))
 
+    def count(self, *channels: Channel) -> int:
+        """Return the number of messages of some channels, from the index of the log."""
+        return sum(self.session.count(topic) for channel in channels for topic in self.topics(channel))
+
     def last_ns(self, *channels: Channel) -> int:
         """Return the publish time of the last message of some channels."""
         return self.session.last([topic for channel in channels for topic in self.topics(channel)])[1]

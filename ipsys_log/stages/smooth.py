@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 
 from ipsys_log.errors import IpsysError
@@ -15,21 +15,33 @@ from ipsys_log.tracking.track_rows import make_track
 
 __all__ = ["STAGE"]
 
+_STEPS = 3
+
 
 def _compute(view: StageView, progress: Progress) -> Iterator[Timed]:
     rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
     if rig is None:
         raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
-    progress(0, 1)
-    poses = smooth_positions(_frames(view), rig, model_of(view))
-    progress(1, 1)
+    count = view.count(POSITIONS)
+    # Frames are read, then filtered, then smoothed: each of them counts once for each step.
+    total = max(_STEPS * count, 1)
+    progress(0, total)
+    frames = _frames(view, lambda done: progress(done, total))
+    poses = smooth_positions(
+        frames,
+        rig,
+        model_of(view),
+        progress=lambda share: progress(count + round(share * (total - count)), total),
+    )
+    progress(total, total)
     return _messages(poses)
 
 
-def _frames(view: StageView) -> Iterator[Frame]:
+def _frames(view: StageView, progress: Callable[[int], None]) -> Iterator[Frame]:
     """Yield the positions of all frames, without late frames: these have wrong times."""
     late_frames = LateFrames(view.payloads(EVENTS))
-    for message in view.messages(POSITIONS):
+    for done, message in enumerate(view.messages(POSITIONS), 1):
+        progress(done)
         if not late_frames.has(message):
             camera, time_ns = str(message.camera), message.publish_time_ns
             yield Frame(time_ns, camera, message.log_time_ns, message.payload.positions)

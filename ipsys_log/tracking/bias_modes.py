@@ -104,8 +104,9 @@ class BiasModes:
         i, j = cells[:, 0], cells[:, 1]
         s, t = shares[:, 0, None, None], shares[:, 1, None, None]
         u, v = 1 - s, 1 - t
-        row = self.grid.shape[1]
-        corners = i * row + j + np.array([[0], [row], [1], [row + 1]])
+        row, corners = self.grid.shape[1], np.empty((4, count), dtype=np.intp)
+        corners[0] = i * row + j
+        corners[1], corners[2], corners[3] = corners[0] + row, corners[0] + 1, corners[0] + (row + 1)
         near, right, above, far = self.tables[camera].reshape(-1, 3, self.count).take(corners, axis=0)
         sensitivities = np.empty((count, 4, self.count))
         sensitivities[:, :3] = (near * u + right * s) * v + (above * u + far * s) * t

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 # The variance of a heading that was not measured: it has no weight in double precision.
 UNKNOWN_RAD2 = 1e6
 _START_HEADING_RAD2 = np.pi**2
+# The velocity and the acceleration on the floor.
+_MOVING = [4, 5, 8, 9]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,16 +129,29 @@ def start(sightings: Sightings, noise: MotionNoise, fade_m: Array | None = None)
     return States(means, covariances, cross, fade_m)
 
 
-def predict(states: States, durations_s: Array, noise: MotionNoise) -> States:
-    """Return the states after durations (k,) in s, which are at least 0."""
+def predict(states: States, durations_s: Array, noise: MotionNoise, scales: Array | None = None) -> States:
+    """Return the states after durations (k,) in s, which are at least 0.
+
+    ``scales`` (k,) are factors of the variances of the velocities and accelerations on the floor, and so of
+    the growth of the covariance.
+    """
+    if scales is not None:
+        states = _scale_moving(states, scales)
     speeds_m_s = np.hypot(states.means[:, 4], states.means[:, 5])
-    forward, spread = transition(durations_s, speeds_m_s, noise)
+    forward, spread = transition(durations_s, speeds_m_s, noise, scales)
     means = (forward @ states.means[:, :, None])[:, :, 0]
     covariances = forward @ states.covariances @ forward.swapaxes(1, 2) + spread
     cross = forward @ states.cross
     if states.fade_m is not None:
         cross *= np.exp(-(speeds_m_s * durations_s)[:, None, None] / states.fade_m)
     return States(means, covariances, cross, states.fade_m)
+
+
+def _scale_moving(states: States, scales: Array) -> States:
+    roots = np.ones(states.means.shape)
+    roots[:, _MOVING] = np.sqrt(scales)[:, None]
+    covariances = roots[:, :, None] * states.covariances * roots[:, None]
+    return States(states.means, covariances, roots[:, :, None] * states.cross, states.fade_m)
 
 
 def compare(states: States, sightings: Sightings) -> Innovations:

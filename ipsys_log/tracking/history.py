@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 from ipsys_log.tracking.filter import Sightings, States
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["HISTORY_NS", "History", "Record", "Sighted"]
+__all__ = ["HISTORY_NS", "History", "Record", "Sighted", "combine_seen"]
 
 # A sighting that is older than the newest one by more than this is left out.
 HISTORY_NS = NS_PER_S // 2
 # More instants than this are checked for those that no late sighting can reach.
 _MOST_ROWS = 256
+# A camera, and whether the position is inside the calibrated volume.
+Seen = tuple[str, bool | None]
 
 
 class Sighted(NamedTuple):
@@ -55,8 +58,9 @@ class History:
     """The records of one robot, for as long as a late sighting can change them.
 
     ``times_ns`` are the times of the records, ``rows_ns`` the instants of the poses that were given out, and
-    ``began_ns`` is the time of the first record. A ``complete`` history keeps the ``older`` sightings without
-    their states, for processing after the recording.
+    ``began_ns`` is the time of the first record. ``last_ns`` has the time of the last sighting by each camera
+    with each flag. A ``complete`` history keeps the ``older`` sightings without their states, for processing
+    after the recording.
     """
 
     records: list[Record] = field(default_factory=list)
@@ -64,6 +68,7 @@ class History:
     rows_ns: set[int] = field(default_factory=set)
     complete: bool = False
     began_ns: int = 0
+    last_ns: dict[Seen, int] = field(default_factory=dict)
     older: list[Sighted] = field(default_factory=list)
 
     @property
@@ -75,16 +80,26 @@ class History:
         """Return the number of records at or before a time; those of the same time come first."""
         return bisect_right(self.times_ns, time_ns)
 
+    def append(self, record: Record) -> None:
+        """Add a record after the others, and forget those that no late sighting can reach."""
+        if not self.records:
+            self.began_ns = record.time_ns
+        self.records.append(record)
+        self.times_ns.append(record.time_ns)
+        self.last_ns[record.camera, record.inside] = record.time_ns
+        self._forget()
+
     def replace_from(self, place: int, records: list[Record]) -> None:
         """Replace the records from a place on, and forget those that no late sighting can reach."""
-        if not self.records or records[0].time_ns < self.began_ns:
-            self.began_ns = records[0].time_ns
-        if place == len(self.records) and len(records) == 1:  # mostly
-            self.records.append(records[0])
-            self.times_ns.append(records[0].time_ns)
-        else:
-            self.records[place:] = records
-            self.times_ns[place:] = [record.time_ns for record in records]
+        self.began_ns = min(self.began_ns, records[0].time_ns)
+        self.records[place:] = records
+        self.times_ns[place:] = [record.time_ns for record in records]
+        for record in records:
+            seen = record.camera, record.inside
+            self.last_ns[seen] = max(self.last_ns.get(seen, 0), record.time_ns)
+        self._forget()
+
+    def _forget(self) -> None:
         oldest_ns = self.times_ns[-1] - HISTORY_NS
         # The last record before the oldest time stays: a sighting at that time starts from it.
         forgotten = max(bisect_right(self.times_ns, oldest_ns) - 1, 0)
@@ -99,7 +114,24 @@ class History:
         """Return all sightings in order of time; of a ``complete`` history."""
         return [*self.older, *(record.sighted for record in self.records)]
 
-    def recent(self, time_ns: int, window_ns: int) -> list[Record]:
-        """Return the records of a window that ends at a time."""
-        first = bisect_left(self.times_ns, time_ns - window_ns)
-        return self.records[first : self.place_of(time_ns)]
+    def recent(self, time_ns: int, window_ns: int) -> tuple[Record, tuple[str, ...], bool | None]:
+        """Return the last record of a window that ends at a time, and the sightings of the window, combined.
+
+        Parameters
+        ----------
+        time_ns : of a record.
+        window_ns : at most :data:`HISTORY_NS`.
+        """
+        first_ns, newest = time_ns - window_ns, self.records[-1]
+        if newest.time_ns == time_ns:  # mostly
+            seen = tuple([one for one, last_ns in self.last_ns.items() if last_ns >= first_ns])
+            return newest, *combine_seen(seen)
+        records = self.records[bisect_left(self.times_ns, first_ns) : self.place_of(time_ns)]
+        return records[-1], *combine_seen(tuple((one.camera, one.inside) for one in records))
+
+
+@lru_cache(maxsize=1024)  # robots have few combinations of cameras, again and again
+def combine_seen(seen: tuple[Seen, ...]) -> tuple[tuple[str, ...], bool | None]:
+    """Return the cameras of sightings, sorted, and whether one of them is inside; None if no camera tells."""
+    flags = [inside for _, inside in seen if inside is not None]
+    return tuple(sorted({camera for camera, _ in seen})), any(flags) if flags else None

@@ -60,7 +60,8 @@ def read_sightings(
     headings, noise[:, 3, 3] = measured[:, 0], measured[:, 1]
     noise[:, :3, :3], has_covariance = _position_noise(positions, camera in modes.tables)
     noise[:, _PLACE, _PLACE] += _LEAST_M**2
-    poses = np.column_stack([[(p.x_m, p.y_m, p.z_m) for p in positions], headings])
+    poses = np.empty((count, 4))
+    poses[:, :3], poses[:, 3] = [(p.x_m, p.y_m, p.z_m) for p in positions], headings
     clock_s = np.broadcast_to(modes.clock_of(camera), (count, modes.count))
     return Sightings(poses, noise, modes.at(camera, poses, headings), clock_s), has_covariance
 
@@ -88,7 +89,7 @@ def _position_noise(positions: Sequence[Position], has_modes: bool) -> tuple[Arr
 def _are_covariances(matrices_m2: Array) -> NDArray[np.bool_]:
     """Return a mask (...) of the positive definite ones of matrices (..., 3, 3), by their minors."""
     rows = matrices_m2.reshape(*matrices_m2.shape[:-2], 9)
-    xx, xy, xz, _, yy, yz, _, _, zz = np.moveaxis(rows, -1, 0)
+    xx, xy, xz, _, yy, yz, _, _, zz = rows.transpose(-1, *range(rows.ndim - 1))  # faster than np.moveaxis
     usable = (np.abs(rows) < _FARTHEST_M).all(axis=-1)
     with np.errstate(over="ignore", invalid="ignore"):
         minor = xx * yy - xy * xy

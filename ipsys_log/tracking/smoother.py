@@ -8,7 +8,7 @@ considers the amplitudes has no optimal smoother, so this one estimates them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ def smooth_track(
     noise: MotionNoise,
     fade_m: Array | None = None,
     block: int = _BLOCK,
+    progress: Callable[[int], None] = lambda sightings: None,
 ) -> Iterator[States]:
     """Yield the motion of one robot by all sightings of its track: block by block, the last one first.
 
@@ -49,6 +50,8 @@ def smooth_track(
     noise : the usual motion.
     fade_m : (m,), of the amplitudes, see :class:`~ipsys_log.tracking.filter.States`.
     block : sightings of a block.
+    progress : called with the number of sightings of each block that is filtered, and of each one that is
+        smoothed: the sum is 2 n.
 
     Yields
     ------
@@ -68,6 +71,8 @@ def smooth_track(
     for first in firsts[:-1]:
         means, covariances = _filter(begins[-1], sightings, first, *steps(first, first + block))
         begins.append((means[-1].copy(), covariances[-1].copy()))
+        progress(block)
+    progress(len(sightings.poses) - firsts[-1])
     later = begins[-1]  # not used: the last block has no step after it
     for first, begin in zip(reversed(firsts), reversed(begins), strict=True):
         forward, spread = steps(first, first + block)
@@ -77,6 +82,7 @@ def smooth_track(
         both = (covariances + covariances.swapaxes(1, 2)) / 2
         # Copies: a view would keep the memory of all amplitudes.
         own_part, cross = both[:, :MOTION, :MOTION].copy(), -both[:, :MOTION, MOTION:]
+        progress(own)
         yield States(means[:, :MOTION].copy(), own_part, cross)
 
 

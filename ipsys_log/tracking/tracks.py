@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
 from ipsys_log.tracking.history import HISTORY_NS, History, Record, Sighted
 from ipsys_log.tracking.motion import MotionNoise
+from ipsys_log.tracking.unseen_growth import UnseenGrowth
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Pose", "Robot", "RobotTracks", "TrackSettings", "gather_sightings"]
@@ -77,11 +78,12 @@ class Pose(NamedTuple):
 class _Track:
     """A track, and the sightings that contradict it: a rival track of the same robot.
 
-    ``sightings`` counts those of the track, ``hits`` the consecutive ones of the rival, and ``late`` those
-    that are too late.
+    ``growth`` is that of its covariance without sightings. ``sightings`` counts those of the track, ``hits``
+    the consecutive ones of the rival, and ``late`` those that are too late.
     """
 
     history: History
+    growth: UnseenGrowth = field(default_factory=UnseenGrowth)
     sightings: int = 0
     has_covariance: bool = True
     rival: History | None = None
@@ -189,7 +191,8 @@ class RobotTracks:
             return []
         last = _gather([track.history.newest for _, track, _ in coasting])
         ages_s = np.array([age_ns for _, _, age_ns in coasting]) / NS_PER_S
-        states = predict(last, ages_s, settings.motion)
+        scales = np.array([track.growth.scale for _, track, _ in coasting])
+        states = predict(last, ages_s, settings.motion, scales)
         spreads_m2 = states.covariances[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1)
         for _, track, _ in coasting:
             track.history.rows_ns.add(time_ns)
@@ -272,9 +275,13 @@ class RobotTracks:
                 continue
             track.rival, track.hits, track.late = None, 0, 0
             track.sightings += 1
-            later.append((track, place, [record, *track.history.records[place:]]))
-            if place == len(track.history.records):
-                track.has_covariance = batch.has_covariance[row]
+            if place < len(track.history.records):
+                later.append((track, place, [record, *track.history.records[place:]]))
+                continue
+            track.history.append(record)
+            track.has_covariance = batch.has_covariance[row]
+            if record.time_ns >= track.growth.due_ns:
+                track.growth.learn(track.history, self._settings.motion)
         self._filter_again(later)
         return accepted
 
@@ -333,7 +340,7 @@ class RobotTracks:
         own = record._replace(states=states, state=0)
         if hits == 1 or rival is None:
             rival = History(complete=self._complete)
-        rival.replace_from(len(rival.records), [own])
+        rival.append(own)
         track.rival, track.hits = rival, hits
         if hits < min(self._settings.restart, track.sightings):
             return False
@@ -348,15 +355,14 @@ class RobotTracks:
         if time_ns in track.history.rows_ns:
             return None
         track.history.rows_ns.add(time_ns)
-        recent = track.history.recent(time_ns, self._settings.window_ns)
-        flags = [record.inside for record in recent if record.inside is not None]
+        last, cameras, inside = track.history.recent(time_ns, self._settings.window_ns)
         return Pose(
             robot,
             time_ns,
-            recent[-1].states,
-            recent[-1].state,
-            tuple(sorted({record.camera for record in recent})),
-            any(flags) if flags else None,
+            last.states,
+            last.state,
+            cameras,
+            inside,
             batch.has_covariance[row],
             age_ns=time_ns - track.history.began_ns,
         )

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import random
+from functools import partial
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import Position, Rig, RigMarker, Track, Tracks
+from ipsys_log.tracking import smoothed_poses
 from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
+from ipsys_log.tracking.smoother import smooth_track
 from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.units import NS_PER_S
 
@@ -104,3 +108,16 @@ def test_wrong_position_of_one_frame_is_left_out() -> None:
 def test_no_frame_gives_no_pose() -> None:
     assert smooth_positions([], RIG, None) == []
     assert smooth_positions([Frame(1, "red", 2, ())], RIG, None) == []
+
+
+def test_progress_counts_the_filter_and_each_smoothed_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive of an hour has one track: a bar without steps between its beginning and its end would stand."""
+    frames, _ = make_frames(120)
+    monkeypatch.setattr(smoothed_poses, "smooth_track", partial(smooth_track, block=20))
+    shares: list[float] = []
+    smooth_positions(frames, RIG, None, progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
+    # Half of the work is the filter, frame by frame; then six blocks are filtered, and six smoothed.
+    assert shares[:120] == pytest.approx(list(np.arange(1, 121) / 240))
+    assert shares[120:] == pytest.approx(list(0.5 + np.arange(1, 13) / 24))

@@ -1,0 +1,44 @@
+"""The way and the speed of robots that stop and start again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from ipsys_log.simulation.cameras import mount_cameras
+from ipsys_log.simulation.drive import plan_drive
+from ipsys_log.simulation.pace import Stops, draw_pace
+from ipsys_log.simulation.settings import LabSettings
+
+STOPS = Stops(legs_s=2.0, stands_s=1.0, acceleration_m_s2=2.5)
+
+
+def test_way_of_a_pace_is_the_integral_of_its_speed() -> None:
+    pace = draw_pace(STOPS, 0.26, 60.0, np.random.default_rng(1))
+    times_s = np.linspace(0.0, 60.0, 600_001)
+    shares = pace.share_at(times_s)
+    np.testing.assert_allclose(
+        pace.driven_s(times_s), cumulative_trapezoid(shares, times_s, initial=0.0), atol=1e-5
+    )
+    assert shares.min() == 0.0
+    assert shares.max() == 1.0
+    # A third of the time is for the stands, within the chance of some twenty stops.
+    assert 0.5 < shares.mean() < 0.8
+
+
+def test_robot_with_stops_brakes_with_its_acceleration() -> None:
+    lab = LabSettings(drive_s=20.0, drive_speed_m_s=0.26, markers=2)
+    steady = plan_drive(lab, mount_cameras(lab))
+    drive = replace(steady, paces={0: draw_pace(STOPS, 0.26, 20.0, np.random.default_rng(2))})
+    times_s = np.arange(2.0, 20.0, 0.01)
+    velocities_m_s = drive.velocities_over(0, times_s)
+    points_m = drive.poses_over(0, times_s)[:, :2]
+    moved_m = np.diff(points_m, axis=0)
+    np.testing.assert_allclose(moved_m / 0.01, (velocities_m_s[1:] + velocities_m_s[:-1]) / 2, atol=0.02)
+    speeds_m_s = np.linalg.norm(velocities_m_s, axis=1)
+    assert speeds_m_s.min() == 0.0
+    assert 2.2 < np.abs(np.diff(speeds_m_s)).max() / 0.01 < 2.6
+    # The other robot drives on.
+    np.testing.assert_array_equal(drive.poses_over(1, times_s), steady.poses_over(1, times_s))

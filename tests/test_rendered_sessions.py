@@ -1,0 +1,90 @@
+"""Rendered sessions of the benchmark of tracks: their markers, their folder, and their continuation."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ipsys_log.messages import Markers, Message
+from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.settings import LabSettings
+from tests.conftest import ROOT
+
+LAB = LabSettings(
+    seed=7,
+    width=640,
+    height=360,
+    frames_per_station=2,
+    rate_hz=10.0,
+    drive_s=1.0,
+    markers=2,
+    cameras=("red", "white"),
+)
+
+
+@pytest.fixture
+def rendered(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("rendered_sessions")
+
+
+def make_lab() -> GeometricLab:
+    return build_lab(
+        GeometricSettings(
+            lab=LAB, points=2, clock_offset_s=0.02, frame_delays_s=(0.0, 0.011), corner_noise=0.0
+        )
+    )
+
+
+def corners(messages: list[Message]) -> dict[tuple[str, int, int], np.ndarray]:
+    return {
+        (str(message.camera), message.publish_time_ns, marker.id): marker.corners_px
+        for message in messages
+        if isinstance(message.payload, Markers)
+        for marker in message.payload.markers
+    }
+
+
+@pytest.mark.slow
+def test_rendered_markers_are_those_of_the_lab_and_are_kept(
+    rendered: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = make_lab()
+    first = rendered.rendered_session(lab, tmp_path / "labs")
+    exact, seen = corners(list(simulate_session(lab))), corners(first)
+    assert len(seen) >= 0.8 * len(exact) > 10
+    assert set(seen) <= set(exact)
+    # A wrong time by one frame delay (11 ms) moves a robot by more.
+    apart_px = np.array([np.linalg.norm(seen[key] - exact[key], axis=1).max() for key in seen])
+    assert apart_px.max() < 0.4
+    assert [one.topic for one in first] == [one.topic for one in simulate_session(lab)]
+    monkeypatch.setattr(rendered, "render", None)  # nothing is rendered again
+    again = rendered.rendered_session(lab, tmp_path / "labs")
+    assert [one.log_time_ns for one in again] == [one.log_time_ns for one in first]
+    np.testing.assert_array_equal(list(corners(again).values()), list(seen.values()))
+
+
+def test_interrupted_session_leaves_nothing_that_counts_as_rendered(
+    rendered: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rendered, "prepare_view", lambda *_: None)
+    monkeypatch.setattr(rendered, "render", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        rendered.rendered_session(make_lab(), tmp_path)
+    assert list(tmp_path.glob("*.mcap")) == []
+
+
+def test_rendered_session_refuses_an_uneven_floor(rendered: Any, tmp_path: Path) -> None:
+    lab = make_lab()
+    uneven = replace(lab, settings=replace(lab.settings, floor_rms_m=0.001))
+    with pytest.raises(SystemExit, match="flat floor"):
+        rendered.rendered_session(uneven, tmp_path)

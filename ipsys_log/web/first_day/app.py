@@ -139,6 +139,7 @@ class SetupApp:
             "rig": lambda body: session.save_rig(_texts(body, "values")),
             "simulate": lambda _: session.simulate(),
             "cameras": lambda body: session.save_cameras(_texts(body, "names")),
+            "address": lambda body: session.add_camera(_texts(body, "values")),
             "intrinsics": lambda body: session.use_intrinsics(str(body.get("camera", ""))),
             "calibrate": lambda body: session.calibrate(str(body.get("camera", "")), _texts(body, "options")),
             "start": lambda body: session.start(str(body.get("action", ""))),

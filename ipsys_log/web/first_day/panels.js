@@ -1,9 +1,9 @@
 // The content of each step. The server decides what can be done; the page only asks.
-import { change, choice, field, showFaults } from "./fields.js";
+import { change, choice, field, markFault, showFaults } from "./fields.js";
 import { make } from "./make.js";
 import { alignedImage, cameraImage } from "./pictures.js";
 
-const cameraId = (key) => `camera-${key.replace(/[^\w]/g, "_")}`;
+const cameraId = (key) => `camera-${key.replace(/[^a-z0-9]/gi, (sign) => `_${sign.charCodeAt(0)}`)}`;
 
 // The lines of a calibration that has ended.
 function report(state) {
@@ -14,7 +14,7 @@ function report(state) {
 // The part of the state that a panel shows: the panel is drawn again only if it changes.
 export function shownPart(name, state) {
   const parts = {
-    rig: state.rig, cameras: state.cameras, intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
+    rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
     points: state.points, accuracy: state.answer, live: null,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
@@ -60,8 +60,8 @@ function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
 }
 
-function submit(form, state, act, isMain, work) {
-  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: isMain ? "main" : "", textContent: "Save", disabled: !state.may_change })));
+function submit(form, state, act, isMain, work, { id = "save", text = "Save", disabled = false } = {}) {
+  form.append(make("div", { className: "actions" }, make("button", { id, className: isMain ? "main" : "", textContent: text, disabled: disabled || !state.may_change })));
   form.noValidate = true;
   form.addEventListener("submit", (event) => { event.preventDefault(); act(work); });
   return form;
@@ -96,6 +96,22 @@ function rig(state, act, step) {
   ];
 }
 
+// The form of a camera that no list shows. A camera that has been added leaves the fields empty.
+function address(state, act) {
+  const { labels, fault, added } = state.address;
+  const form = make("form", { id: "address-form", className: "grid" });
+  for (const [key, label] of Object.entries(labels)) {
+    const type = key === "password" ? { type: "password", autocomplete: "new-password" } : {};
+    form.append(field(key, label, "", { name: `${key}-${added}`, maxLength: 500, ...type }));
+  }
+  if (fault) markFault(form, fault, (key) => key);
+  const busy = state.job && !state.job.ended;
+  return submit(form, state, act, false, async () => {
+    const values = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
+    showFaults(form, await change("address", { values }), (key) => key);
+  }, { id: "add-camera", text: "Add the camera", disabled: busy });
+}
+
 function cameras(state, act, step) {
   const form = make("form", {});
   const cards = state.cameras.map((one) => make("div", { className: "card" },
@@ -109,9 +125,12 @@ function cameras(state, act, step) {
     showFaults(form, await change("cameras", { names }), cameraId);
   });
   return [
-    make("p", { textContent: "Names have small letters, digits and _. A network camera is written into lab.toml with a text editor: source = \"rtsp://...\"." }),
+    make("p", { textContent: "Names have small letters, digits and _." }),
     make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, false)),
     form,
+    make("h3", { textContent: "Network camera" }),
+    make("p", { textContent: "The address is in the manual of the camera. A camera of another computer with ipsys has the address zenoh:NAME. The password is only written into lab.toml." }),
+    address(state, act),
   ];
 }
 
@@ -133,11 +152,11 @@ function intrinsics(state, act) {
       ...(one.file ? [button(`Use ${one.file}`, () => act(() => change("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_change })] : []),
       button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
         { className: one.known || one.file ? "" : "main", disabled: works || !state.may_change })))));
+  const listed = make("div", { className: "cards" }, ...cards);
   return [
     make("p", { textContent: "Print a chessboard on a flat plate (ipsys markers --board 6x4 -o board.pdf). Move it through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far." }),
-    form,
-    ...(state.board ? [make("div", { id: "board-image" })] : []),
-    make("div", { className: "cards" }, ...cards),
+    // The user who moves a board looks at its image: it is above the options.
+    ...(state.board ? [make("div", { id: "calibration" }, make("div", { id: "board-image" }), listed), form] : [form, listed]),
     ...lines(report(state).map((text) => ["", text])),
   ];
 }

@@ -5,9 +5,9 @@ import { panel, shownPart } from "./panels.js";
 import { boardImage } from "./pictures.js";
 
 const $ = (id) => document.getElementById(id);
-const EVERY_MS = 1000;
+const EVERY_MS = 1000, PATIENCE_MS = 15000;
 const SIGNS = { done: "✓", ready: "", waits: "" }, SAID = { done: "done", ready: "can be done now", waits: "waits" };
-let state = null, shown = "", selected = null, told = "", timer = 0;
+let state = null, shown = "", selected = null, told = "", lastFault = "null", timer = 0, request = null, isLost = false;
 
 function chip(kind, text) {
   if ($("state").textContent === text) return;
@@ -52,17 +52,21 @@ const initial = (one) => one.defaultValue ?? [...one.options].find((option) => o
 
 function drawPanel() {
   const part = shownPart(selected, state);
-  if (part === shown) return;
+  if (part === shown && !isLost) return;
   // Typed texts and the focus survive a change by another device.
   const same = shown.startsWith(`["${selected}"`);
-  const typed = same ? [...$("panel").querySelectorAll("input, select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.value]) : [];
+  const typed = same ? [...$("panel").querySelectorAll("input, select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.name, one.value]) : [];
   const focused = same ? document.activeElement?.id : "", within = same && $("panel").contains(document.activeElement);
   shown = part;
   const unfolded = same && $("panel").querySelector("form details")?.open;
   $("panel").replaceChildren(...panel(selected, state, act));
   if (unfolded) $("panel").querySelector("form details")?.setAttribute("open", "");
-  for (const [id, value] of typed) if ($(id)) $(id).value = value;
+  for (const [id, name, value] of typed) if ($(id)?.name === name) $(id).value = value;
   if (focused && $("panel").contains($(focused))) $(focused).focus();
+  // A fault that a job has found moves the keyboard to its field, as a fault of the typed text does.
+  const { fault } = state.address, faulted = JSON.stringify(fault);
+  if (fault && faulted !== lastFault && within) $(fault.field)?.focus();
+  lastFault = faulted;
   // A button that has vanished leaves the keyboard in the panel.
   if (within && !$("panel").contains(document.activeElement)) $("panel").focus();
   drawSteps();
@@ -96,12 +100,30 @@ function drawOperator() {
   $("take").hidden = !state.may_operate;
 }
 
+// Without an answer in time, the network may have lost the request: another one replaces it.
+async function ask() {
+  request?.abort();
+  const own = request = new AbortController();
+  const patience = setTimeout(() => own.abort(), PATIENCE_MS);
+  try {
+    const answer = await fetch("api/state", { signal: own.signal });
+    if (!answer.ok) throw new Error(await answer.text());
+    return await answer.json();
+  } catch (error) {
+    if (request !== own) return null;
+    throw error instanceof TypeError || error.name === "AbortError" ? new Error("ipsys does not answer") : error;
+  } finally {
+    clearTimeout(patience);
+  }
+}
+
 async function read() {
   clearTimeout(timer);
   try {
-    const answer = await fetch("api/state");
-    if (!answer.ok) throw new Error(await answer.text());
-    state = await answer.json();
+    const present = await ask();
+    if (!present) return;
+    state = present;
+    if (isLost) tell("");
     seat.present = state.operator;
     state.may_change = state.may_operate && (seat.operates || seat.isFree);
     drawOperator();
@@ -112,8 +134,10 @@ async function read() {
     drawPanel();
     if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
     drawJob();
+    isLost = false;
   } catch (error) {
-    chip("bad", error instanceof TypeError ? "ipsys does not answer" : error.message.slice(0, 60));
+    chip("bad", error.message.slice(0, 60));
+    isLost = true;
   }
   clearTimeout(timer);
   timer = setTimeout(read, EVERY_MS);
@@ -126,6 +150,10 @@ addEventListener("hashchange", () => {
   scrollTo(0, 0);
   $("panel").focus();
 });
+// A page that comes back does not wait for the next turn.
+addEventListener("online", read);
+addEventListener("pageshow", (event) => { if (event.persisted) read(); });
+document.addEventListener("visibilitychange", () => { if (!document.hidden) read(); });
 $("take").addEventListener("click", () => act(() => (seat.operates ? seat.release() : seat.take())));
 $("stop").addEventListener("click", () => act(() => change("stop")));
 read();

@@ -88,7 +88,8 @@ class CameraPictures:
             job.say(f"opening {option.key}")
             data, fault = None, ""
             try:
-                data = self._take(rig, option.camera, job)
+                # A camera without a name is named by its source in what it says.
+                data = self._take(rig, replace(option.camera, name=option.name or option.key), job)
             except IpsysError as error:
                 fault = str(error)
             if job.is_stopped():
@@ -123,9 +124,8 @@ class CameraPictures:
         self._fault = None
 
     def _take(self, rig: Rig, camera: RigCamera, job: Job) -> bytes | None:
-        named = replace(camera, name=camera.name or "new")
-        with source_opener(rig, [named], self._rig_file.parent, job.is_stopped) as opener:
-            return take_picture(named, opener, job.say, job.is_stopped)
+        with source_opener(rig, [camera], self._rig_file.parent, job.is_stopped) as opener:
+            return take_picture(camera, opener, job.say, job.is_stopped)
 
     def _keep(self, key: str, data: bytes | None, fault: str) -> None:
         self._number += 1

@@ -36,6 +36,7 @@ class LogFacts:
     points : number of calibration points that are not withdrawn.
     tracked : number of messages with tracks of a live recording.
     aligned_run : the run of camera points in a log of the alignment; None if it has none.
+    seeing : the cameras with camera points in this run.
     fault : the reason if the log cannot be read.
     """
 
@@ -44,6 +45,7 @@ class LogFacts:
     points: int = 0
     tracked: int = 0
     aligned_run: str | None = None
+    seeing: frozenset[str] = frozenset()
     fault: str = ""
 
 
@@ -157,9 +159,16 @@ def _read_facts(path: Path) -> LogFacts:
             run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
             tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
             aligned_run = None if points or tracked else newest_run(session, CAMERA_POINTS)
-            return LogFacts(path, session.start_ns, points, tracked, aligned_run)
+            seeing = frozenset() if aligned_run is None else _seeing(session, aligned_run)
+            return LogFacts(path, session.start_ns, points, tracked, aligned_run, seeing)
     except (IpsysError, OSError) as error:
         return LogFacts(path, fault=str(error))
+
+
+def _seeing(session: Session, run: str) -> frozenset[str]:
+    """Return the cameras that have camera points of a marker."""
+    messages = session.messages(session.topics(CAMERA_POINTS, run))
+    return frozenset(str(one.camera) for one in messages if one.payload.points)
 
 
 def _read_fit(paths: Sequence[Path]) -> FitFacts | None:

@@ -26,13 +26,13 @@ LABELS = {
     "name": "Name of the lab",
     "dictionary": "Dictionary of the printed markers",
     "marker_length_m": "Side of the black square, in m",
-    "robots": "Marker ids of the robots",
-    "width_m": "Width of the floor (x), in m",
-    "depth_m": "Depth of the floor (y), in m",
-    "first_x_m": "First reference point, x in m",
-    "first_y_m": "First reference point, y in m",
-    "second_x_m": "Second reference point, x in m",
-    "second_y_m": "Second reference point, y in m",
+    "robots": "Marker ids of the robots, such as 0, 1, 2",
+    "width_m": "Floor: width (x), in m",
+    "depth_m": "Floor: depth (y), in m",
+    "first_x_m": "Reference point A: x, in m",
+    "first_y_m": "Reference point A: y, in m",
+    "second_x_m": "Reference point B: x, in m",
+    "second_y_m": "Reference point B: y, in m",
 }
 _NUMBERS = [key for key in LABELS if key.endswith("_m")]
 
@@ -136,10 +136,9 @@ def _value(key: str, text: str) -> Any:
         raise IpsysError(f"{key} is empty; type a value")
     if key not in _NUMBERS:
         return text
-    if comma := re.fullmatch(r"(-?\d+),(\d+)", text):
-        raise IpsysError(f"{key} = {text}: write the decimal point as {comma[1]}.{comma[2]}")
     try:
-        return float(text)
+        # A field has one number: a comma is its decimal point, as on the measuring page.
+        return float(re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", text))
     except ValueError as error:
         raise IpsysError(f"{key} = {text} is not a number; write 0.2, for example") from error
 

@@ -18,6 +18,7 @@ from ipsys_log.first_day.camera_choice import save_cameras, set_calibration
 from ipsys_log.first_day.camera_pictures import CameraPictures
 from ipsys_log.first_day.jobs import Job, Jobs
 from ipsys_log.first_day.lab_folder import LabFolder, LogFacts
+from ipsys_log.first_day.prints import print_board, print_markers
 from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
 from ipsys_log.rig.file import load_rig
@@ -83,6 +84,7 @@ class SetupSession:
             "steps": [asdict(step) for step in progress.steps],
             "rig": self._describe_rig(progress),
             "cameras": self._cameras.describe(progress.rig),
+            "attached": len(self._cameras.attached()),
             "address": self._cameras.describe_address(),
             "intrinsics": [asdict(one) for one in progress.intrinsics],
             "board_fields": BOARD_FIELDS,
@@ -92,6 +94,7 @@ class SetupSession:
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
                 "logs": [[log.path.name, log.points] for log in progress.logs if log.points],
             },
+            "tracked": [[log.path.name, log.tracked] for log in progress.logs if log.tracked],
             "answer": list(progress.fit.answer) if progress.fit else [],
             "faults": [log.fault for log in progress.logs if log.fault],
             "job": None if job is None else job.describe(),
@@ -213,6 +216,20 @@ class SetupSession:
         result = None if self._alignment is None else self._alignment[1]
         cameras = result.cameras if isinstance(result, AlignmentResult) else ()
         return next((one.picture for one in cameras if one.camera == name), None)
+
+    def print_pdf(self, name: str, typed: Mapping[str, str]) -> bytes:
+        """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields.
+
+        Raises
+        ------
+        IpsysError
+            There is no such print, or it cannot be drawn.
+        """
+        if name == "markers":
+            return print_markers(self._folder)
+        if name == "board":
+            return print_board(typed)
+        raise IpsysError(f"the print {name!r} is not known; reload this page")
 
     def close(self) -> None:
         """Stop the present job in order."""

@@ -16,7 +16,7 @@ FAULTS = [
     ("name", " ", "name is empty"),
     ("dictionary", "DICT_5", "'DICT_5' of the rig is unknown to OpenCV"),
     ("marker_length_m", "20", "write 0.2 if it is in cm"),
-    ("marker_length_m", "0,2", "write the decimal point as 0.2"),
+    ("marker_length_m", "0,2,1", "is not a number"),
     ("marker_length_m", "-1", "must be above 0"),
     ("width_m", "488", "write 4.88 if it is in cm"),
     ("depth_m", "wide", "is not a number"),
@@ -51,7 +51,7 @@ def test_equal_reference_points_are_a_fault() -> None:
 def test_saved_fields_are_read_again(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     typed = {"name": 'a "hall"', "marker_length_m": "0.15", "robots": "3, 7", "second_x_m": "2.5"}
-    assert save_rig_entry(path, typed) == []
+    assert save_rig_entry(path, {**typed, "second_x_m": "2,5"}) == []
     rig = load_rig(path)
     assert (rig.name, rig.marker_length_m) == ('a "hall"', 0.15)
     assert [(marker.id, marker.robot) for marker in rig.markers] == [(3, "robot_3"), (7, "robot_7")]

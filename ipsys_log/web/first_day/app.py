@@ -13,6 +13,7 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.session import Pages, SetupSession
@@ -74,11 +75,13 @@ class SetupApp:
     def __init__(self, folder: LabFolder) -> None:
         self._measuring, self._dashboard = _Embedded(), _Embedded()
         self._seat = OperatorSeat()
+        self._scene: LiveScene | None = None
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
                 *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
                 Route("/picture/{kind}/{name}", self._picture),
+                Route("/print/{name}.pdf", self._print),
                 Route("/api/state", self._state),
                 Route("/api/operate", self._operate, methods=["POST"]),
                 *self._changes(),
@@ -90,14 +93,25 @@ class SetupApp:
 
     @contextmanager
     def _show_measuring(self, scene: LiveScene) -> Iterator[None]:
-        with self._measuring.show(build_app(scene)):
-            yield
+        self._scene = scene
+        try:
+            with self._measuring.show(build_app(scene)):
+                yield
+        finally:
+            self._scene = None
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
         lab = view.lab
         dashboard = dashboard_of_recording(
-            lab.cameras, lab.settings, lab.monitor.checks, view.log, view.model, view.run, view.streams
+            lab.cameras,
+            lab.settings,
+            lab.monitor.checks,
+            view.log,
+            view.model,
+            view.run,
+            view.streams,
+            self._seat,
         )
         with self._dashboard.show(build_dashboard(dashboard)):
             yield dashboard
@@ -106,8 +120,11 @@ class SetupApp:
         # The logs of the folder may be long: another thread reads them.
         state = await asyncio.to_thread(self.session.describe)
         pages = {"measure": self._measuring.app is not None, "live": self._dashboard.app is not None}
+        scene = self._scene
+        measured = None if scene is None else len(active_measurements(scene.history()))
         may = request.scope.get(MAY_WRITE, True)
-        return JSONResponse({**state, "pages": pages, "may_operate": may, "operator": self._seat.number})
+        shown = {"pages": pages, "measured": measured, "may_operate": may, "operator": self._seat.number}
+        return JSONResponse({**state, **shown})
 
     async def _picture(self, request: Request) -> Response:
         data = self.session.picture(request.path_params["kind"], request.path_params["name"])
@@ -115,6 +132,12 @@ class SetupApp:
             return Response(status_code=404)
         kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
         return Response(data, media_type=kind)
+
+    async def _print(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        data = await asyncio.to_thread(self.session.print_pdf, name, dict(request.query_params))
+        headers = {"Content-Disposition": f'attachment; filename="{name}.pdf"'}
+        return Response(data, media_type="application/pdf", headers=headers)
 
     async def _operate(self, request: Request) -> Response:
         """Claim the setup for a device, or release it."""

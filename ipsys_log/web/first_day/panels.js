@@ -15,7 +15,7 @@ function report(state) {
 export function shownPart(name, state) {
   const parts = {
     rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
-    points: state.points, accuracy: state.answer, live: null,
+    points: [state.points, state.measured], accuracy: state.answer, live: state.tracked,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
   return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
@@ -60,6 +60,21 @@ function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
 }
 
+// A table of logs with a number of each.
+function counts(logs, unit) {
+  const rows = logs.map(([name, count]) => make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${count} ${unit}` })));
+  return rows.length ? [make("table", {}, make("tbody", {}, ...rows))] : [];
+}
+
+// A button that downloads a PDF for a printer; texts: the typed fields.
+function printer(name, text, act, texts = () => ({})) {
+  return button(text, () => act(async () => {
+    const answer = await fetch(`print/${name}.pdf?${new URLSearchParams(texts())}`);
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    make("a", { href: URL.createObjectURL(await answer.blob()), download: `${name}.pdf` }).click();
+  }), `print-${name}`);
+}
+
 function submit(form, state, act, isMain, work, { id = "save", text = "Save", disabled = false } = {}) {
   form.append(make("div", { className: "actions" }, make("button", { id, className: isMain ? "main" : "", textContent: text, disabled: disabled || !state.may_change })));
   form.noValidate = true;
@@ -85,14 +100,20 @@ function rig(state, act, step) {
     const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
     showFaults(form, await change("rig", { values: typed }), (key) => key);
   });
-  if (exists) return [form];
+  const help = [
+    make("p", { textContent: "Measure the side of the black square of a printed marker, without its white margin. With an error of 2 % in it, all heights have an error of 2 %." }),
+    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." }),
+  ];
+  if (exists) return [...help, form, make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
   const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
-    make("p", { textContent: "Measure the black square of a printed marker. If a printer scales it by 2 %, each height has an error of 4 cm." }),
-    form,
     make("h3", { textContent: "Without cameras" }),
     make("p", { textContent: "The simulated lab has three cameras and a sheet of tape measurements. Try all steps with it first." }),
     make("div", { className: "actions" }, simulated),
+    make("h3", { textContent: "With your cameras" }),
+    make("p", { textContent: "The fields have the values of an example: replace them by those of your lab." }),
+    ...help,
+    form,
   ];
 }
 
@@ -120,13 +141,15 @@ function cameras(state, act, step) {
       ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
       field(cameraId(one.key), "Name; empty: not used", one.name, { maxLength: 40 }))));
   form.append(make("div", { className: "cards" }, ...cards));
-  submit(form, state, act, step.status !== "done", async () => {
+  const isSeen = state.cameras.some((one) => one.picture);
+  submit(form, state, act, step.status !== "done" && isSeen, async () => {
     const names = Object.fromEntries(state.cameras.map((one) => [one.key, document.getElementById(cameraId(one.key)).value]));
     showFaults(form, await change("cameras", { names }), cameraId);
   });
   return [
-    make("p", { textContent: "Names have small letters, digits and _." }),
-    make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, false)),
+    make("p", { textContent: "A camera with a name is used. Names have small letters, digits and _." }),
+    ...(state.attached ? [] : [make("p", { className: "text", textContent: "No USB camera is found. Plug one in, and search again." })]),
+    make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, step.status !== "done" && !isSeen)),
     form,
     make("h3", { textContent: "Network camera" }),
     make("p", { textContent: "The address is in the manual of the camera. A camera of another computer with ipsys has the address zenoh:NAME. The password is only written into lab.toml." }),
@@ -141,9 +164,9 @@ function intrinsics(state, act) {
   const form = make("form", {}, make("div", { className: "grid" }, made[0]),
     make("details", {}, make("summary", { textContent: "Square, lens model and ChArUco board" }), make("div", { className: "grid" }, ...made.slice(1))));
   form.addEventListener("submit", (event) => event.preventDefault());
+  const typed = () => Object.fromEntries(state.board_fields.map(([key]) => [key, document.getElementById(key).value]));
   const calibrate = (camera) => act(async () => {
-    const options = Object.fromEntries(state.board_fields.map(([key]) => [key, document.getElementById(key).value]));
-    showFaults(form, await change("calibrate", { camera, options }), (key) => key);
+    showFaults(form, await change("calibrate", { camera, options: typed() }), (key) => key);
   });
   const cards = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
     make("b", { textContent: one.camera }),
@@ -154,46 +177,47 @@ function intrinsics(state, act) {
         { className: one.known || one.file ? "" : "main", disabled: works || !state.may_change })))));
   const listed = make("div", { className: "cards" }, ...cards);
   return [
-    make("p", { textContent: "Print a chessboard on a flat plate (ipsys markers --board 6x4 -o board.pdf). Move it through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far." }),
+    make("p", { textContent: "The intrinsics describe the lens of a camera. Pictures of a chessboard determine them." }),
+    make("p", { textContent: "Print the chessboard, and glue it on a flat plate. Press Calibrate, move the board through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far. A board of 7 x 5 squares has 6x4 inner corners." }),
+    make("div", { className: "actions" }, printer("board", "Board to print (PDF)", act, typed)),
     // The user who moves a board looks at its image: it is above the options.
     ...(state.board ? [make("div", { id: "calibration" }, make("div", { id: "board-image" }), listed), form] : [form, listed]),
-    ...lines(report(state).map((text) => ["", text])),
+    ...lines(report(state).map((text, n) => [n ? "" : "strong", text])),
   ];
 }
 
 function alignment(state, act) {
   const found = state.alignment;
   const parts = [
-    make("p", { textContent: "Put four or more markers on the floor, up to the edges of each image. The arrow shows the direction in which to turn a camera; it is 5 times longer than the turn." }),
+    make("p", { textContent: "Put four or more markers on the floor, up to the edges of each image, and leave them there. An arrow on the image shows where to turn a camera; it is drawn 5 times longer. A camera without an arrow is level." }),
     make("div", { className: "actions" }, starter(found ? "Measure again" : "Measure the alignment", "align", state, act, !found)),
   ];
   if (!found) return parts;
   const cards = found.cameras.map((one) => make("div", { className: "card" }, alignedImage(one),
-    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: sentence(one.advice) }))));
+    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: `To do: ${sentence(one.advice)}` }))));
   return [
-    ...parts, make("div", { className: "cards" }, ...cards), make("h3", { textContent: "Floor" }),
+    ...parts, make("div", { className: "cards" }, ...cards),
+    ...(found.coverage.length ? [make("h3", { textContent: "Floor" })] : []),
     ...lines([...(found.fault ? [["bad", found.fault]] : []), ...found.coverage.map(([text, good]) => [good ? "good" : "warn", text])]),
-    ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Notes: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
+    ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Remarks on markers and floor: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
   ];
 }
 
 function points(state, act) {
   const { sheet, logs } = state.points;
-  const parts = [make("p", { textContent: "Put a marker on the floor, measure the distances from the two reference points with a tape, and enter them on the measuring page. Repeat this over the whole floor, also at other heights." })];
+  const parts = [make("p", { textContent: "Put a marker of a robot on the floor, measure the distances from the two reference points with a tape, and enter them on the measuring page. Repeat this over the whole floor, and with some points on a box: each camera must see 10 points or more, and 40 give a good model." })];
   const actions = make("div", { className: "actions" });
-  if (state.pages.measure) actions.append(make("a", { id: "open-measure", className: "button main", href: "measure/", target: "_blank", textContent: "Open the measuring page" }));
+  if (state.pages.measure) actions.append(make("a", { id: "open-measure", className: "button main", href: "measure/", target: "_blank", textContent: "Open the measuring page" }), button("Finish measuring", () => act(() => change("stop")), "finish", { disabled: !state.may_change }));
   else actions.append(starter("Start measuring", "measure", state, act, !sheet && logs.length === 0));
-  if (sheet) actions.append(starter(`Use the sheet ${sheet}`, "sheet", state, act, logs.length === 0));
+  if (sheet) actions.append(starter(`Use the simulated measurements (${sheet})`, "sheet", state, act, logs.length === 0));
   parts.push(actions);
-  if (logs.length) {
-    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, count]) =>
-      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${count} points` }))))));
-  }
-  return parts;
+  const measured = state.measured === null ? [] : [make("p", { textContent: `The present measuring has ${state.measured} points.` })];
+  return [...parts, ...measured, ...(logs.length > 1 ? [make("p", { textContent: "The fit uses all logs." })] : []), ...counts(logs, "points")];
 }
 
 function accuracy(state, act, step) {
   return [
+    make("p", { textContent: "The fit computes how each camera turns the images of markers into positions. The evaluation measures the error of these positions." }),
     make("div", { className: "actions" }, starter(state.answer.length ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
     ...lines(state.answer.map((text, n) => [n < 2 ? "strong" : "", text])),
   ];
@@ -202,7 +226,9 @@ function accuracy(state, act, step) {
 function live(state, act, step) {
   const open = make("a", { id: "open-live", className: "button main", href: "live/", target: "_blank", textContent: "Open the dashboard" });
   return [
-    make("p", { textContent: "The robots are tracked and recorded until you press Stop. Other devices can open the dashboard, too." }),
+    make("p", { textContent: "The robots are tracked and recorded until you press Stop. The dashboard shows them." }),
     make("div", { className: "actions" }, state.pages.live ? open : starter("Start the live view", "live", state, act, step.status !== "done")),
+    ...counts(state.tracked, "updates of positions"),
+    ...state.tracked.slice(-1).map(([name]) => make("p", {}, "The positions as a table, in a terminal: ", command(`ipsys export ${name} -o tracks.csv`))),
   ];
 }

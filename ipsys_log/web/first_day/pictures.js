@@ -22,7 +22,7 @@ function arrow(one, width, height) {
   const [x, y] = one.centre_px;
   const group = element("g", { class: one.level ? "level" : "tilted" });
   const paths = [`M${x - width / 50} ${y}h${width / 25}M${x} ${y - width / 50}v${width / 25}`];
-  if (one.plumb_px) {
+  if (one.plumb_px && !one.level) {
     const [dx, dy] = [one.plumb_px[0] - x, one.plumb_px[1] - y].map((d) => d * GROWTH);
     const length = Math.hypot(dx, dy), scale = Math.min(1, (height * 0.45) / Math.max(length, 1));
     const [ex, ey] = [x + dx * scale, y + dy * scale];

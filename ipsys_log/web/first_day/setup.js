@@ -93,11 +93,12 @@ function drawJob() {
 // Show who operates. Without an operator, the first device that changes something operates.
 function drawOperator() {
   const { operates, isFree } = seat;
-  $("operate").hidden = state.may_operate && isFree;
-  const text = !state.may_operate ? "This device only views." : operates ? "This device operates." : "Another device operates.";
+  $("operate").hidden = false;
+  const text = !state.may_operate ? "This device only views." : operates ? "This device operates; others only view."
+    : isFree ? "No device operates: the first that changes something does." : "Another device operates; this one only views.";
   if ($("operation").textContent !== text) $("operation").textContent = text;
-  $("take").textContent = operates ? "Stop operating" : "Take over";
-  $("take").hidden = !state.may_operate;
+  $("take").textContent = operates ? "Let others operate" : "Take over";
+  $("take").hidden = !state.may_operate || isFree;
 }
 
 // Without an answer in time, the network may have lost the request: another one replaces it.

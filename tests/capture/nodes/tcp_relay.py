@@ -83,15 +83,23 @@ class Relay:
             for source, target in ((near, far), (far, near)):
                 threading.Thread(target=self._pump, args=(source, target), daemon=True).start()
 
+    def _wait_for_passage(self) -> bool:
+        """Wait until the relay passes blocks; return False at its end."""
+        while not self._passes.wait(_TURN_S):
+            if self._ended.is_set():
+                return False
+        return True
+
     def _pump(self, source: socket.socket, target: socket.socket) -> None:
         with suppress(OSError):
             while block := source.recv(_BLOCK):
                 if self._jitter_s:
                     time.sleep(self._rng.random() * self._jitter_s)
-                while not self._passes.wait(_TURN_S):
-                    if self._ended.is_set():
-                        return
+                if not self._wait_for_passage():
+                    return
                 target.sendall(block)
+        # The end of a connection does not pass either.
+        self._wait_for_passage()
         for side in (source, target):
             with suppress(OSError):
                 side.shutdown(socket.SHUT_RDWR)

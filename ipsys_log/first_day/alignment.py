@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import simplejpeg
@@ -54,7 +53,7 @@ class AlignmentResult:
     notes: tuple[str, ...]
 
 
-def read_result(log: Path, run: str) -> AlignmentResult:
+def read_result(session: Session, run: str) -> AlignmentResult:
     """Read the alignment from a log of ``ipsys align``.
 
     Parameters
@@ -66,15 +65,14 @@ def read_result(log: Path, run: str) -> AlignmentResult:
     IpsysError
         The log cannot be read.
     """
-    with Session([log]) as session:
-        rig = session.payloads(session.topics(RIG))[-1]
-        lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        lab = read_alignment(session, run, rig, lenses)
-        cameras = tuple(
-            _camera(one, lenses[one.camera], _picture(session, one.camera), rig)
-            for one in lab.alignments
-            if one.camera in lenses
-        )
+    rig = session.payloads(session.topics(RIG))[-1]
+    lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+    lab = read_alignment(session, run, rig, lenses)
+    cameras = tuple(
+        _camera(one, lenses[one.camera], _picture(session, one.camera), rig)
+        for one in lab.alignments
+        if one.camera in lenses
+    )
     return AlignmentResult(cameras, tuple(coverage_lines(lab)), lab.notes)
 
 

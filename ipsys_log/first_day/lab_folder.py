@@ -11,6 +11,7 @@ from pathlib import Path
 from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import tape_sheet_path
+from ipsys_log.first_day.alignment import AlignmentResult, read_result
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, TRACKS
@@ -35,8 +36,7 @@ class LogFacts:
     ----------
     points : number of calibration points that are not withdrawn.
     tracked : number of messages with tracks of a live recording.
-    aligned_run : the run of camera points in a log of the alignment; None if it has none.
-    seeing : the cameras with camera points in this run.
+    alignment : the result of an alignment; None for other logs.
     fault : the reason if the log cannot be read.
     """
 
@@ -44,8 +44,7 @@ class LogFacts:
     start_ns: int = 0
     points: int = 0
     tracked: int = 0
-    aligned_run: str | None = None
-    seeing: frozenset[str] = frozenset()
+    alignment: AlignmentResult | None = None
     fault: str = ""
 
 
@@ -159,16 +158,10 @@ def _read_facts(path: Path) -> LogFacts:
             run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
             tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
             aligned_run = None if points or tracked else newest_run(session, CAMERA_POINTS)
-            seeing = frozenset() if aligned_run is None else _seeing(session, aligned_run)
-            return LogFacts(path, session.start_ns, points, tracked, aligned_run, seeing)
+            alignment = None if aligned_run is None else read_result(session, aligned_run)
+            return LogFacts(path, session.start_ns, points, tracked, alignment)
     except (IpsysError, OSError) as error:
         return LogFacts(path, fault=str(error))
-
-
-def _seeing(session: Session, run: str) -> frozenset[str]:
-    """Return the cameras that have camera points of a marker."""
-    messages = session.messages(session.topics(CAMERA_POINTS, run))
-    return frozenset(str(one.camera) for one in messages if one.payload.points)
 
 
 def _read_fit(paths: Sequence[Path]) -> FitFacts | None:

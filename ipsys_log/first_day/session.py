@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.first_day import work
-from ipsys_log.first_day.alignment import AlignmentResult, read_result
+from ipsys_log.first_day.alignment import AlignmentResult
 from ipsys_log.first_day.board_entry import BOARD_FIELDS, parse_board_entry
 from ipsys_log.first_day.board_search import BoardSearch
 from ipsys_log.first_day.camera_address import parse_camera_address
 from ipsys_log.first_day.camera_choice import save_cameras, set_calibration
 from ipsys_log.first_day.camera_pictures import CameraPictures
 from ipsys_log.first_day.jobs import Job, Jobs
-from ipsys_log.first_day.lab_folder import LabFolder, LogFacts
+from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.prints import print_board, print_markers
 from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
@@ -62,7 +62,7 @@ class SetupSession:
         self._folder, self._pages = folder, pages
         self._cameras = CameraPictures(folder.rig_file)
         self._search: BoardSearch | None = None
-        self._alignment: tuple[LogFacts, AlignmentResult | str] | None = None
+        self._alignment: AlignmentResult | None = None
         self._actions: dict[str, tuple[str, str, Callable[[Job], None]]] = {
             "pictures": ("the pictures of the cameras", "cameras", self._cameras.take_all),
             "align": ("the alignment", "alignment", lambda job: work.align(folder, job)),
@@ -213,8 +213,7 @@ class SetupSession:
             return None if self._search is None else self._search.picture()
         if kind == "camera":
             return self._cameras.picture(name)
-        result = None if self._alignment is None else self._alignment[1]
-        cameras = result.cameras if isinstance(result, AlignmentResult) else ()
+        cameras = () if self._alignment is None else self._alignment.cameras
         return next((one.picture for one in cameras if one.camera == name), None)
 
     def print_pdf(self, name: str, typed: Mapping[str, str]) -> bytes:
@@ -258,16 +257,9 @@ class SetupSession:
 
     def _describe_alignment(self, progress: SetupProgress) -> dict[str, Any] | None:
         log = progress.alignment
-        if log is None or log.aligned_run is None:
+        if log is None or log.alignment is None:
             return None
-        if self._alignment is None or self._alignment[0] != log:
-            try:
-                self._alignment = log, read_result(log.path, log.aligned_run)
-            except IpsysError as error:
-                self._alignment = log, str(error)
-        result = self._alignment[1]
-        if isinstance(result, str):
-            return {"fault": result, "cameras": [], "coverage": [], "notes": []}
+        result = self._alignment = log.alignment
         cameras = [
             {
                 "camera": one.camera,
@@ -281,7 +273,7 @@ class SetupSession:
             }
             for one in result.cameras
         ]
-        return {"fault": "", "cameras": cameras, "coverage": result.coverage, "notes": result.notes}
+        return {"cameras": cameras, "coverage": result.coverage, "notes": result.notes}
 
     def _measure_sheet(self, job: Job) -> None:
         sheet = self._folder.sheet

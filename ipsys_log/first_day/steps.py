@@ -91,12 +91,12 @@ def read_progress(folder: LabFolder) -> SetupProgress:
     cameras = tuple(camera for camera in rig.cameras if camera.source) if rig else ()
     intrinsics = tuple(_intrinsics_of(camera, folder.path) for camera in cameras)
     logs = tuple(folder.logs())
-    aligned = [log for log in logs if log.aligned_run and log.path.stem.startswith("alignment")]
+    aligned = [log for log in logs if log.alignment and log.path.stem.startswith("alignment")]
     alignment, fit = aligned[-1] if aligned else None, folder.fit()
     camera_fault = _camera_fault(cameras)
     # Each step needs the cameras, and the steps from the alignment on also need all intrinsics.
     unknown = [one.camera for one in intrinsics if not one.known]
-    missing = "first choose the cameras" if not cameras else camera_fault
+    missing = f"first {'correct' if cameras else 'choose'} the cameras" if camera_fault else ""
     missing = missing or (f"intrinsics are missing for {', '.join(unknown)}" if unknown else "")
     steps = (
         _rig_step(rig, rig_fault),
@@ -175,11 +175,12 @@ def _intrinsics_step(intrinsics: tuple[CameraIntrinsics, ...], camera_fault: str
 
 def _alignment_step(alignment: LogFacts | None, cameras: tuple[RigCamera, ...], missing: str) -> StepState:
     title, command = "Alignment", "ipsys align --rig lab.toml -o alignment.mcap"
-    if alignment is None:
+    if alignment is None or alignment.alignment is None:
         return StepState("alignment", title, command, Status.WAITS if missing else Status.READY, missing)
-    blind = [camera.name for camera in cameras if camera.name not in alignment.seeing]
-    status = Status.READY if blind else Status.DONE
-    text = f"no marker of the lab for {', '.join(blind)}" if blind else "measured"
+    known = {one.camera for one in alignment.alignment.cameras if one.level is not None}
+    unknown = [camera.name for camera in cameras if camera.name not in known]
+    status = Status.READY if unknown else Status.DONE
+    text = f"no result for {', '.join(unknown)}" if unknown else "measured"
     return StepState("alignment", title, command, status, f"{text} in {alignment.path.name}")
 
 

@@ -23,19 +23,26 @@ export function shownPart(name, state) {
 
 export function panel(name, state, act) {
   const step = state.steps.find((one) => one.name === name);
-  const number = state.steps.indexOf(step) + 1;
+  const number = state.steps.indexOf(step) + 1, later = state.steps.slice(number);
   const content = { rig, cameras, intrinsics, alignment, points, accuracy, live }[name](state, act, step);
-  const following = state.steps[number];
+  // Finished steps are skipped: a simulated lab has its cameras and their intrinsics.
+  const following = later.find((one) => one.status === "ready") ?? later[0];
   const onward = step.status === "done" && following
     ? [make("div", { className: "actions" }, button(`Next: ${following.title}`, () => { location.hash = following.name; }, "onward", { className: "main" }))] : [];
   return [
     make("h2", { textContent: `${number}. ${step.title}` }),
     ...(step.text ? [make("p", { className: "text", textContent: sentence(step.text) })] : []),
     ...lines(state.faults.map((fault) => ["bad", fault])),
-    ...(step.status === "waits" ? [] : content),
+    ...(step.status === "waits" ? [forward(state)] : content),
     ...onward,
     make("p", { className: "command" }, "The same in a terminal, in this folder: ", command(step.command)),
   ];
+}
+
+// A step that waits leads to the first step that can be done.
+function forward(state) {
+  const next = state.steps.find((one) => one.name === state.next);
+  return make("div", { className: "actions" }, ...(next ? [button(`Go to: ${next.title}`, () => { location.hash = next.name; }, "forward", { className: "main" })] : []));
 }
 
 // A line ends between two words, never behind a hyphen.
@@ -83,7 +90,8 @@ function submit(form, state, act, isMain, work, { id = "save", text = "Save", di
 }
 
 function rig(state, act, step) {
-  const { values, labels, dictionaries, exists } = state.rig;
+  const { values, labels, dictionaries, exists, name } = state.rig;
+  if (exists && name === null) return lines([["bad", "Correct lab.toml with a text editor; this page sees the new file. Or move it away to begin again."]]);
   const form = make("form", { className: "grid" });
   let pair = form;
   for (const [key, label] of Object.entries(labels)) {
@@ -136,7 +144,7 @@ function address(state, act) {
 function cameras(state, act, step) {
   const form = make("form", {});
   const cards = state.cameras.map((one) => make("div", { className: "card" },
-    cameraImage(one.picture, one.name || one.key),
+    cameraImage(one.picture, one.name || one.key, one.fault ? "no picture" : "no picture yet"),
     make("div", {}, make("b", { textContent: one.key }), make("p", { className: "text", textContent: one.text }),
       ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
       field(cameraId(one.key), "Name; empty: not used", one.name, { maxLength: 40 }))));
@@ -198,7 +206,7 @@ function alignment(state, act) {
   return [
     ...parts, make("div", { className: "cards" }, ...cards),
     ...(found.coverage.length ? [make("h3", { textContent: "Floor" })] : []),
-    ...lines([...(found.fault ? [["bad", found.fault]] : []), ...found.coverage.map(([text, good]) => [good ? "good" : "warn", text])]),
+    ...lines(found.coverage.map(([text, good]) => [good ? "good" : "warn", text])),
     ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Remarks on markers and floor: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
   ];
 }

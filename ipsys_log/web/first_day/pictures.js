@@ -4,8 +4,8 @@ import { element, make } from "./make.js";
 // Small angles are hard to see: the arrow is longer than the distance in the image.
 const GROWTH = 5;
 
-export function cameraImage(address, name) {
-  if (!address) return make("div", { className: "image", textContent: "no picture yet" });
+export function cameraImage(address, name, missing) {
+  if (!address) return make("div", { className: "image", textContent: missing });
   return make("div", { className: "image" }, make("img", { src: address, alt: `Image of ${name}` }));
 }
 

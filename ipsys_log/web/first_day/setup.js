@@ -6,7 +6,7 @@ import { boardImage } from "./pictures.js";
 
 const $ = (id) => document.getElementById(id);
 const EVERY_MS = 1000, PATIENCE_MS = 15000;
-const SIGNS = { done: "✓", ready: "", waits: "" }, SAID = { done: "done", ready: "can be done now", waits: "waits" };
+const SAID = { done: "done", ready: "can be done now", waits: "waits" };
 let state = null, shown = "", selected = null, told = "", lastFault = "null", timer = 0, request = null, isLost = false;
 
 function chip(kind, text) {
@@ -37,7 +37,7 @@ function choose() {
 function drawSteps() {
   const rows = state.steps.map((step, n) => {
     const button = make("button", { type: "button", id: `step-${step.name}`, className: step.status },
-      make("b", { textContent: SIGNS[step.status] || String(n + 1) }),
+      make("b", { textContent: String(n + 1) }),
       make("span", { className: "title", textContent: step.title }), make("small", { textContent: step.text || SAID[step.status] }));
     if (step.name === selected) button.setAttribute("aria-current", "step");
     button.addEventListener("click", () => { location.hash = step.name; });

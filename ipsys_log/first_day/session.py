@@ -94,7 +94,6 @@ class SetupSession:
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
                 "logs": [[log.path.name, log.points] for log in progress.logs if log.points],
             },
-            "tracked": [[log.path.name, log.tracked] for log in progress.logs if log.tracked],
             "answer": list(progress.fit.answer) if progress.fit else [],
             "faults": [log.fault for log in progress.logs if log.fault],
             "job": None if job is None else job.describe(),

@@ -283,8 +283,6 @@ async function watch() {
   setTimeout(watch, POLL_MS);
 }
 
-// Below a path, this is a page of the setup.
-$("back").hidden = location.pathname === "/";
 guarded(async () => {
   ({ history, ...lab } = await ask("scene"));
   $("lab").textContent = lab.model ? `${lab.lab}, model ${lab.model}` : lab.lab;

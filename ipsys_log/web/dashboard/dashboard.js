@@ -7,8 +7,6 @@ import { showTiles } from "./tiles.js";
 const $ = (id) => document.getElementById(id);
 // Without data for this time, the page says so.
 const QUIET_MS = 3000;
-// Below a path, this is a page of the setup.
-$("back").hidden = location.pathname === "/";
 let map, operation, source, heard = 0, end = null, played = null;
 
 function show(kind, text) {

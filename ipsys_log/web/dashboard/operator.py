@@ -31,7 +31,6 @@ class Operator:
     add : writes a payload with a topic to the log, through the queue that gives log times.
     now_ns : the clock of the log times.
     say : shows the text of an event on the terminal.
-    seat : the seat of the operator; None: a new one.
 
     Attributes
     ----------
@@ -40,13 +39,9 @@ class Operator:
     """
 
     def __init__(
-        self,
-        add: Callable[[str, Any], None],
-        now_ns: Callable[[], int],
-        say: Callable[[str], object],
-        seat: OperatorSeat | None = None,
+        self, add: Callable[[str, Any], None], now_ns: Callable[[], int], say: Callable[[str], object]
     ) -> None:
-        self.seat, self._written = OperatorSeat() if seat is None else seat, 0
+        self.seat, self._written = OperatorSeat(), 0
         self.segment: Segment | None = None
         self._add, self._now_ns, self._say = add, now_ns, say
 

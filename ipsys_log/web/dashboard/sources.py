@@ -14,7 +14,6 @@ from ipsys_log.sinks.sink import Sink
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.played_log import PlayedLog
 from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
-from ipsys_log.web.operator_seat import OperatorSeat
 
 __all__ = ["dashboard_of_player", "dashboard_of_recording"]
 
@@ -27,7 +26,6 @@ def dashboard_of_recording(
     model: Model,
     run: str,
     streams: Sequence[Sink],
-    seat: OperatorSeat | None = None,
 ) -> Dashboard:
     """Return the dashboard of a live recording, with an operator.
 
@@ -38,7 +36,6 @@ def dashboard_of_recording(
     checks : last checks of the cameras, by name.
     log, model, run : the log that is written, the fitted model, and the run of its tracks.
     streams : the streams of positions.
-    seat : the seat of the operator, if another page of the server has the same operator.
 
     Raises
     ------
@@ -53,7 +50,7 @@ def dashboard_of_recording(
     }
     now_ns = cameras.clock.now_ns
     setting = DashboardSetting(rig, lenses, model, run, cameras.states, checks, log, now_ns, streams)
-    return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say, seat))
+    return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say))
 
 
 def dashboard_of_player(player: Player, scene: PlayedScene) -> Dashboard:

@@ -13,7 +13,6 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.session import Pages, SetupSession
@@ -75,7 +74,6 @@ class SetupApp:
     def __init__(self, folder: LabFolder) -> None:
         self._measuring, self._dashboard = _Embedded(), _Embedded()
         self._seat = OperatorSeat()
-        self._scene: LiveScene | None = None
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
@@ -93,25 +91,14 @@ class SetupApp:
 
     @contextmanager
     def _show_measuring(self, scene: LiveScene) -> Iterator[None]:
-        self._scene = scene
-        try:
-            with self._measuring.show(build_app(scene)):
-                yield
-        finally:
-            self._scene = None
+        with self._measuring.show(build_app(scene)):
+            yield
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
         lab = view.lab
         dashboard = dashboard_of_recording(
-            lab.cameras,
-            lab.settings,
-            lab.monitor.checks,
-            view.log,
-            view.model,
-            view.run,
-            view.streams,
-            self._seat,
+            lab.cameras, lab.settings, lab.monitor.checks, view.log, view.model, view.run, view.streams
         )
         with self._dashboard.show(build_dashboard(dashboard)):
             yield dashboard
@@ -120,11 +107,8 @@ class SetupApp:
         # The logs of the folder may be long: another thread reads them.
         state = await asyncio.to_thread(self.session.describe)
         pages = {"measure": self._measuring.app is not None, "live": self._dashboard.app is not None}
-        scene = self._scene
-        measured = None if scene is None else len(active_measurements(scene.history()))
         may = request.scope.get(MAY_WRITE, True)
-        shown = {"pages": pages, "measured": measured, "may_operate": may, "operator": self._seat.number}
-        return JSONResponse({**state, **shown})
+        return JSONResponse({**state, "pages": pages, "may_operate": may, "operator": self._seat.number})
 
     async def _picture(self, request: Request) -> Response:
         data = self.session.picture(request.path_params["kind"], request.path_params["name"])

@@ -3,7 +3,7 @@ import { make } from "./make.js";
 import { Seat, post } from "./operator.js";
 
 // The seat of this device; a request names its number.
-export const seat = new Seat("ipsys-operator");
+export const seat = new Seat("ipsys-setup");
 
 // Ask for a change, as the operator; return the faults of the fields.
 export async function change(path, body = {}) {

@@ -15,7 +15,7 @@ function report(state) {
 export function shownPart(name, state) {
   const parts = {
     rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
-    points: [state.points, state.measured], accuracy: state.answer, live: state.tracked,
+    points: state.points, accuracy: state.answer, live: null,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
   return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
@@ -65,12 +65,6 @@ function starter(text, action, state, act, isMain = true) {
 
 function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
-}
-
-// A table of logs with a number of each.
-function counts(logs, unit) {
-  const rows = logs.map(([name, count]) => make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${count} ${unit}` })));
-  return rows.length ? [make("table", {}, make("tbody", {}, ...rows))] : [];
 }
 
 // A button that downloads a PDF for a printer; texts: the typed fields.
@@ -213,19 +207,21 @@ function alignment(state, act) {
 
 function points(state, act) {
   const { sheet, logs } = state.points;
-  const parts = [make("p", { textContent: "Put a marker of a robot on the floor, measure the distances from the two reference points with a tape, and enter them on the measuring page. Repeat this over the whole floor, and with some points on a box: each camera must see 10 points or more, and 40 give a good model." })];
+  const parts = [make("p", { textContent: "Put a marker on the floor, measure the distances from the two reference points with a tape, and enter them on the measuring page. Repeat this over the whole floor, also at other heights." })];
   const actions = make("div", { className: "actions" });
-  if (state.pages.measure) actions.append(make("a", { id: "open-measure", className: "button main", href: "measure/", target: "_blank", textContent: "Open the measuring page" }), button("Finish measuring", () => act(() => change("stop")), "finish", { disabled: !state.may_change }));
+  if (state.pages.measure) actions.append(make("a", { id: "open-measure", className: "button main", href: "measure/", target: "_blank", textContent: "Open the measuring page" }));
   else actions.append(starter("Start measuring", "measure", state, act, !sheet && logs.length === 0));
-  if (sheet) actions.append(starter(`Use the simulated measurements (${sheet})`, "sheet", state, act, logs.length === 0));
+  if (sheet) actions.append(starter(`Use the sheet ${sheet}`, "sheet", state, act, logs.length === 0));
   parts.push(actions);
-  const measured = state.measured === null ? [] : [make("p", { textContent: `The present measuring has ${state.measured} points.` })];
-  return [...parts, ...measured, ...(logs.length > 1 ? [make("p", { textContent: "The fit uses all logs." })] : []), ...counts(logs, "points")];
+  if (logs.length) {
+    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, count]) =>
+      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${count} points` }))))));
+  }
+  return parts;
 }
 
 function accuracy(state, act, step) {
   return [
-    make("p", { textContent: "The fit computes how each camera turns the images of markers into positions. The evaluation measures the error of these positions." }),
     make("div", { className: "actions" }, starter(state.answer.length ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
     ...lines(state.answer.map((text, n) => [n < 2 ? "strong" : "", text])),
   ];
@@ -234,9 +230,7 @@ function accuracy(state, act, step) {
 function live(state, act, step) {
   const open = make("a", { id: "open-live", className: "button main", href: "live/", target: "_blank", textContent: "Open the dashboard" });
   return [
-    make("p", { textContent: "The robots are tracked and recorded until you press Stop. The dashboard shows them." }),
+    make("p", { textContent: "The robots are tracked and recorded until you press Stop. Other devices can open the dashboard, too." }),
     make("div", { className: "actions" }, state.pages.live ? open : starter("Start the live view", "live", state, act, step.status !== "done")),
-    ...counts(state.tracked, "updates of positions"),
-    ...state.tracked.slice(-1).map(([name]) => make("p", {}, "The positions as a table, in a terminal: ", command(`ipsys export ${name} -o tracks.csv`))),
   ];
 }

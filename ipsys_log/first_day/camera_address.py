@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain
 from urllib.parse import quote, urlsplit
 
 from ipsys_log.capture.devices import check_sources
 from ipsys_log.capture.nodes.centre import is_of_node, node_of
 from ipsys_log.errors import IpsysError
+from ipsys_log.first_day.camera_choice import free_names
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.passwords import hide_password
 from ipsys_log.rig.file import check_name
@@ -122,6 +123,4 @@ def _name(name: str, camera: RigCamera, rig: Rig) -> str:
         return check_name(name, "camera name")
     same = [one.name for one in rig.cameras if one.source and one not in others]
     node = [node_of(camera)] if is_of_node(camera) else []
-    planned = [one.name for one in rig.cameras if not one.source]
-    numbered = (f"camera_{number}" for number in count(1))
-    return next(one for one in chain(same, node, planned, numbered) if one not in taken)
+    return next(one for one in chain(same, node, free_names(rig, taken)) if one not in taken)

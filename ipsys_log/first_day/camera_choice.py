@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,8 +29,10 @@ from ipsys_log.units import NS_PER_S
 __all__ = [
     "CameraOption",
     "add_camera",
+    "free_names",
     "list_attached",
     "list_options",
+    "propose_names",
     "save_cameras",
     "set_calibration",
     "take_picture",
@@ -72,6 +75,27 @@ def list_options(rig: Rig | None, attached: Sequence[UsbCamera]) -> list[CameraO
         for camera in simulated
         if _simulated_number(camera) not in present
     ]
+
+
+def propose_names(options: Sequence[CameraOption], rig: Rig | None) -> list[str]:
+    """Return a name for each option: its own, that of the simulated camera, or the next free one."""
+    taken = {option.name for option in options}
+    free = free_names(rig, taken)
+    names = []
+    for option in options:
+        simulated = option.key.removeprefix("sim:")
+        own = option.name or (simulated if simulated in LIVE_SETTINGS.cameras else "")
+        name = own if own and (option.name or own not in taken) else next(free)
+        taken.add(name)
+        names.append(name)
+    return names
+
+
+def free_names(rig: Rig | None, taken: Container[str]) -> Iterator[str]:
+    """Yield names of cameras that are not taken: those of the rig without a source, then numbered ones."""
+    planned = [camera.name for camera in rig.cameras if not camera.source] if rig else []
+    numbered = (f"camera_{number}" for number in count(1))
+    return (name for name in chain(planned, numbered) if name not in taken)
 
 
 def save_cameras(path: Path, names: Mapping[str, str], attached: Sequence[UsbCamera]) -> list[Fault]:

@@ -12,7 +12,13 @@ from ipsys_log.capture.frames import AccessRefusedError
 from ipsys_log.capture.usb_bus import UsbCamera
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.camera_address import ADDRESS_FIELDS, fault_text
-from ipsys_log.first_day.camera_choice import add_camera, list_attached, list_options, take_picture
+from ipsys_log.first_day.camera_choice import (
+    add_camera,
+    list_attached,
+    list_options,
+    propose_names,
+    take_picture,
+)
 from ipsys_log.first_day.jobs import Job
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.passwords import hide_password
@@ -57,11 +63,13 @@ class CameraPictures:
     def describe(self, rig: Rig | None) -> list[dict[str, Any]]:
         """Return the cameras as plain data, without passwords."""
         rows = []
-        for key, text, camera in list_options(rig, self.attached()):
+        options = list_options(rig, self.attached())
+        for (key, text, camera), proposal in zip(options, propose_names(options, rig), strict=True):
             taken = self._pictures.get(key)
             picture = f"picture/camera/{taken.number}" if taken is not None and taken.data else None
             fault = "" if taken is None else taken.fault
-            rows.append({"key": key, "text": text, "name": camera.name, "picture": picture, "fault": fault})
+            row = {"key": key, "text": text, "name": camera.name, "proposal": proposal}
+            rows.append({**row, "picture": picture, "fault": fault})
         return rows
 
     def describe_address(self) -> Mapping[str, Any]:

@@ -19,7 +19,7 @@ from ipsys_log.first_day.camera_pictures import CameraPictures
 from ipsys_log.first_day.jobs import Job, Jobs
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.prints import print_board, print_markers
-from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
+from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
 from ipsys_log.rig.file import load_rig
 from ipsys_log.sinks.sink import Sink
@@ -250,6 +250,7 @@ class SetupSession:
             "exists": self._folder.rig_file.exists(),
             "name": progress.rig.name if progress.rig else None,
             "values": rig_fields(progress.rig or example_rig()),
+            "warnings": rig_warnings(progress.rig) if progress.rig else [],
             "labels": LABELS,
             "dictionaries": DICTIONARIES,
         }

@@ -1,7 +1,7 @@
 // The content of each step. The server decides what can be done; the page only asks.
 import { change, choice, field, markFault, showFaults } from "./fields.js";
 import { make } from "./make.js";
-import { alignedImage, cameraImage } from "./pictures.js";
+import { alignedImage, cameraImage, floorSketch } from "./pictures.js";
 
 const cameraId = (key) => `camera-${key.replace(/[^a-z0-9]/gi, (sign) => `_${sign.charCodeAt(0)}`)}`;
 
@@ -102,11 +102,17 @@ function rig(state, act, step) {
     const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
     showFaults(form, await change("rig", { values: typed }), (key) => key);
   });
+  const sketch = make("div", { id: "sketch" }), show = () => {
+    const numbers = Object.fromEntries(Object.keys(labels).map((key) => [key, Number((form.querySelector(`#${key}`)?.value ?? "").replace(",", "."))]));
+    sketch.replaceChildren(...floorSketch(numbers));
+  };
+  form.addEventListener("input", show);
+  show();
   const help = [
     make("p", { textContent: "Measure the side of the black square of a printed marker, without its white margin. With an error of 2 % in it, all heights have an error of 2 %." }),
     make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." }),
   ];
-  if (exists) return [...help, form, make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
+  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), sketch, make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
   const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
     make("h3", { textContent: "Without cameras" }),
@@ -116,6 +122,7 @@ function rig(state, act, step) {
     make("p", { textContent: "The fields have the values of an example: replace them by those of your lab." }),
     ...help,
     form,
+    sketch,
   ];
 }
 
@@ -135,13 +142,22 @@ function address(state, act) {
   }, { id: "add-camera", text: "Add the camera", disabled: busy });
 }
 
+// A box that uses a camera, with the proposed name, and the name; without a name, the camera is not used.
+function use(one) {
+  const id = cameraId(one.key), box = make("input", { type: "checkbox", id: `use-${id}`, checked: one.name !== "", defaultChecked: one.name !== "" });
+  const named = field(id, "Name", one.name, { maxLength: 40 }), name = named.querySelector("input");
+  box.addEventListener("change", () => { name.value = box.checked ? one.name || one.proposal : ""; });
+  name.addEventListener("input", () => { box.checked = name.value.trim() !== ""; });
+  return [make("label", { className: "use" }, box, "Use this camera"), named];
+}
+
 function cameras(state, act, step) {
   const form = make("form", {});
   const cards = state.cameras.map((one) => make("div", { className: "card" },
     cameraImage(one.picture, one.name || one.key, one.fault ? "no picture" : "no picture yet"),
     make("div", {}, make("b", { textContent: one.key }), make("p", { className: "text", textContent: one.text }),
       ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
-      field(cameraId(one.key), "Name; empty: not used", one.name, { maxLength: 40 }))));
+      ...use(one))));
   form.append(make("div", { className: "cards" }, ...cards));
   const isSeen = state.cameras.some((one) => one.picture);
   submit(form, state, act, step.status !== "done" && isSeen, async () => {
@@ -149,7 +165,7 @@ function cameras(state, act, step) {
     showFaults(form, await change("cameras", { names }), cameraId);
   });
   return [
-    make("p", { textContent: "A camera with a name is used. Names have small letters, digits and _." }),
+    make("p", { textContent: "Choose the cameras that the lab uses, and save. Names have small letters, digits and _." }),
     ...(state.attached ? [] : [make("p", { className: "text", textContent: "No USB camera is found. Plug one in, and search again." })]),
     make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, step.status !== "done" && !isSeen)),
     form,
@@ -178,12 +194,15 @@ function intrinsics(state, act) {
       button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
         { className: one.known || one.file ? "" : "main", disabled: works || !state.may_change })))));
   const listed = make("div", { className: "cards" }, ...cards);
+  // The user who moves a board looks at its image: it is above all texts.
+  const shown = state.board ? [make("div", { id: "calibration" }, make("div", { id: "board-image" }), listed)] : [];
   return [
+    ...shown,
     make("p", { textContent: "The intrinsics describe the lens of a camera. Pictures of a chessboard determine them." }),
     make("p", { textContent: "Print the chessboard, and glue it on a flat plate. Press Calibrate, move the board through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far. A board of 7 x 5 squares has 6x4 inner corners." }),
     make("div", { className: "actions" }, printer("board", "Board to print (PDF)", act, typed)),
-    // The user who moves a board looks at its image: it is above the options.
-    ...(state.board ? [make("div", { id: "calibration" }, make("div", { id: "board-image" }), listed), form] : [form, listed]),
+    form,
+    ...(state.board ? [] : [listed]),
     ...lines(report(state).map((text, n) => [n ? "" : "strong", text])),
   ];
 }

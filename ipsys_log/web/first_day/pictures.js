@@ -45,3 +45,16 @@ export function boardImage(board) {
   if (board.board_px) svg.append(element("polygon", { class: "present", points: board.board_px.join(" ") }));
   return [make("div", { className: "image" }, svg), make("p", { className: "text", textContent: `${board.count} pictures; ${board.advice.join("; ")}.` })];
 }
+
+// The floor with its two reference points as typed; nothing while a value is missing.
+export function floorSketch(typed) {
+  const { width_m: width, depth_m: depth } = typed;
+  const points = [["A", typed.first_x_m, typed.first_y_m], ["B", typed.second_x_m, typed.second_y_m]];
+  if (!(width > 0 && depth > 0) || points.flat().some((value) => Number.isNaN(value))) return [];
+  const unit = Math.max(width, depth) / 20, edge = 2 * unit;
+  const text = (x, y, content) => element("text", { x, y: depth - y, "font-size": unit }, content);
+  const svg = element("svg", { viewBox: `${-edge} ${-edge} ${width + 2 * edge} ${depth + 2 * edge}`, role: "img", "aria-label": "The floor from above, with the reference points A and B" });
+  svg.append(element("rect", { width, height: depth }), element("path", { d: `M${unit * 4} ${depth}H0V${depth - unit * 4}`, class: "axes" }), text(unit * 4.3, -unit * 0.3, "x"), text(-unit * 0.3, unit * 4.6, "y"));
+  for (const [name, x, y] of points) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 3 }), text(x + unit / 2, y + unit / 2, name));
+  return [svg];
+}

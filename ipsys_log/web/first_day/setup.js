@@ -50,18 +50,23 @@ function drawSteps() {
 
 const initial = (one) => one.defaultValue ?? [...one.options].find((option) => option.defaultSelected)?.value;
 
-function drawPanel() {
+// isBack: images that could not be loaded are loaded again.
+function drawPanel(isBack = false) {
   const part = shownPart(selected, state);
-  if (part === shown && !isLost) return;
+  if (part === shown && !isBack) return;
   // Typed texts and the focus survive a change by another device.
   const same = shown.startsWith(`["${selected}"`);
-  const typed = same ? [...$("panel").querySelectorAll("input, select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.name, one.value]) : [];
+  const typed = same ? [...$("panel").querySelectorAll("input:not([type=checkbox]), select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.name, one.value]) : [];
   const focused = same ? document.activeElement?.id : "", within = same && $("panel").contains(document.activeElement);
   shown = part;
   const unfolded = same && $("panel").querySelector("form details")?.open;
   $("panel").replaceChildren(...panel(selected, state, act));
   if (unfolded) $("panel").querySelector("form details")?.setAttribute("open", "");
-  for (const [id, name, value] of typed) if ($(id)?.name === name) $(id).value = value;
+  for (const [id, name, value] of typed) {
+    if ($(id)?.name !== name) continue;
+    $(id).value = value;
+    $(id).dispatchEvent(new Event("input", { bubbles: true }));
+  }
   if (focused && $("panel").contains($(focused))) $(focused).focus();
   // A fault that a job has found moves the keyboard to its field, as a fault of the typed text does.
   const { fault } = state.address, faulted = JSON.stringify(fault);
@@ -95,7 +100,7 @@ function drawOperator() {
   const { operates, isFree } = seat;
   $("operate").hidden = false;
   const text = !state.may_operate ? "This device only views." : operates ? "This device operates; others only view."
-    : isFree ? "No device operates: the first that changes something does." : "Another device operates; this one only views.";
+    : isFree ? "No device operates yet: the first one that changes something does." : "Another device operates; this one only views.";
   if ($("operation").textContent !== text) $("operation").textContent = text;
   $("take").textContent = operates ? "Let others operate" : "Take over";
   $("take").hidden = !state.may_operate || isFree;
@@ -118,13 +123,24 @@ async function ask() {
   }
 }
 
+// Without the server, the buttons wait.
+function drawLost() {
+  if (!state) return;
+  state.may_change = false;
+  $("operation").textContent = "ipsys does not answer: the buttons wait. If the command has ended, start it again.";
+  $("take").hidden = $("stop").hidden = true;
+  drawPanel();
+}
+
 async function read() {
   clearTimeout(timer);
   try {
     const present = await ask();
     if (!present) return;
     state = present;
-    if (isLost) tell("");
+    const isBack = isLost;
+    isLost = false;
+    if (isBack) tell("");
     seat.present = state.operator;
     state.may_change = state.may_operate && (seat.operates || seat.isFree);
     drawOperator();
@@ -132,13 +148,13 @@ async function read() {
     chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} done`);
     $("folder").textContent = state.rig.name ?? state.folder;
     choose();
-    drawPanel();
+    drawPanel(isBack);
     if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
     drawJob();
-    isLost = false;
   } catch (error) {
     chip("bad", error.message.slice(0, 60));
     isLost = true;
+    drawLost();
   }
   clearTimeout(timer);
   timer = setTimeout(read, EVERY_MS);

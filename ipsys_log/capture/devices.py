@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -175,12 +175,15 @@ OPENERS: dict[str, Open] = {
 
 
 @contextmanager
-def source_opener(rig: Rig, cameras: Sequence[RigCamera], folder: Path) -> Iterator[Open]:
+def source_opener(
+    rig: Rig, cameras: Sequence[RigCamera], folder: Path, is_stopped: Callable[[], bool] = lambda: False
+) -> Iterator[Open]:
     """Yield the function that opens the cameras of a rig; all cameras of nodes share one session.
 
     Parameters
     ----------
     folder : the folder of the rig file, in which the rig names certificates.
+    is_stopped : ends the wait for a node.
 
     Raises
     ------
@@ -192,7 +195,7 @@ def source_opener(rig: Rig, cameras: Sequence[RigCamera], folder: Path) -> Itera
         yield open_source
         return
     check_installed(f"camera {of_nodes[0].name}: the source {of_nodes[0].source} needs", "zenoh")
-    with Centre(of_nodes, read_network(rig.nodes, folder), version("ipsys_log")) as centre:
+    with Centre(of_nodes, read_network(rig.nodes, folder), version("ipsys_log"), is_stopped) as centre:
         yield centre.choose_opener(open_source)
 
 

@@ -12,6 +12,7 @@ from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
 __all__ = [
+    "AccessRefusedError",
     "ActualSettings",
     "Clock",
     "Frame",
@@ -27,6 +28,10 @@ __all__ = [
 
 class SourceError(IpsysError):
     """An error of a camera that cannot be opened, or that is disconnected; the camera may come back."""
+
+
+class AccessRefusedError(SourceError):
+    """An error of a camera that needs a user and a password, or refuses the present ones."""
 
 
 class Frame(NamedTuple):

@@ -15,7 +15,15 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, SourceError, report_refused_settings
+from ipsys_log.capture.frames import (
+    AccessRefusedError,
+    ActualSettings,
+    Clock,
+    Frame,
+    Say,
+    SourceError,
+    report_refused_settings,
+)
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
 from ipsys_log.messages import RigCamera
 from ipsys_log.passwords import hide_password
@@ -199,6 +207,8 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
                     yield Frame(bytes(packet), name, stamps.of(packet))
             # The stream of a connected camera does not end. After an error, the camera is opened again.
             raise SourceError(f"{label}: the stream has ended")
+    except (av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError) as error:
+        raise AccessRefusedError(f"{label}: {_explain(error)}") from error
     except av.error.FFmpegError as error:
         raise SourceError(f"{label}: {_explain(error)}") from error
 
@@ -219,7 +229,8 @@ def _open(address: str, label: str) -> InputContainer:
 
     host = urlsplit(address).hostname
     try:
-        socket.getaddrinfo(host, None)
+        if host is not None:  # udp://:5000 is sent to this machine
+            socket.getaddrinfo(host, None)
     except socket.gaierror as error:
         if error.errno == socket.EAI_NONAME:
             raise SourceError(f"{label}: the host {host!r} does not exist; check the address") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,8 @@ from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_s
 
 __all__ = ["add_commands"]
 
+_PORT = 8000
+
 Folder = Annotated[
     Path,
     typer.Argument(metavar="FOLDER", help="The folder of the lab: it gets lab.toml, intrinsics and logs."),
@@ -25,7 +28,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 @runs_until_stopped
-def setup(folder: Folder, host: Host = None, port: Port = 8000) -> None:
+def setup(folder: Folder, host: Host = None, port: Port = _PORT) -> None:
     """Set a lab up on a page, step by step: rig, cameras, intrinsics, points, fit, and the live view.
 
     Each step does what its command does, and names it. The state comes from the files of FOLDER: you can
@@ -39,8 +42,9 @@ def setup(folder: Folder, host: Host = None, port: Port = 8000) -> None:
     check_folder(folder, "FOLDER")
     from ipsys_log.first_day.lab_folder import LabFolder
     from ipsys_log.web.first_day.app import SetupApp
-    from ipsys_log.web.server import qr_code, serve_app
+    from ipsys_log.web.server import check_port_free, qr_code, serve_app
 
+    check_port_free(host, port)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -54,7 +58,7 @@ def setup(folder: Folder, host: Host = None, port: Port = 8000) -> None:
         console.print(f"open {server.url}", markup=False)
         if server.view_url is not None:
             remarks.print(f"to view only: {server.view_url}", markup=False)
-        remarks.print(f"Ctrl-C ends; to continue: ipsys setup {folder}", markup=False)
+        remarks.print(f"Ctrl-C ends; to continue: {_command(folder, host, port)}", markup=False)
         try:
             server.wait(lambda: bool(signals))
         finally:
@@ -64,3 +68,10 @@ def setup(folder: Folder, host: Host = None, port: Port = 8000) -> None:
                 remarks.print(bug, markup=False, highlight=False)
     if page.session.jobs.bugs:
         raise typer.Exit(1)
+
+
+def _command(folder: Path, host: str | None, port: int) -> str:
+    """Return the command that continues with the same options."""
+    options = [] if host is None else ["--host", host]
+    options += [] if port == _PORT else ["--port", str(port)]
+    return shlex.join(["ipsys", "setup", str(folder), *options])

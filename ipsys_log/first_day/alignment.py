@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import Alignment
 from ipsys_log.geometry.lenses import project
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, CompressedImage
+from ipsys_log.messages import CameraCalibration, CompressedImage, Rig
 from ipsys_log.messages.channels import RIG
 from ipsys_log.report.alignment import read_alignment
 from ipsys_log.report.alignment_text import advise, coverage_lines
+from ipsys_log.stages.detect.stock import detect_markers
 
 __all__ = ["AlignedCamera", "AlignmentResult", "read_result"]
 
@@ -52,7 +53,7 @@ class AlignmentResult:
     notes: tuple[str, ...]
 
 
-def read_result(log: Path, run: str) -> AlignmentResult:
+def read_result(session: Session, run: str) -> AlignmentResult:
     """Read the alignment from a log of ``ipsys align``.
 
     Parameters
@@ -64,25 +65,39 @@ def read_result(log: Path, run: str) -> AlignmentResult:
     IpsysError
         The log cannot be read.
     """
-    with Session([log]) as session:
-        rig = session.payloads(session.topics(RIG))[-1]
-        lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        lab = read_alignment(session, run, rig, lenses)
-        cameras = tuple(
-            _camera(one, lenses[one.camera], _picture(session, one.camera))
-            for one in lab.alignments
-            if one.camera in lenses
-        )
+    rig = session.payloads(session.topics(RIG))[-1]
+    lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+    lab = read_alignment(session, run, rig, lenses)
+    cameras = tuple(
+        _camera(one, lenses[one.camera], _picture(session, one.camera), rig)
+        for one in lab.alignments
+        if one.camera in lenses
+    )
     return AlignmentResult(cameras, tuple(coverage_lines(lab)), lab.notes)
 
 
-def _camera(one: Alignment, lens: CameraCalibration, picture: bytes | None) -> AlignedCamera:
+def _camera(one: Alignment, lens: CameraCalibration, picture: bytes | None, rig: Rig) -> AlignedCamera:
     plumb_px = None if one.down is None else _pixel(one.down, lens)
     markers_px = tuple(_pixel(marker.point_m, lens) for marker in one.floor_markers)
     centre_px = float(lens.K[0, 2]), float(lens.K[1, 2])
     size_px = lens.width, lens.height
-    return AlignedCamera(
-        one.camera, one.level, advise(one), size_px, centre_px, plumb_px, markers_px, picture
+    advice = advise(one)
+    if not one.floor_markers and picture is not None:
+        advice += _unlisted_text(picture, rig)
+    return AlignedCamera(one.camera, one.level, advice, size_px, centre_px, plumb_px, markers_px, picture)
+
+
+def _unlisted_text(picture: bytes, rig: Rig) -> str:
+    """Return a remark on the markers in an image whose ids the rig does not list; "" without such markers."""
+    listed = {marker.id for marker in rig.all_markers}
+    grey = simplejpeg.decode_jpeg(picture, "GRAY")[..., 0]
+    unlisted = sorted({marker.id for marker in detect_markers(grey, rig.dictionary)} - listed)
+    if not listed or not unlisted:
+        return ""
+    ids = ", ".join(map(str, unlisted))
+    return (
+        f"; the image shows markers that lab.toml does not list ({ids}): add their ids in step 1, or leave "
+        "the ids of the robots empty there to use all markers"
     )
 
 

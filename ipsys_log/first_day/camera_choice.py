@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 
-from ipsys_log.capture.devices import check_devices, check_sources, open_source
-from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.devices import check_devices, check_sources
+from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.capture.simulated import parse_source
 from ipsys_log.capture.usb_bus import UsbCamera, find_cameras
 from ipsys_log.errors import FrameError, IpsysError
@@ -24,18 +24,22 @@ from ipsys_log.rig.file import check_name, check_rig, load_rig
 from ipsys_log.simulation.live_lab import LIVE_SETTINGS
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import Fault
+from ipsys_log.units import NS_PER_S
 
 __all__ = [
     "CameraOption",
+    "add_camera",
+    "free_names",
     "list_attached",
     "list_options",
+    "propose_names",
     "save_cameras",
     "set_calibration",
     "take_picture",
 ]
 
-# A source yields a frame, or None at least twice a second: the search for a picture ends after a minute.
-_MOST_WAITS = 120
+# The search for a picture ends after this time.
+_LONGEST_WAIT_NS = 60 * NS_PER_S
 
 
 class CameraOption(NamedTuple):
@@ -73,6 +77,27 @@ def list_options(rig: Rig | None, attached: Sequence[UsbCamera]) -> list[CameraO
     ]
 
 
+def propose_names(options: Sequence[CameraOption], rig: Rig | None) -> list[str]:
+    """Return a name for each option: its own, that of the simulated camera, or the next free one."""
+    taken = {option.name for option in options}
+    free = free_names(rig, taken)
+    names = []
+    for option in options:
+        simulated = option.key.removeprefix("sim:")
+        own = option.name or (simulated if simulated in LIVE_SETTINGS.cameras else "")
+        name = own if own and (option.name or own not in taken) else next(free)
+        taken.add(name)
+        names.append(name)
+    return names
+
+
+def free_names(rig: Rig | None, taken: Container[str]) -> Iterator[str]:
+    """Yield names of cameras that are not taken: those of the rig without a source, then numbered ones."""
+    planned = [camera.name for camera in rig.cameras if not camera.source] if rig else []
+    numbered = (f"camera_{number}" for number in count(1))
+    return (name for name in chain(planned, numbered) if name not in taken)
+
+
 def save_cameras(path: Path, names: Mapping[str, str], attached: Sequence[UsbCamera]) -> list[Fault]:
     """Write the named cameras into the rig file; return the faults of names instead.
 
@@ -107,11 +132,33 @@ def save_cameras(path: Path, names: Mapping[str, str], attached: Sequence[UsbCam
         return faults
     if not chosen:
         raise IpsysError("no camera has a name; type a name for each camera that the lab uses")
-    new = check_rig(replace(rig, cameras=tuple(chosen)), path.name)
+    check_rig(replace(rig, cameras=tuple(chosen)), path.name)
     check_devices(chosen)
     check_sources(chosen)
-    write_rig(path, replace_tables(path.read_text(encoding="utf-8"), "[[cameras]]", chosen), new)
+    _write_cameras(path, rig, chosen)
     return []
+
+
+def add_camera(path: Path, camera: RigCamera) -> None:
+    """Write a camera with a new source into the rig file.
+
+    A camera of the rig with the same source, apart from its password, gets the new source and the new name.
+    The entry of its name without a source gets the source.
+
+    Raises
+    ------
+    IpsysError
+        The rig file has a fault, or cannot be changed.
+    """
+    rig = load_rig(path)
+    key, cameras = hide_password(str(camera.source)), list(rig.cameras)
+    same = [n for n, one in enumerate(cameras) if one.source and hide_password(one.source) == key]
+    planned = [n for n, one in enumerate(cameras) if not one.source and one.name == camera.name]
+    for place in (same or planned)[:1]:
+        camera = cameras[place] = replace(cameras[place], name=camera.name, source=camera.source)
+    if camera not in cameras:
+        cameras.append(camera)
+    _write_cameras(path, rig, [one for one in cameras if one.source or one.name != camera.name])
 
 
 def set_calibration(path: Path, camera: str, file: str) -> None:
@@ -124,11 +171,15 @@ def set_calibration(path: Path, camera: str, file: str) -> None:
     """
     rig = load_rig(path)
     cameras = tuple(replace(one, calibration=file) if one.name == camera else one for one in rig.cameras)
+    _write_cameras(path, rig, cameras)
+
+
+def _write_cameras(path: Path, rig: Rig, cameras: Sequence[RigCamera]) -> None:
     text = replace_tables(path.read_text(encoding="utf-8"), "[[cameras]]", cameras)
-    write_rig(path, text, replace(rig, cameras=cameras))
+    write_rig(path, text, replace(rig, cameras=tuple(cameras)))
 
 
-def take_picture(camera: RigCamera, say: Say, is_stopped: Callable[[], bool]) -> bytes | None:
+def take_picture(camera: RigCamera, opener: Open, say: Say, is_stopped: Callable[[], bool]) -> bytes | None:
     """Open a camera, and return its first image as JPEG or PNG; None if it sends none, or after a stop.
 
     Raises
@@ -136,9 +187,11 @@ def take_picture(camera: RigCamera, say: Say, is_stopped: Callable[[], bool]) ->
     IpsysError
         The camera cannot be opened, or sends a damaged image.
     """
-    with open_source(replace(camera, name=camera.name or "new"), Clock(), say) as frames:
-        for frame in islice(frames, _MOST_WAITS):
-            if is_stopped():
+    clock = Clock()
+    end_ns = clock.now_ns() + _LONGEST_WAIT_NS
+    with opener(camera, clock, say) as frames:
+        for frame in frames:
+            if is_stopped() or clock.now_ns() > end_ns:
                 return None
             if isinstance(frame, Frame) and (picture := _picture(frame)) is not None:
                 return picture
@@ -148,6 +201,8 @@ def take_picture(camera: RigCamera, say: Say, is_stopped: Callable[[], bool]) ->
 def _picture(frame: Frame) -> bytes | None:
     if frame.format in ("jpeg", "png"):
         return frame.data
+    if frame.format == "markers":  # from a node that sends no images
+        return None
     video = CompressedVideo(0, "", frame.data, frame.format)
     if not is_keyframe(video):
         return None

@@ -25,14 +25,15 @@ class Job:
 
     Attributes
     ----------
-    name : name of its action.
+    name : the name of its work, for people.
+    action : the name of its action, for a page.
     ended : the work has returned or failed.
     error : the reason of a failure, in one line; "" otherwise.
     bug : the traceback of an unexpected exception; "" otherwise.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, action: str = "") -> None:
+        self.name, self.action = name, action
         self.ended, self.error, self.bug = False, "", ""
         self._lines: deque[str] = deque(maxlen=_MOST_LINES)
         self._stage, self._done, self._total = "", 0, 0
@@ -79,6 +80,7 @@ class Job:
         """Return the job as plain data."""
         return {
             "name": self.name,
+            "action": self.action,
             "ended": self.ended,
             "stopping": self.is_stopped() and not self.ended,
             "error": self.error,
@@ -109,7 +111,7 @@ class Jobs:
         present = [self.present.bug] if self.present is not None and self.present.bug else []
         return [*self._earlier_bugs, *present]
 
-    def start(self, name: str, work: Callable[[Job], None]) -> None:
+    def start(self, name: str, work: Callable[[Job], None], action: str = "") -> None:
         """Start a job in its own thread.
 
         Raises
@@ -121,7 +123,7 @@ class Jobs:
             if self.present is not None and not self.present.ended:
                 raise IpsysError(f"{self.present.name} is not finished; wait for it, or stop it")
             self._earlier_bugs = self.bugs
-            self.present = Job(name)
+            self.present = Job(name, action)
             self._thread = threading.Thread(target=_run, args=(self.present, work), name=name, daemon=True)
             self._thread.start()
 

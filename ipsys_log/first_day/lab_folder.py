@@ -11,6 +11,7 @@ from pathlib import Path
 from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import tape_sheet_path
+from ipsys_log.first_day.alignment import AlignmentResult, read_result
 from ipsys_log.first_day.outlier_points import OutlierPoint, find_outlier_points
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC
@@ -36,7 +37,7 @@ class LogFacts:
     ----------
     points : number of calibration points that are not withdrawn.
     tracked : number of messages with tracks of a live recording.
-    aligned_run : the run of camera points in a log of the alignment; None if it has none.
+    alignment : the result of an alignment; None for other logs.
     fault : the reason if the log cannot be read.
     """
 
@@ -44,7 +45,7 @@ class LogFacts:
     start_ns: int = 0
     points: int = 0
     tracked: int = 0
-    aligned_run: str | None = None
+    alignment: AlignmentResult | None = None
     fault: str = ""
 
 
@@ -160,7 +161,8 @@ def _read_facts(path: Path) -> LogFacts:
             run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
             tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
             aligned_run = None if points or tracked else newest_run(session, CAMERA_POINTS)
-            return LogFacts(path, session.start_ns, points, tracked, aligned_run)
+            alignment = None if aligned_run is None else read_result(session, aligned_run)
+            return LogFacts(path, session.start_ns, points, tracked, alignment)
     except (IpsysError, OSError) as error:
         return LogFacts(path, fault=str(error))
 

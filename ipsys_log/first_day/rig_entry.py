@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +18,25 @@ from ipsys_log.rig.file import check_rig, example_toml, load_rig
 from ipsys_log.stages.detect import marker_detector
 from ipsys_log.survey.entry import Fault
 
-__all__ = ["LABELS", "check_rig_entry", "example_rig", "rig_fields", "save_rig_entry"]
+__all__ = ["LABELS", "check_rig_entry", "example_rig", "rig_fields", "rig_warnings", "save_rig_entry"]
 
 _FILE = "lab.toml"
 _USUAL = ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 1.0, 0.0)
 _LONGEST_FIELD = 200
+# Larger factors from an error of the tape to an error of the position are worth a warning.
+_MOST_GROWTH = 6.0
 # The fields of the form: key, label.
 LABELS = {
     "name": "Name of the lab",
-    "dictionary": "Dictionary of the printed markers",
+    "dictionary": "Dictionary of the markers",
     "marker_length_m": "Side of the black square, in m",
-    "robots": "Marker ids of the robots",
-    "width_m": "Width of the floor (x), in m",
-    "depth_m": "Depth of the floor (y), in m",
-    "first_x_m": "First reference point, x in m",
-    "first_y_m": "First reference point, y in m",
-    "second_x_m": "Second reference point, x in m",
-    "second_y_m": "Second reference point, y in m",
+    "robots": "Marker ids of robots: 0, 1, 2",
+    "width_m": "Floor width, in m",
+    "depth_m": "Floor depth, in m",
+    "first_x_m": "Point A: x, in m",
+    "first_y_m": "Point A: y, in m",
+    "second_x_m": "Point B: x, in m",
+    "second_y_m": "Point B: y, in m",
 }
 _NUMBERS = [key for key in LABELS if key.endswith("_m")]
 
@@ -76,17 +80,52 @@ def check_rig_entry(typed: Mapping[str, str], rig: Rig) -> tuple[Rig | None, lis
             values[key] = _value(key, text)
             _check_alone(key, values[key], values.get("dictionary", rig.dictionary))
         except IpsysError as error:
-            faults.append(Fault(key, str(error).removeprefix(f"{_FILE}: ")))
-    if faults:
-        return None, faults
-    new = _build(values, rig)
+            faults.append(Fault(key, _without_key(str(error))))
+    # The valid fields are checked together, beside the present values of the others: one answer names all
+    # faults.
+    wrong = {fault.field for fault in faults}
+    present = {key: _value(key, text) for key, text in rig_fields(rig).items() if key in wrong and text}
+    new = None if wrong - set(present) else _build({**values, **present}, rig)
+    if new is not None:
+        faults += [fault for fault in _check_together(new) if fault.field not in wrong]
+    return (None, faults) if faults else (new, [])
+
+
+def _check_together(rig: Rig) -> list[Fault]:
+    """Return the fault of values that contradict each other."""
     try:
-        check_rig(new, _FILE)
-        check_units(new, _FILE)
+        check_rig(rig, _FILE)
+        check_units(rig, _FILE)
     except IpsysError as error:
-        text = str(error).removeprefix(f"{_FILE}: ")
-        return None, [Fault("second_x_m" if "reference points" in text else "robots", text)]
-    return new, []
+        text = _without_key(str(error))
+        return [Fault("second_x_m" if "reference points" in text else "robots", text)]
+    return []
+
+
+def _without_key(text: str) -> str:
+    """Return the text of an error beside its field, which has a label: without the key of the rig file."""
+    return re.sub(r"^(lab\.toml: )?(\[floor\] |reference point A: )?(\w+_m = )?", "", text)
+
+
+def rig_warnings(rig: Rig) -> list[str]:
+    """Return warnings on reference points that are possible, but give poor positions."""
+    points, floor = rig.reference_points, rig.floor
+    if floor is None or len(points) < len(_USUAL):
+        return []
+    warnings = [
+        f"reference point {point.name} is outside the floor"
+        for point in points
+        if not (0 <= point.x_m <= floor.width_m and 0 <= point.y_m <= floor.depth_m)
+    ]
+    apart_m = max(math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) for a, b in combinations(points, 2))
+    # Two circles of radius r around points at a distance b cross at an angle of about b / r.
+    growth = math.hypot(floor.width_m, floor.depth_m) / apart_m
+    if growth > _MOST_GROWTH:
+        warnings.append(
+            f"the reference points are {apart_m:.2f} m apart: far from them, an error of the tape grows by a "
+            f"factor of up to {growth:.0f}; choose them further apart"
+        )
+    return warnings
 
 
 def save_rig_entry(path: Path, typed: Mapping[str, str]) -> list[Fault]:
@@ -133,15 +172,14 @@ def _value(key: str, text: str) -> Any:
     if key == "robots":
         return [_marker_id(part) for part in re.split(r"[,;\s]+", text) if part]
     if not text:
-        raise IpsysError(f"{key} is empty; type a value")
+        raise IpsysError("the field is empty; type a value")
     if key not in _NUMBERS:
         return text
-    if comma := re.fullmatch(r"(-?\d+),(\d+)", text):
-        raise IpsysError(f"{key} = {text}: write the decimal point as {comma[1]}.{comma[2]}")
     try:
-        return float(text)
+        # A field has one number: a comma is its decimal point, as on the measuring page.
+        return float(re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", text))
     except ValueError as error:
-        raise IpsysError(f"{key} = {text} is not a number; write 0.2, for example") from error
+        raise IpsysError(f"{text} is not a number; write 0.2, for example") from error
 
 
 def _marker_id(text: str) -> int:

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.usb_bus import UsbCamera
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.first_day import work
-from ipsys_log.first_day.alignment import AlignmentResult, read_result
+from ipsys_log.first_day.alignment import AlignmentResult
 from ipsys_log.first_day.board_entry import BOARD_FIELDS, parse_board_entry
 from ipsys_log.first_day.board_search import BoardSearch
-from ipsys_log.first_day.camera_choice import (
-    list_attached,
-    list_options,
-    save_cameras,
-    set_calibration,
-    take_picture,
-)
+from ipsys_log.first_day.camera_address import parse_camera_address
+from ipsys_log.first_day.camera_choice import save_cameras, set_calibration
+from ipsys_log.first_day.camera_pictures import CameraPictures
 from ipsys_log.first_day.jobs import Job, Jobs
-from ipsys_log.first_day.lab_folder import FitFacts, LabFolder, LogFacts
+from ipsys_log.first_day.lab_folder import FitFacts, LabFolder
 from ipsys_log.first_day.outlier_points import exclude_outlier
-from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, save_rig_entry
+from ipsys_log.first_day.prints import print_board, print_markers
+from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
 from ipsys_log.rig.file import load_rig
 from ipsys_log.sinks.sink import Sink
@@ -39,22 +35,12 @@ DICTIONARIES = (
     *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
 )
 
-_CALIBRATION = "the calibration"
-
 
 class Pages(NamedTuple):
     """The functions that show a measuring page and a dashboard until the end of their block."""
 
     measuring: Callable[[LiveScene], AbstractContextManager[object]]
     dashboard: Callable[[work.LiveRecording], AbstractContextManager[Sink]]
-
-
-class _Picture(NamedTuple):
-    """The last picture of a camera, or the reason that there is none; ``number`` tells pictures apart."""
-
-    number: int
-    data: bytes | None
-    fault: str
 
 
 class SetupSession:
@@ -75,13 +61,11 @@ class SetupSession:
     def __init__(self, folder: LabFolder, pages: Pages) -> None:
         self.jobs = Jobs()
         self._folder, self._pages = folder, pages
-        self._attached: Sequence[UsbCamera] | None = None
-        self._pictures: dict[str, _Picture] = {}
-        self._number = 0
+        self._cameras = CameraPictures(folder.rig_file)
         self._search: BoardSearch | None = None
-        self._alignment: tuple[LogFacts, AlignmentResult | str] | None = None
+        self._alignment: AlignmentResult | None = None
         self._actions: dict[str, tuple[str, str, Callable[[Job], None]]] = {
-            "pictures": ("the pictures of the cameras", "cameras", self._take_pictures),
+            "pictures": ("the pictures of the cameras", "cameras", self._cameras.take_all),
             "align": ("the alignment", "alignment", lambda job: work.align(folder, job)),
             "sheet": ("the measuring by the sheet", "points", self._measure_sheet),
             "measure": (
@@ -100,7 +84,9 @@ class SetupSession:
             "next": progress.next,
             "steps": [asdict(step) for step in progress.steps],
             "rig": self._describe_rig(progress),
-            "cameras": self._describe_cameras(progress),
+            "cameras": self._cameras.describe(progress.rig),
+            "attached": len(self._cameras.attached()),
+            "address": self._cameras.describe_address(),
             "intrinsics": [asdict(one) for one in progress.intrinsics],
             "board_fields": BOARD_FIELDS,
             "board": self._describe_board(),
@@ -112,7 +98,7 @@ class SetupSession:
             "fit": None if progress.fit is None else _describe_fit(progress.fit),
             "tracked": [log.path.name for log in progress.logs if log.tracked],
             "faults": [log.fault for log in progress.logs if log.fault],
-            "job": None if job is None else {**job.describe(), "action": self._action_of(job)},
+            "job": None if job is None else job.describe(),
         }
 
     def save_rig(self, typed: Mapping[str, str]) -> list[Fault]:
@@ -145,7 +131,27 @@ class SetupSession:
             The rig file has a fault, or a job works.
         """
         self._check_idle()
-        return save_cameras(self._folder.rig_file, names, self._found())
+        return save_cameras(self._folder.rig_file, names, self._cameras.attached())
+
+    def add_camera(self, typed: Mapping[str, str]) -> list[Fault]:
+        """Start to open the camera of a typed address; return the fault of a field instead.
+
+        With a picture, the camera is written into the rig file. Without one, the state has the fault.
+
+        Raises
+        ------
+        IpsysError
+            The rig file has a fault, or a job works.
+        """
+        self._check_idle()
+        self._cameras.forget_fault()
+        camera = parse_camera_address(typed, load_rig(self._folder.rig_file))
+        if isinstance(camera, Fault):
+            return [camera]
+        self.jobs.start(
+            f"the picture of camera {camera.name}", lambda job: self._cameras.add(camera, job), "address"
+        )
+        return []
 
     def use_intrinsics(self, camera: str) -> None:
         """Write the file of intrinsics of a camera into the rig file.
@@ -180,8 +186,9 @@ class SetupSession:
         pictures = self._folder.new_board_folder(camera)
         search = self._search = BoardSearch(camera, entry.parse(), pictures)
         self.jobs.start(
-            f"{_CALIBRATION} of {camera}",
+            f"the calibration of {camera}",
             lambda job: work.calibrate(self._folder, search, pictures, entry, job),
+            "calibrate",
         )
         return []
 
@@ -210,18 +217,30 @@ class SetupSession:
         step = read_progress(self._folder).step(name)
         if step.status is Status.WAITS:
             raise IpsysError(f"{step.title}: {step.text}")
-        self.jobs.start(title, job)
+        self.jobs.start(title, job, action)
 
     def picture(self, kind: str, name: str) -> bytes | None:
         """Return a picture: ``board`` of the calibration, ``camera`` by number, ``alignment`` by camera."""
         if kind == "board":
             return None if self._search is None else self._search.picture()
         if kind == "camera":
-            found = (one.data for one in self._pictures.values() if str(one.number) == name)
-            return next(found, None)
-        result = None if self._alignment is None else self._alignment[1]
-        cameras = result.cameras if isinstance(result, AlignmentResult) else ()
+            return self._cameras.picture(name)
+        cameras = () if self._alignment is None else self._alignment.cameras
         return next((one.picture for one in cameras if one.camera == name), None)
+
+    def print_pdf(self, name: str, typed: Mapping[str, str]) -> bytes:
+        """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields.
+
+        Raises
+        ------
+        IpsysError
+            There is no such print, or it cannot be drawn.
+        """
+        if name == "markers":
+            return print_markers(self._folder)
+        if name == "board":
+            return print_board(typed)
+        raise IpsysError(f"the print {name!r} is not known; reload this page")
 
     def close(self) -> None:
         """Stop the present job in order."""
@@ -232,18 +251,10 @@ class SetupSession:
         if job is not None and not job.ended:
             raise IpsysError(f"{job.name} is not finished; wait for it, or stop it")
 
-    def _found(self) -> Sequence[UsbCamera]:
-        if self._attached is None:
-            self._attached = list_attached()
-        return self._attached
-
-    def _action_of(self, job: Job) -> str:
-        return next((key for key, (title, *_) in self._actions.items() if title == job.name), "calibrate")
-
     def _describe_board(self) -> dict[str, Any] | None:
         """Return the pictures of a board that a camera takes now; None without a calibration."""
         job = self.jobs.present
-        if self._search is None or job is None or job.ended or self._action_of(job) != "calibrate":
+        if self._search is None or job is None or job.ended or job.action != "calibrate":
             return None
         return self._search.describe() or None
 
@@ -252,31 +263,16 @@ class SetupSession:
             "exists": self._folder.rig_file.exists(),
             "name": progress.rig.name if progress.rig else None,
             "values": rig_fields(progress.rig or example_rig()),
+            "warnings": rig_warnings(progress.rig) if progress.rig else [],
             "labels": LABELS,
             "dictionaries": DICTIONARIES,
         }
 
-    def _describe_cameras(self, progress: SetupProgress) -> list[dict[str, Any]]:
-        rows = []
-        for key, text, camera in list_options(progress.rig, self._found()):
-            taken = self._pictures.get(key)
-            picture = f"picture/camera/{taken.number}" if taken is not None and taken.data else None
-            fault = "" if taken is None else taken.fault
-            rows.append({"key": key, "text": text, "name": camera.name, "picture": picture, "fault": fault})
-        return rows
-
     def _describe_alignment(self, progress: SetupProgress) -> dict[str, Any] | None:
         log = progress.alignment
-        if log is None or log.aligned_run is None:
+        if log is None or log.alignment is None:
             return None
-        if self._alignment is None or self._alignment[0] != log:
-            try:
-                self._alignment = log, read_result(log.path, log.aligned_run)
-            except IpsysError as error:
-                self._alignment = log, str(error)
-        result = self._alignment[1]
-        if isinstance(result, str):
-            return {"fault": result, "cameras": [], "coverage": [], "notes": []}
+        result = self._alignment = log.alignment
         cameras = [
             {
                 "camera": one.camera,
@@ -290,24 +286,7 @@ class SetupSession:
             }
             for one in result.cameras
         ]
-        return {"fault": "", "cameras": cameras, "coverage": result.coverage, "notes": result.notes}
-
-    def _take_pictures(self, job: Job) -> None:
-        """Search for cameras, and take a picture of each, one after the other."""
-        self._attached = list_attached()
-        rig = load_rig(self._folder.rig_file)
-        for option in list_options(rig, self._attached):
-            if job.is_stopped():
-                return
-            job.say(f"opening {option.key}")
-            data, fault = None, ""
-            try:
-                data = take_picture(option.camera, job.say, job.is_stopped)
-            except IpsysError as error:
-                fault = str(error)
-            self._number += 1
-            missing = "the camera sends no image; check its cable and its mode"
-            self._pictures[option.key] = _Picture(self._number, data, fault or ("" if data else missing))
+        return {"cameras": cameras, "coverage": result.coverage, "notes": result.notes}
 
     def _measure_sheet(self, job: Job) -> None:
         sheet = self._folder.sheet

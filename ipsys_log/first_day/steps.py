@@ -91,17 +91,18 @@ def read_progress(folder: LabFolder) -> SetupProgress:
     cameras = tuple(camera for camera in rig.cameras if camera.source) if rig else ()
     intrinsics = tuple(_intrinsics_of(camera, folder.path) for camera in cameras)
     logs = tuple(folder.logs())
-    aligned = [log for log in logs if log.aligned_run and log.path.stem.startswith("alignment")]
+    aligned = [log for log in logs if log.alignment and log.path.stem.startswith("alignment")]
     alignment, fit = aligned[-1] if aligned else None, folder.fit()
     camera_fault = _camera_fault(cameras)
     # Each step needs the cameras, and the steps from the alignment on also need all intrinsics.
     unknown = [one.camera for one in intrinsics if not one.known]
-    missing = camera_fault or (f"intrinsics are missing for {', '.join(unknown)}" if unknown else "")
+    missing = f"first {'correct' if cameras else 'choose'} the cameras" if camera_fault else ""
+    missing = missing or (f"intrinsics are missing for {', '.join(unknown)}" if unknown else "")
     steps = (
         _rig_step(rig, rig_fault),
         _cameras_step(rig, cameras, camera_fault),
         _intrinsics_step(intrinsics, camera_fault),
-        _alignment_step(alignment, missing),
+        _alignment_step(alignment, cameras, missing),
         _points_step(rig, logs, missing),
         _accuracy_step(folder.calibration_logs(), logs, fit),
         _live_step(folder.calibration_logs(), logs, fit, missing),
@@ -135,7 +136,7 @@ def _intrinsics_of(camera: RigCamera, folder: Path) -> CameraIntrinsics:
 
 def _camera_fault(cameras: tuple[RigCamera, ...]) -> str:
     if not cameras:
-        return "no camera has a source"
+        return "no camera is chosen yet"
     try:
         check_sources(cameras)
     except IpsysError as error:
@@ -172,10 +173,15 @@ def _intrinsics_step(intrinsics: tuple[CameraIntrinsics, ...], camera_fault: str
     return StepState("intrinsics", "Camera intrinsics", command, status, text)
 
 
-def _alignment_step(alignment: LogFacts | None, missing: str) -> StepState:
-    status = Status.DONE if alignment else Status.WAITS if missing else Status.READY
-    text = f"measured in {alignment.path.name}" if alignment else missing
-    return StepState("alignment", "Alignment", "ipsys align --rig lab.toml -o alignment.mcap", status, text)
+def _alignment_step(alignment: LogFacts | None, cameras: tuple[RigCamera, ...], missing: str) -> StepState:
+    title, command = "Alignment", "ipsys align --rig lab.toml -o alignment.mcap"
+    if alignment is None or alignment.alignment is None:
+        return StepState("alignment", title, command, Status.WAITS if missing else Status.READY, missing)
+    known = {one.camera for one in alignment.alignment.cameras if one.level is not None}
+    unknown = [camera.name for camera in cameras if camera.name not in known]
+    status = Status.READY if unknown else Status.DONE
+    text = f"no result for {', '.join(unknown)}" if unknown else "measured"
+    return StepState("alignment", title, command, status, f"{text} in {alignment.path.name}")
 
 
 def _points_step(rig: Rig | None, logs: tuple[LogFacts, ...], missing: str) -> StepState:

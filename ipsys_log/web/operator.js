@@ -1,9 +1,12 @@
 // Requests that change something, and the device that may send them: one at a time. The server decides.
+const PATIENCE_MS = 20000;
+
 export async function post(path, body = {}) {
   let answer;
   try {
     answer = await fetch(`api/${path}`, {
       method: "POST", headers: { "Content-Type": "application/json", "X-Ipsys": "1" }, body: JSON.stringify(body),
+      signal: AbortSignal.timeout(PATIENCE_MS),
     });
   } catch {
     throw new Error("ipsys does not answer. Does it still run, and is this device in its network?");

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import urllib.request
@@ -33,8 +34,16 @@ def test_command_serves_a_new_folder_and_ends_in_order(tmp_path: Path) -> None:
         _, err = program.communicate(timeout=WAIT_LIMIT_S)
     assert program.returncode == 0, err
     assert "to continue: ipsys setup" in err
+    assert err.splitlines()[0].endswith("--port 0")
     assert "Traceback" not in err
     assert (tmp_path / "lab").is_dir()
+
+
+def test_used_port_leaves_no_folder(ipsys: Ipsys, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        done = ipsys("setup", tmp_path / "lab", "--port", other.getsockname()[1])
+    assert (done.code, "is in use by another program" in done.err) == (1, True)
+    assert not (tmp_path / "lab").exists()
 
 
 def test_file_instead_of_a_folder_is_one_line(ipsys: Ipsys, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ipsys_log.capture.usb_bus import UsbCamera
-from ipsys_log.first_day.camera_choice import list_options
+from ipsys_log.first_day.camera_choice import list_options, propose_names
 from ipsys_log.messages import Rig, RigCamera
 
 
@@ -50,3 +50,17 @@ def test_simulated_camera_in_use_is_not_offered_again() -> None:
     offered = [option.key for option in list_options(rig, [])]
     assert offered.count("sim:red") == 1
     assert "sim:white" in offered
+
+
+def test_each_camera_has_a_proposed_name_of_its_own(tmp_path: Path) -> None:
+    cameras = RigCamera("white", source="sim:black"), RigCamera("door")
+    rig = Rig("lab", "DICT_4X4_100", 0.2, cameras=cameras)
+    devices = [attached(tmp_path / f"video{number}", "Lab Camera") for number in range(2)]
+    options = list_options(rig, devices)
+    assert dict(zip([option.key for option in options], propose_names(options, rig), strict=True)) == {
+        "sim:black": "white",
+        f"usb:{tmp_path / 'video0'}": "door",
+        f"usb:{tmp_path / 'video1'}": "camera_1",
+        "sim:red": "red",
+        "sim:white": "camera_2",
+    }

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.camera_choice import list_options, save_cameras, set_calibration
-from ipsys_log.first_day.rig_entry import check_rig_entry, example_rig, rig_fields, save_rig_entry
+from ipsys_log.first_day.rig_entry import (
+    check_rig_entry,
+    example_rig,
+    rig_fields,
+    rig_warnings,
+    save_rig_entry,
+)
 from ipsys_log.messages import RigCamera
 from ipsys_log.rig.file import load_rig
 
 FAULTS = [
-    ("name", " ", "name is empty"),
+    ("name", " ", "the field is empty"),
     ("dictionary", "DICT_5", "'DICT_5' of the rig is unknown to OpenCV"),
     ("marker_length_m", "20", "write 0.2 if it is in cm"),
-    ("marker_length_m", "0,2", "write the decimal point as 0.2"),
+    ("marker_length_m", "0,2,1", "is not a number"),
     ("marker_length_m", "-1", "must be above 0"),
     ("width_m", "488", "write 4.88 if it is in cm"),
     ("depth_m", "wide", "is not a number"),
@@ -32,7 +39,7 @@ def test_wrong_value_is_a_fault_of_its_field(field: str, text: str, fault: str, 
     (found,) = save_rig_entry(path, {field: text})
     assert found.field == field
     assert fault in found.text
-    assert "lab.toml" not in found.text
+    assert not re.search("lab.toml|_m = ", found.text)  # the field has a label
     assert not path.exists()
 
 
@@ -40,6 +47,10 @@ def test_several_wrong_values_are_faults_of_all_their_fields() -> None:
     rig, faults = check_rig_entry({"name": "", "width_m": "x", "robots": "0"}, example_rig())
     assert rig is None
     assert [fault.field for fault in faults] == ["name", "width_m"]
+    # Faults of values together are named in the same answer.
+    same = {"first_x_m": "1", "first_y_m": "2", "second_x_m": "1", "second_y_m": "2"}
+    _, faults = check_rig_entry({**same, "marker_length_m": "20"}, example_rig())
+    assert [fault.field for fault in faults] == ["marker_length_m", "second_x_m"]
 
 
 def test_equal_reference_points_are_a_fault() -> None:
@@ -48,10 +59,21 @@ def test_equal_reference_points_are_a_fault() -> None:
     assert (fault.field, "two reference points are at" in fault.text) == ("second_x_m", True)
 
 
+def test_reference_points_that_give_poor_positions_are_warned_of() -> None:
+    assert rig_warnings(example_rig()) == []
+    rig, _ = check_rig_entry({"second_x_m": "1.3"}, example_rig())
+    assert rig is not None
+    (warning,) = rig_warnings(rig)
+    assert "0.08 m apart" in warning
+    rig, _ = check_rig_entry({"second_x_m": "9"}, example_rig())
+    assert rig is not None
+    assert rig_warnings(rig) == ["reference point B is outside the floor"]
+
+
 def test_saved_fields_are_read_again(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     typed = {"name": 'a "hall"', "marker_length_m": "0.15", "robots": "3, 7", "second_x_m": "2.5"}
-    assert save_rig_entry(path, typed) == []
+    assert save_rig_entry(path, {**typed, "second_x_m": "2,5"}) == []
     rig = load_rig(path)
     assert (rig.name, rig.marker_length_m) == ('a "hall"', 0.15)
     assert [(marker.id, marker.robot) for marker in rig.markers] == [(3, "robot_3"), (7, "robot_7")]

@@ -22,10 +22,10 @@ _DOUBLE_TAP_S = 0.35
 
 
 class Phone:
-    """One page in one browser; ``console`` has the messages of the browser."""
+    """One page in one browser; ``console`` has the messages of the browser, ``process`` is its process."""
 
-    def __init__(self, read: int, write: int) -> None:
-        self._read, self._write = read, write
+    def __init__(self, read: int, write: int, process: int) -> None:
+        self._read, self._write, self.process = read, write, process
         self._rest = b""
         self._number = 0
         self._session: str | None = None
@@ -177,7 +177,7 @@ def phone(folder: Path) -> Iterator[Phone]:
         for end in ours:
             os.close(end)
         try:
-            yield Phone(read, write)
+            yield Phone(read, write, browser.pid)
         finally:
             browser.kill()
             os.close(read)

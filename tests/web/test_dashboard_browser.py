@@ -145,6 +145,29 @@ def test_operator_needs_only_the_keyboard(browser: Phone, lab: LiveLab) -> None:
         says(browser, "#take", "Take over")
 
 
+def test_two_pages_show_the_same_and_one_operates(browser: Phone, lab: LiveLab, tmp_path: Path) -> None:
+    with (
+        page_of(lab.dashboard) as page,
+        phone(tmp_path / "second") as other,
+        opened(browser, page.url, DESKTOP),
+        opened(other, page.url, PHONE),
+    ):
+        for one in (browser, other):
+            says(one, "#operation", "No device operates")
+        browser.tap("#take")
+        says(browser, "#operation", "This device operates")
+        says(other, "#operation", "Another device operates")
+        assert not other.run("document.querySelector('#mark').checkVisibility()")
+        other.tap("#take")
+        says(other, "#operation", "This device operates")
+        says(browser, "#operation", "Another device operates")
+        assert not browser.run("document.querySelector('#mark').checkVisibility()")
+        other.type("#mark", "robot pushed")
+        press(other, "Enter", "\r")
+        for one in (browser, other):
+            says(one, "#events", "robot pushed")
+
+
 def test_viewer_has_no_buttons(browser: Phone, lab: LiveLab) -> None:
     with page_of(lab.dashboard, "127.0.0.1") as page:
         assert page.view_url is not None

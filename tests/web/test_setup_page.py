@@ -32,6 +32,9 @@ rate_hz = 5
 """
 
 
+FLOOR = {"width_m": "4.88", "depth_m": "4.88"}
+
+
 class Client:
     """A client of the setup page, with any headers."""
 
@@ -181,6 +184,38 @@ def test_impossible_request_is_refused_and_changes_no_file(
     assert [one.name for one in folder.iterdir()] == ["lab.toml"]
     assert (folder / "lab.toml").read_text() == SMALL
     assert page.state()["job"] is None
+
+
+def test_prints_are_pdfs_of_the_markers_and_the_typed_board(page: Client, folder: Path) -> None:
+    (folder / "lab.toml").write_text(SMALL)
+    status, answer = page.ask("/print/markers.pdf")
+    assert (status, "lab.toml lists no markers" in answer["error"]) == (400, True)
+    assert page.ask("/api/rig", {"values": {"robots": "3, 4", **FLOOR}}) == (200, {})
+    for path in ("/print/markers.pdf", "/print/board.pdf?board=charuco:4x5&square=0.02"):
+        status, data = page.ask(path)
+        assert (status, data[:5]) == (200, b"%PDF-")
+    status, answer = page.ask("/print/board.pdf?board=6")
+    assert (status, "--board 6: is not a board" in answer["error"]) == (400, True)
+    assert page.ask("/print/lab.toml.pdf")[0] == 400
+
+
+# A simulated camera records twice.
+@pytest.mark.slow
+def test_alignment_without_known_markers_names_those_in_the_image(page: Client, folder: Path) -> None:
+    """The only marker of the lab moves, so it does not count."""
+    small = SMALL.replace("?stations=0", "").replace("480", "960").replace("270", "540")
+    (folder / "lab.toml").write_text(f'{small}[[markers]]\nid = 0\nrobot = "ada"\n')
+    for is_known in (False, True):
+        assert page.ask("/api/start", {"action": "align"}) == (200, {})
+        assert page.job_ended()["error"] == ""
+        state = page.state()
+        (camera,) = state["alignment"]["cameras"]
+        (step,) = (step for step in state["steps"] if step["name"] == "alignment")
+        assert step["status"] == ("done" if is_known else "ready"), camera
+        assert ("image shows markers that lab.toml does not list" in camera["advice"]) is not is_known
+        assert ("no result for red" in step["text"]) is not is_known
+        # Without ids, all markers of the dictionary count.
+        assert page.ask("/api/rig", {"values": {"robots": "", **FLOOR}}) == (200, {})
 
 
 def test_pictures_have_no_paths(page: Client) -> None:

@@ -80,6 +80,7 @@ class Centre:
     cameras : cameras whose source is a node.
     network : the address and the certificates.
     version : the version of ipsys here; a node with another version is refused.
+    is_stopped : ends the wait for the first answer of a node.
 
     Raises
     ------
@@ -87,9 +88,15 @@ class Centre:
         On entering: the centre cannot listen.
     """
 
-    def __init__(self, cameras: Sequence[RigCamera], network: NodeNetwork, version: str) -> None:
+    def __init__(
+        self,
+        cameras: Sequence[RigCamera],
+        network: NodeNetwork,
+        version: str,
+        is_stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._nodes = {camera.name: node_of(camera) for camera in cameras}
-        self._network, self._version = network, version
+        self._network, self._version, self._is_stopped = network, version, is_stopped
         self._session: zenoh.Session | None = None
         self._links: dict[str, _Link] = {}
 
@@ -118,7 +125,7 @@ class Centre:
         if link is None:
             stream = NodeStream(camera, self._version)
             link = _Link(self._session, camera, self._nodes[camera.name], stream, clock)
-            link.await_node(self._network, say)
+            link.await_node(self._network, say, self._is_stopped)
             self._links[camera.name] = link
             say(f"camera {camera.name}: its node answers; {stream.describe_clock()}")
         link.heard_ns = clock.now_ns()
@@ -150,8 +157,8 @@ class _Link:
         self._asks_frames = False
         self._subscriber = session.declare_subscriber(frames_key(node), self._receive)
 
-    def await_node(self, network: NodeNetwork, say: Say) -> None:
-        """Wait for the first answers of the node; ``say`` reports a longer wait.
+    def await_node(self, network: NodeNetwork, say: Say, is_stopped: Callable[[], bool]) -> None:
+        """Wait for the first answers of the node, or for a stop; ``say`` reports a longer wait.
 
         Raises
         ------
@@ -161,7 +168,7 @@ class _Link:
         start_ns, is_said = self._clock.now_ns(), False
         while not (self._exchanges >= _OPENING_EXCHANGES and self._stream.is_known):
             waited_s = (self._clock.now_ns() - start_ns) / NS_PER_S
-            if waited_s > _FIRST_ANSWER_S:
+            if waited_s > _FIRST_ANSWER_S or is_stopped():
                 break
             if waited_s > _WAIT_UNSAID_S and not is_said and not self._exchanges:
                 is_said = True

@@ -81,6 +81,7 @@ class SetupApp:
             routes=[
                 *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
                 Route("/picture/{kind}/{name}", self._picture),
+                Route("/print/{name}.pdf", self._print),
                 Route("/api/state", self._state),
                 Route("/api/operate", self._operate, methods=["POST"]),
                 *self._changes(),
@@ -139,6 +140,12 @@ class SetupApp:
         kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
         return Response(data, media_type=kind)
 
+    async def _print(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        data = await asyncio.to_thread(self.session.print_pdf, name, dict(request.query_params))
+        headers = {"Content-Disposition": f'attachment; filename="{name}.pdf"'}
+        return Response(data, media_type="application/pdf", headers=headers)
+
     async def _operate(self, request: Request) -> Response:
         """Claim the setup for a device, or release it."""
         return JSONResponse(answer_claim(self._seat, await read_json(request)))
@@ -162,6 +169,7 @@ class SetupApp:
             "rig": lambda body: session.save_rig(_texts(body, "values")),
             "simulate": lambda _: session.simulate(),
             "cameras": lambda body: session.save_cameras(_texts(body, "names")),
+            "address": lambda body: session.add_camera(_texts(body, "values")),
             "intrinsics": lambda body: session.use_intrinsics(str(body.get("camera", ""))),
             "calibrate": lambda body: session.calibrate(str(body.get("camera", "")), _texts(body, "options")),
             "exclude": lambda body: session.exclude(str(body.get("log", "")), str(body.get("point", ""))),

@@ -32,11 +32,14 @@ export function showFaults(form, faults, idOf) {
     input.setAttribute("aria-invalid", "false");
     document.getElementById(`${input.id}-fault`).textContent = "";
   }
-  for (const fault of [...faults].reverse()) {
-    const input = document.getElementById(idOf(fault.field));
-    input.setAttribute("aria-invalid", "true");
-    input.closest("details")?.setAttribute("open", "");
-    document.getElementById(`${input.id}-fault`).textContent = fault.text;
-    input.focus();
-  }
+  for (const fault of [...faults].reverse()) markFault(form, fault, idOf).focus();
+}
+
+// Show a fault at its field of a form; return the field.
+export function markFault(form, fault, idOf) {
+  const input = form.querySelector(`#${idOf(fault.field)}`);
+  input.setAttribute("aria-invalid", "true");
+  input.closest("details")?.setAttribute("open", "");
+  form.querySelector(`#${input.id}-fault`).textContent = fault.text;
+  return input;
 }

@@ -1,9 +1,9 @@
 // The content of each step. The server decides what can be done; the page only asks.
-import { change, choice, field, showFaults } from "./fields.js";
+import { change, choice, field, markFault, showFaults } from "./fields.js";
 import { make } from "./make.js";
-import { alignedImage, cameraImage } from "./pictures.js";
+import { alignedImage, cameraImage, floorSketch } from "./pictures.js";
 
-const cameraId = (key) => `camera-${key.replace(/[^\w]/g, "_")}`;
+const cameraId = (key) => `camera-${key.replace(/[^a-z0-9]/gi, (sign) => `_${sign.charCodeAt(0)}`)}`;
 
 // The lines of a calibration that has ended.
 function report(state) {
@@ -14,7 +14,7 @@ function report(state) {
 // The part of the state that a panel shows: the panel is drawn again only if it changes.
 export function shownPart(name, state) {
   const parts = {
-    rig: state.rig, cameras: state.cameras, intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
+    rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
     points: [state.points, state.measured_now], accuracy: [state.fit, state.points], live: state.tracked,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
@@ -23,19 +23,26 @@ export function shownPart(name, state) {
 
 export function panel(name, state, act) {
   const step = state.steps.find((one) => one.name === name);
-  const number = state.steps.indexOf(step) + 1;
+  const number = state.steps.indexOf(step) + 1, later = state.steps.slice(number);
   const content = { rig, cameras, intrinsics, alignment, points, accuracy, live }[name](state, act, step);
-  const following = state.steps[number];
+  // Finished steps are skipped: a simulated lab has its cameras and their intrinsics.
+  const following = later.find((one) => one.status === "ready") ?? later[0];
   const onward = step.status === "done" && following
     ? [make("div", { className: "actions" }, button(`Next: ${following.title}`, () => { location.hash = following.name; }, "onward", { className: "main" }))] : [];
   return [
     make("h2", { textContent: `${number}. ${step.title}` }),
     ...(step.text ? [make("p", { className: "text", textContent: sentence(step.text) })] : []),
     ...lines(state.faults.map((fault) => ["bad", fault])),
-    ...(step.status === "waits" ? [] : content),
+    ...(step.status === "waits" ? [forward(state)] : content),
     ...onward,
     make("p", { className: "command" }, "The same in a terminal, in this folder: ", command(step.command)),
   ];
+}
+
+// A step that waits leads to the first step that can be done.
+function forward(state) {
+  const next = state.steps.find((one) => one.name === state.next);
+  return make("div", { className: "actions" }, ...(next ? [button(`Go to: ${next.title}`, () => { location.hash = next.name; }, "forward", { className: "main" })] : []));
 }
 
 // A line ends between two words, never behind a hyphen.
@@ -60,15 +67,25 @@ function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
 }
 
-function submit(form, state, act, isMain, work) {
-  form.append(make("div", { className: "actions" }, make("button", { id: "save", className: isMain ? "main" : "", textContent: "Save", disabled: !state.may_change })));
+// A button that downloads a PDF for a printer; texts: the typed fields.
+function printer(name, text, act, texts = () => ({})) {
+  return button(text, () => act(async () => {
+    const answer = await fetch(`print/${name}.pdf?${new URLSearchParams(texts())}`);
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    make("a", { href: URL.createObjectURL(await answer.blob()), download: `${name}.pdf` }).click();
+  }), `print-${name}`);
+}
+
+function submit(form, state, act, isMain, work, { id = "save", text = "Save", disabled = false } = {}) {
+  form.append(make("div", { className: "actions" }, make("button", { id, className: isMain ? "main" : "", textContent: text, disabled: disabled || !state.may_change })));
   form.noValidate = true;
   form.addEventListener("submit", (event) => { event.preventDefault(); act(work); });
   return form;
 }
 
 function rig(state, act, step) {
-  const { values, labels, dictionaries, exists } = state.rig;
+  const { values, labels, dictionaries, exists, name } = state.rig;
+  if (exists && name === null) return lines([["bad", "Correct lab.toml with a text editor; this page sees the new file. Or move it away to begin again."]]);
   const form = make("form", { className: "grid" });
   let pair = form;
   for (const [key, label] of Object.entries(labels)) {
@@ -85,33 +102,76 @@ function rig(state, act, step) {
     const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
     showFaults(form, await change("rig", { values: typed }), (key) => key);
   });
-  if (exists) return [form];
+  const sketch = make("div", { id: "sketch" }), show = () => {
+    const numbers = Object.fromEntries(Object.keys(labels).map((key) => [key, Number((form.querySelector(`#${key}`)?.value ?? "").replace(",", "."))]));
+    sketch.replaceChildren(...floorSketch(numbers));
+  };
+  form.addEventListener("input", show);
+  show();
+  const help = [
+    make("p", { textContent: "Measure the side of the black square of a printed marker, without its white margin. With an error of 2 % in it, all heights have an error of 2 %." }),
+    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." }),
+  ];
+  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), sketch, make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
   const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
-    make("p", { textContent: "Measure the black square of a printed marker. If a printer scales it by 2 %, each height has an error of 4 cm." }),
-    form,
     make("h3", { textContent: "Without cameras" }),
     make("p", { textContent: "The simulated lab has three cameras and a sheet of tape measurements. Try all steps with it first." }),
     make("div", { className: "actions" }, simulated),
+    make("h3", { textContent: "With your cameras" }),
+    make("p", { textContent: "The fields have the values of an example: replace them by those of your lab." }),
+    ...help,
+    form,
+    sketch,
   ];
+}
+
+// The form of a camera that no list shows. A camera that has been added leaves the fields empty.
+function address(state, act) {
+  const { labels, fault, added } = state.address;
+  const form = make("form", { id: "address-form", className: "grid" });
+  for (const [key, label] of Object.entries(labels)) {
+    const type = key === "password" ? { type: "password", autocomplete: "new-password" } : {};
+    form.append(field(key, label, "", { name: `${key}-${added}`, maxLength: 500, ...type }));
+  }
+  if (fault) markFault(form, fault, (key) => key);
+  const busy = state.job && !state.job.ended;
+  return submit(form, state, act, false, async () => {
+    const values = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
+    showFaults(form, await change("address", { values }), (key) => key);
+  }, { id: "add-camera", text: "Add the camera", disabled: busy });
+}
+
+// A box that uses a camera, with the proposed name, and the name; without a name, the camera is not used.
+function use(one) {
+  const id = cameraId(one.key), box = make("input", { type: "checkbox", id: `use-${id}`, checked: one.name !== "", defaultChecked: one.name !== "" });
+  const named = field(id, "Name", one.name, { maxLength: 40 }), name = named.querySelector("input");
+  box.addEventListener("change", () => { name.value = box.checked ? one.name || one.proposal : ""; });
+  name.addEventListener("input", () => { box.checked = name.value.trim() !== ""; });
+  return [make("label", { className: "use" }, box, "Use this camera"), named];
 }
 
 function cameras(state, act, step) {
   const form = make("form", {});
   const cards = state.cameras.map((one) => make("div", { className: "card" },
-    cameraImage(one.picture, one.name || one.key),
+    cameraImage(one.picture, one.name || one.key, one.fault ? "no picture" : "no picture yet"),
     make("div", {}, make("b", { textContent: one.key }), make("p", { className: "text", textContent: one.text }),
       ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
-      field(cameraId(one.key), "Name; empty: not used", one.name, { maxLength: 40 }))));
+      ...use(one))));
   form.append(make("div", { className: "cards" }, ...cards));
-  submit(form, state, act, step.status !== "done", async () => {
+  const isSeen = state.cameras.some((one) => one.picture);
+  submit(form, state, act, step.status !== "done" && isSeen, async () => {
     const names = Object.fromEntries(state.cameras.map((one) => [one.key, document.getElementById(cameraId(one.key)).value]));
     showFaults(form, await change("cameras", { names }), cameraId);
   });
   return [
-    make("p", { textContent: "Names have small letters, digits and _. A network camera is written into lab.toml with a text editor: source = \"rtsp://...\"." }),
-    make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, false)),
+    make("p", { textContent: "Choose the cameras that the lab uses, and save. Names have small letters, digits and _." }),
+    ...(state.attached ? [] : [make("p", { className: "text", textContent: "No USB camera is found. Plug one in, and search again." })]),
+    make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, step.status !== "done" && !isSeen)),
     form,
+    make("h3", { textContent: "Network camera" }),
+    make("p", { textContent: "The address is in the manual of the camera. A camera of another computer with ipsys has the address zenoh:NAME. The password is only written into lab.toml." }),
+    address(state, act),
   ];
 }
 
@@ -122,9 +182,9 @@ function intrinsics(state, act) {
   const form = make("form", {}, make("div", { className: "grid" }, made[0]),
     make("details", {}, make("summary", { textContent: "Square, lens model and ChArUco board" }), make("div", { className: "grid" }, ...made.slice(1))));
   form.addEventListener("submit", (event) => event.preventDefault());
+  const typed = () => Object.fromEntries(state.board_fields.map(([key]) => [key, document.getElementById(key).value]));
   const calibrate = (camera) => act(async () => {
-    const options = Object.fromEntries(state.board_fields.map(([key]) => [key, document.getElementById(key).value]));
-    showFaults(form, await change("calibrate", { camera, options }), (key) => key);
+    showFaults(form, await change("calibrate", { camera, options: typed() }), (key) => key);
   });
   const cards = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
     make("b", { textContent: one.camera }),
@@ -133,28 +193,34 @@ function intrinsics(state, act) {
       ...(one.file ? [button(`Use ${one.file}`, () => act(() => change("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_change })] : []),
       button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
         { className: one.known || one.file ? "" : "main", disabled: works || !state.may_change })))));
+  const listed = make("div", { className: "cards" }, ...cards);
+  // The user who moves a board looks at its image: it is above all texts.
+  const shown = state.board ? [make("div", { id: "calibration" }, make("div", { id: "board-image" }), listed)] : [];
   return [
-    make("p", { textContent: "Print a chessboard on a flat plate (ipsys markers --board 6x4 -o board.pdf). Move it through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far." }),
+    ...shown,
+    make("p", { textContent: "The intrinsics describe the lens of a camera. Pictures of a chessboard determine them." }),
+    make("p", { textContent: "Print the chessboard, and glue it on a flat plate. Press Calibrate, move the board through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far. A board of 7 x 5 squares has 6x4 inner corners." }),
+    make("div", { className: "actions" }, printer("board", "Board to print (PDF)", act, typed)),
     form,
-    ...(state.board ? [make("div", { id: "board-image" })] : []),
-    make("div", { className: "cards" }, ...cards),
-    ...lines(report(state).map((text) => ["", text])),
+    ...(state.board ? [] : [listed]),
+    ...lines(report(state).map((text, n) => [n ? "" : "strong", text])),
   ];
 }
 
 function alignment(state, act) {
   const found = state.alignment;
   const parts = [
-    make("p", { textContent: "Put four or more markers on the floor, up to the edges of each image. The arrow shows the direction in which to turn a camera; it is 5 times longer than the turn." }),
+    make("p", { textContent: "Put four or more markers on the floor, up to the edges of each image, and leave them there. An arrow on the image shows where to turn a camera; it is drawn 5 times longer. A camera without an arrow is level." }),
     make("div", { className: "actions" }, starter(found ? "Measure again" : "Measure the alignment", "align", state, act, !found)),
   ];
   if (!found) return parts;
   const cards = found.cameras.map((one) => make("div", { className: "card" }, alignedImage(one),
-    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: sentence(one.advice) }))));
+    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: `To do: ${sentence(one.advice)}` }))));
   return [
-    ...parts, make("div", { className: "cards" }, ...cards), make("h3", { textContent: "Floor" }),
-    ...lines([...(found.fault ? [["bad", found.fault]] : []), ...found.coverage.map(([text, good]) => [good ? "good" : "warn", text])]),
-    ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Notes: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
+    ...parts, make("div", { className: "cards" }, ...cards),
+    ...(found.coverage.length ? [make("h3", { textContent: "Floor" })] : []),
+    ...lines(found.coverage.map(([text, good]) => [good ? "good" : "warn", text])),
+    ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Remarks on markers and floor: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
   ];
 }
 

@@ -4,8 +4,8 @@ import { element, make } from "./make.js";
 // Small angles are hard to see: the arrow is longer than the distance in the image.
 const GROWTH = 5;
 
-export function cameraImage(address, name) {
-  if (!address) return make("div", { className: "image", textContent: "no picture yet" });
+export function cameraImage(address, name, missing) {
+  if (!address) return make("div", { className: "image", textContent: missing });
   return make("div", { className: "image" }, make("img", { src: address, alt: `Image of ${name}` }));
 }
 
@@ -22,7 +22,7 @@ function arrow(one, width, height) {
   const [x, y] = one.centre_px;
   const group = element("g", { class: one.level ? "level" : "tilted" });
   const paths = [`M${x - width / 50} ${y}h${width / 25}M${x} ${y - width / 50}v${width / 25}`];
-  if (one.plumb_px) {
+  if (one.plumb_px && !one.level) {
     const [dx, dy] = [one.plumb_px[0] - x, one.plumb_px[1] - y].map((d) => d * GROWTH);
     const length = Math.hypot(dx, dy), scale = Math.min(1, (height * 0.45) / Math.max(length, 1));
     const [ex, ey] = [x + dx * scale, y + dy * scale];
@@ -44,4 +44,17 @@ export function boardImage(board) {
   for (const outline of board.kept_px) svg.append(element("polygon", { class: "kept", points: outline.join(" ") }));
   if (board.board_px) svg.append(element("polygon", { class: "present", points: board.board_px.join(" ") }));
   return [make("div", { className: "image" }, svg), make("p", { className: "text", textContent: `${board.count} pictures; ${board.advice.join("; ")}.` })];
+}
+
+// The floor with its two reference points as typed; nothing while a value is missing.
+export function floorSketch(typed) {
+  const { width_m: width, depth_m: depth } = typed;
+  const points = [["A", typed.first_x_m, typed.first_y_m], ["B", typed.second_x_m, typed.second_y_m]];
+  if (!(width > 0 && depth > 0) || points.flat().some((value) => Number.isNaN(value))) return [];
+  const unit = Math.max(width, depth) / 20, edge = 2 * unit;
+  const text = (x, y, content) => element("text", { x, y: depth - y, "font-size": unit }, content);
+  const svg = element("svg", { viewBox: `${-edge} ${-edge} ${width + 2 * edge} ${depth + 2 * edge}`, role: "img", "aria-label": "The floor from above, with the reference points A and B" });
+  svg.append(element("rect", { width, height: depth }), element("path", { d: `M${unit * 4} ${depth}H0V${depth - unit * 4}`, class: "axes" }), text(unit * 4.3, -unit * 0.3, "x"), text(-unit * 0.3, unit * 4.6, "y"));
+  for (const [name, x, y] of points) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 3 }), text(x + unit / 2, y + unit / 2, name));
+  return [svg];
 }

@@ -5,9 +5,9 @@ import { panel, shownPart } from "./panels.js";
 import { boardImage } from "./pictures.js";
 
 const $ = (id) => document.getElementById(id);
-const EVERY_MS = 1000;
-const SIGNS = { done: "✓", ready: "", waits: "" }, SAID = { done: "done", ready: "can be done now", waits: "waits" };
-let state = null, shown = "", selected = null, told = "", timer = 0;
+const EVERY_MS = 1000, PATIENCE_MS = 15000;
+const SAID = { done: "done", ready: "can be done now", waits: "waits" };
+let state = null, shown = "", selected = null, told = "", lastFault = "null", timer = 0, request = null, isLost = false;
 
 function chip(kind, text) {
   if ($("state").textContent === text) return;
@@ -37,7 +37,7 @@ function choose() {
 function drawSteps() {
   const rows = state.steps.map((step, n) => {
     const button = make("button", { type: "button", id: `step-${step.name}`, className: step.status },
-      make("b", { textContent: SIGNS[step.status] || String(n + 1) }),
+      make("b", { textContent: String(n + 1) }),
       make("span", { className: "title", textContent: step.title }), make("small", { textContent: step.text || SAID[step.status] }));
     if (step.name === selected) button.setAttribute("aria-current", "step");
     button.addEventListener("click", () => { location.hash = step.name; });
@@ -50,19 +50,28 @@ function drawSteps() {
 
 const initial = (one) => one.defaultValue ?? [...one.options].find((option) => option.defaultSelected)?.value;
 
-function drawPanel() {
+// isBack: images that could not be loaded are loaded again.
+function drawPanel(isBack = false) {
   const part = shownPart(selected, state);
-  if (part === shown) return;
+  if (part === shown && !isBack) return;
   // Typed texts and the focus survive a change by another device.
   const same = shown.startsWith(`["${selected}"`);
-  const typed = same ? [...$("panel").querySelectorAll("input, select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.value]) : [];
+  const typed = same ? [...$("panel").querySelectorAll("input:not([type=checkbox]), select")].filter((one) => one.value !== initial(one)).map((one) => [one.id, one.name, one.value]) : [];
   const focused = same ? document.activeElement?.id : "", within = same && $("panel").contains(document.activeElement);
   shown = part;
   const unfolded = same && $("panel").querySelector("form details")?.open;
   $("panel").replaceChildren(...panel(selected, state, act));
   if (unfolded) $("panel").querySelector("form details")?.setAttribute("open", "");
-  for (const [id, value] of typed) if ($(id)) $(id).value = value;
+  for (const [id, name, value] of typed) {
+    if ($(id)?.name !== name) continue;
+    $(id).value = value;
+    $(id).dispatchEvent(new Event("input", { bubbles: true }));
+  }
   if (focused && $("panel").contains($(focused))) $(focused).focus();
+  // A fault that a job has found moves the keyboard to its field, as a fault of the typed text does.
+  const { fault } = state.address, faulted = JSON.stringify(fault);
+  if (fault && faulted !== lastFault && within) $(fault.field)?.focus();
+  lastFault = faulted;
   // A button that has vanished leaves the keyboard in the panel.
   if (within && !$("panel").contains(document.activeElement)) $("panel").focus();
   drawSteps();
@@ -89,19 +98,49 @@ function drawJob() {
 // Show who operates. Without an operator, the first device that changes something operates.
 function drawOperator() {
   const { operates, isFree } = seat;
-  $("operate").hidden = state.may_operate && isFree;
-  const text = !state.may_operate ? "This device only views." : operates ? "This device operates." : "Another device operates.";
+  $("operate").hidden = false;
+  const text = !state.may_operate ? "This device only views." : operates ? "This device operates; others only view."
+    : isFree ? "No device operates yet: the first one that changes something does." : "Another device operates; this one only views.";
   if ($("operation").textContent !== text) $("operation").textContent = text;
-  $("take").textContent = operates ? "Stop operating" : "Take over";
-  $("take").hidden = !state.may_operate;
+  $("take").textContent = operates ? "Let others operate" : "Take over";
+  $("take").hidden = !state.may_operate || isFree;
+}
+
+// Without an answer in time, the network may have lost the request: another one replaces it.
+async function ask() {
+  request?.abort();
+  const own = request = new AbortController();
+  const patience = setTimeout(() => own.abort(), PATIENCE_MS);
+  try {
+    const answer = await fetch("api/state", { signal: own.signal });
+    if (!answer.ok) throw new Error(await answer.text());
+    return await answer.json();
+  } catch (error) {
+    if (request !== own) return null;
+    throw error instanceof TypeError || error.name === "AbortError" ? new Error("ipsys does not answer") : error;
+  } finally {
+    clearTimeout(patience);
+  }
+}
+
+// Without the server, the buttons wait.
+function drawLost() {
+  if (!state) return;
+  state.may_change = false;
+  $("operation").textContent = "ipsys does not answer: the buttons wait. If the command has ended, start it again.";
+  $("take").hidden = $("stop").hidden = true;
+  drawPanel();
 }
 
 async function read() {
   clearTimeout(timer);
   try {
-    const answer = await fetch("api/state");
-    if (!answer.ok) throw new Error(await answer.text());
-    state = await answer.json();
+    const present = await ask();
+    if (!present) return;
+    state = present;
+    const isBack = isLost;
+    isLost = false;
+    if (isBack) tell("");
     seat.present = state.operator;
     state.may_change = state.may_operate && (seat.operates || seat.isFree);
     drawOperator();
@@ -109,11 +148,13 @@ async function read() {
     chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} done`);
     $("folder").textContent = state.rig.name ?? state.folder;
     choose();
-    drawPanel();
+    drawPanel(isBack);
     if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
     drawJob();
   } catch (error) {
-    chip("bad", error instanceof TypeError ? "ipsys does not answer" : error.message.slice(0, 60));
+    chip("bad", error.message.slice(0, 60));
+    isLost = true;
+    drawLost();
   }
   clearTimeout(timer);
   timer = setTimeout(read, EVERY_MS);
@@ -126,6 +167,10 @@ addEventListener("hashchange", () => {
   scrollTo(0, 0);
   $("panel").focus();
 });
+// A page that comes back does not wait for the next turn.
+addEventListener("online", read);
+addEventListener("pageshow", (event) => { if (event.persisted) read(); });
+document.addEventListener("visibilitychange", () => { if (!document.hidden) read(); });
 $("take").addEventListener("click", () => act(() => (seat.operates ? seat.release() : seat.take())));
 $("stop").addEventListener("click", () => act(() => change("stop")));
 read();

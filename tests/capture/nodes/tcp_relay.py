@@ -131,8 +131,7 @@ class Relay:
             due_s, block = item
             while (wait_s := due_s - time.monotonic()) > 0:
                 time.sleep(wait_s)
-            while not self._passes.wait(_TURN_S) and not self._ended.is_set():
-                continue
+            self._wait_for_passage()
             try:
                 if is_open:
                     target.sendall(block)
@@ -140,7 +139,14 @@ class Relay:
             except OSError:
                 is_open = False
                 _end(source, target)
+        # The end of a connection does not pass a partition either.
+        self._wait_for_passage()
         _end(source, target)
+
+    def _wait_for_passage(self) -> None:
+        """Wait until the relay passes blocks, or ends."""
+        while not self._passes.wait(_TURN_S) and not self._ended.is_set():
+            continue
 
 
 def _end(*sides: socket.socket) -> None:

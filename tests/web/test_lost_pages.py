@@ -1,0 +1,236 @@
+"""Frozen pages and lost networks: recordings go on, and a page that comes back shows the present state."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
+from ipsys_log.first_day.lab_folder import LabFolder
+from ipsys_log.log.dataset import Session
+from ipsys_log.web.first_day.app import SetupApp
+from ipsys_log.web.server import serve_app
+from tests.capture.nodes.tcp_relay import Relay
+from tests.web.phone import Phone, phone
+from tests.web.test_connections import wait_until
+from tests.web.test_measuring_page import says
+from tests.web.test_setup_browser import DESKTOP, Visitor, leave, visit
+from tests.web.test_setup_page import SMALL, Client
+
+# Browsers and recordings.
+pytestmark = pytest.mark.slow
+
+POINTS = """[[reference_points]]
+name = "A"
+x_m = 0.0
+y_m = 0.0
+[[reference_points]]
+name = "B"
+x_m = 1.0
+y_m = 0.0
+"""
+UNREAD_CONNECTIONS = 6
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Phone]:
+    with phone(tmp_path / "first") as one:
+        yield one
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "lab"
+    path.mkdir()
+    return path
+
+
+@contextmanager
+def setup_page(folder: Path, port: int = 0) -> Iterator[Client]:
+    setup = SetupApp(LabFolder(folder))
+    with serve_app(setup.app, None, port) as server:
+        try:
+            yield Client(server.url, setup)
+        finally:
+            setup.session.close()
+        assert server.exceptions.count == 0, server.exceptions.first
+
+
+def renderers(browser: Phone) -> list[int]:
+    """Return the processes of the browser that draw pages; they are its children, or theirs."""
+    parents = {}
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(status.parent.name)] = int(status.read_text().rpartition(")")[2].split()[1])
+        except OSError:  # the process has ended
+            continue
+    family = {browser.process}
+    while more := {one for one, parent in parents.items() if parent in family} - family:
+        family |= more
+    return [one for one in family if b"--type=renderer" in Path(f"/proc/{one}/cmdline").read_bytes()]
+
+
+@contextmanager
+def frozen(browser: Phone) -> Iterator[None]:
+    """Stop the pages of a browser, as an operating system does with a page in the background."""
+    stopped = renderers(browser)
+    assert stopped
+    try:
+        for one in stopped:
+            os.kill(one, signal.SIGSTOP)
+        yield
+    finally:
+        for one in stopped:
+            os.kill(one, signal.SIGCONT)
+
+
+@contextmanager
+def unread(page: Client, *paths: str) -> Iterator[None]:
+    """Ask for answers on connections with small buffers, and never read them."""
+    with ExitStack() as stack:
+        for path in paths * UNREAD_CONNECTIONS:
+            lazy = stack.enter_context(socket.socket())
+            lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+            lazy.bind(("127.0.0.2", 0))
+            lazy.connect((str(page.parts.hostname), page.parts.port))
+            lazy.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode() * 20)
+        yield
+
+
+def grows(log: Path, page: Client) -> None:
+    """Wait until the recorder has written more, and the server has answered."""
+    before = log.stat().st_size
+    wait_until(lambda: log.stat().st_size > before)
+    assert page.state()["job"]["ended"] is False
+
+
+def test_frozen_page_of_a_measuring_does_not_stop_it(browser: Phone, folder: Path) -> None:
+    (folder / "lab.toml").write_text(SMALL + POINTS)
+    with setup_page(folder) as page:
+        page.operate()
+        browser.open(page.parts.geturl() + "#points", DESKTOP)
+        assert page.ask("/api/start", {"action": "measure"}) == (200, {})
+        browser.wait("document.querySelector('#open-measure')")
+        with frozen(browser), unread(page, "/api/state", "/panels.js", "/measure/api/views"):
+            # The images of the camera go on.
+            views = [page.ask("/measure/api/views")]
+            for _ in range(3):
+                wait_until(lambda: page.ask("/measure/api/views") != views[-1])
+                views.append(page.ask("/measure/api/views"))
+            assert page.ask("/api/stop", {}) == (200, {})
+            assert page.job_ended()["error"] == ""
+        # The page shows the end of the measuring, and its buttons work again.
+        browser.wait("document.querySelector('#job').hidden && document.querySelector('#measure')")
+        says(browser, "#panel", "0 points measured")
+        says(browser, "#operation", "Another device operates")
+        browser.tap("#take")
+        says(browser, "#operation", "This device operates")
+        browser.wait("!document.querySelector('#measure').disabled")
+        leave(browser)
+
+
+def test_frozen_dashboard_of_the_setup_does_not_stop_the_tracking(
+    browser: Phone, folder: Path, replayed_log: Path
+) -> None:
+    write_new(simulated_lab_texts(folder / "lab.toml"))
+    shutil.copy(replayed_log, folder / "calibration.mcap")
+    log = folder / "live.mcap"
+    with setup_page(folder) as page:
+        page.operate()
+        assert page.ask("/api/start", {"action": "live"}) == (200, {})
+        wait_until(lambda: page.state()["pages"]["live"] or page.state()["job"]["ended"])
+        assert page.state()["job"]["error"] == ""
+        browser.open(page.parts.geturl() + "live/", DESKTOP)
+        says(browser, "#state", "live")
+        with frozen(browser), unread(page, "/live/api/live", "/api/state"):
+            for _ in range(3):
+                grows(log, page)
+        says(browser, "#state", "live")
+        browser.wait("document.querySelectorAll('figure image').length === 3")
+        # The setup page in the same tab shows the present state, and stops the recording.
+        assert page.ask("/api/operate", {"release": page.operator}) == (200, {})
+        visit(browser, page.parts.geturl() + "#live", DESKTOP)
+        browser.tap("#stop")
+        assert page.job_ended()["error"] == ""
+        browser.wait("document.querySelector('#job').hidden")
+        leave(browser)
+    with Session([log]) as session:
+        assert len(session.images) == 3
+        assert all(session.count(topic) > 5 for topic in session.images.values())
+
+
+@pytest.mark.parametrize("closes", [True, False], ids=["closed", "silent"])
+def test_page_shows_the_present_state_after_a_lost_network(
+    browser: Phone, folder: Path, closes: bool
+) -> None:
+    with setup_page(folder) as page, Relay(page.parts.port or 0) as relay:
+        browser.open(f"http://127.0.0.1:{relay.port}/", DESKTOP)
+        says(browser, "#state", "0 of 7")
+        relay.cut(closes)
+        says(browser, "#state", "ipsys does not answer")
+        says(browser, "#operation", "the buttons wait")
+        assert browser.run("document.querySelector('#save').disabled")
+        # Meanwhile another device uses the simulated lab.
+        page.operate()
+        assert page.ask("/api/simulate", {}) == (200, {})
+        assert page.ask("/api/operate", {"release": page.operator}) == (200, {})
+        relay.mend()
+        says(browser, "#state", "3 of 7")
+        says(browser, "#panel", "simulated_lab")
+        browser.wait("!document.querySelector('#save').disabled")
+        browser.run("document.querySelector('#name').value = 'hall'")
+        browser.tap("#save")
+        says(browser, "#folder", "hall")
+        leave(browser)
+
+
+def test_page_goes_on_when_the_command_is_started_again(browser: Phone, folder: Path) -> None:
+    with setup_page(folder) as page:
+        browser.open(page.parts.geturl(), DESKTOP)
+        Visitor(browser).tap("#simulate")
+        says(browser, "#state", "3 of 7")
+    says(browser, "#state", "ipsys does not answer")
+    with setup_page(folder, page.parts.port or 0):
+        says(browser, "#state", "3 of 7")
+        # The new server has no operator: this device operates by its next change.
+        browser.run("document.querySelector('#name').value = 'hall'")
+        browser.tap("#save")
+        says(browser, "#folder", "hall")
+        says(browser, "#operation", "This device operates")
+        leave(browser)
+
+
+def test_two_pages_show_the_same_and_one_operates(browser: Phone, folder: Path, tmp_path: Path) -> None:
+    with setup_page(folder) as page, phone(tmp_path / "second") as other:
+        for one in (browser, other):
+            one.open(page.parts.geturl(), DESKTOP)
+            says(one, "#state", "0 of 7")
+            says(one, "#operation", "No device operates")
+        browser.tap("#simulate")
+        says(browser, "#operation", "This device operates")
+        says(other, "#state", "3 of 7")
+        says(other, "#folder", "simulated_lab")
+        says(other, "#operation", "Another device operates")
+        other.wait("document.querySelector('#save').disabled")
+        other.run("location.hash = 'alignment'")
+        other.wait("document.querySelector('#align').disabled")
+        other.tap("#take")
+        says(other, "#operation", "This device operates")
+        says(browser, "#operation", "Another device operates")
+        other.tap("#align")
+        # The first page sees the job, and has no button to stop it.
+        says(browser, "#job-text", "the alignment")
+        assert not browser.run("document.querySelector('#stop').checkVisibility()")
+        says(other, "#state", "4 of 7")
+        says(browser, "#state", "4 of 7")
+        other.tap("#take")
+        for one in (browser, other):
+            says(one, "#operation", "No device operates")
+            leave(one)

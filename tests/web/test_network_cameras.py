@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.capture.nodes import centre
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.rig.file import load_rig
@@ -174,7 +175,8 @@ def test_camera_of_a_node_is_added_with_its_picture(folder: Path, tmp_path: Path
         assert page.ask(f"/{camera['picture']}")[1].startswith(b"ceiling")
 
 
-def test_stop_ends_the_wait_for_a_node(folder: Path) -> None:
+def test_stop_ends_the_wait_for_a_node(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(centre, "_FIRST_ANSWER_S", 1e6)  # without a stop, the job does not end
     (folder / "lab.toml").write_text(f'{RIG}[nodes]\ncentre = "127.0.0.1:{free_port()}"\n')
     with page_of(folder) as page:
         assert page.ask("/api/address", {"values": {"address": "zenoh:ceiling"}}) == (200, {})

@@ -154,10 +154,10 @@ async function read() {
   } catch (error) {
     chip("bad", error.message.slice(0, 60));
     isLost = true;
-    drawLost();
   }
   clearTimeout(timer);
   timer = setTimeout(read, EVERY_MS);
+  if (isLost) drawLost();
 }
 
 addEventListener("hashchange", () => {

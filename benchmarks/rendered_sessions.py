@@ -49,9 +49,10 @@ def rendered_session(lab: GeometricLab, folder: Path) -> list[Message]:
     path = folder / f"{settings.lab.seed}_{kind}_{_key(lab)}.mcap"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        begin = time.perf_counter()
+        begin = time.process_time()
         write_log(path, _through_images(lab))
-        print(f"rendered {path.name} in {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+        spent_s = time.process_time() - begin
+        print(f"rendered {path.name} in {spent_s:.0f} s of processor time", file=sys.stderr, flush=True)
     with Session([path]) as session:
         return list(session.messages({topic for reader in session.readers for topic in reader.channels}))
 

@@ -125,7 +125,12 @@ def measure(options: argparse.Namespace) -> Report:
 
 def _chosen(options: argparse.Namespace) -> list[Condition]:
     """Return the conditions that the options select; those with images if there shall be images."""
-    chosen = [one for one in _CONDITIONS if options.condition in one.name]
+    names = options.exactly.split(";") if options.exactly else [one.name for one in _CONDITIONS]
+    if unknown := sorted(set(names) - {one.name for one in _CONDITIONS}):
+        raise SystemExit(
+            f"no condition {unknown[0]!r}; there are {'; '.join(one.name for one in _CONDITIONS)}"
+        )
+    chosen = [one for one in _CONDITIONS if options.condition in one.name and one.name in names]
     if not options.rendered:
         return chosen
     return [
@@ -262,6 +267,7 @@ def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--drive-s", type=float, default=20.0, help="duration of a drive in s")
     parser.add_argument("--height-sigma-mm", type=float, default=0.0, help="sigma of the robots' heights")
     parser.add_argument("--condition", default="", help="only conditions with this in their name")
+    parser.add_argument("--exactly", default="", help="only conditions with these names, separated by ;")
     parser.add_argument("--rendered", action="store_true", help="render the labs: about 3 minutes for each")
     parser.add_argument("--keep", default=str(CACHE / "labs"), help="folder of the rendered labs")
     parser.add_argument("--calibrations", default="", help=f"of {'; '.join(CALIBRATIONS)}")

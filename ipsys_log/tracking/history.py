@@ -16,6 +16,7 @@ __all__ = ["HISTORY_NS", "History", "Record", "Sighted", "combine_seen"]
 HISTORY_NS = NS_PER_S // 2
 # More instants than this are checked for those that no late sighting can reach.
 _MOST_ROWS = 256
+_SLACK_NS = HISTORY_NS // 5
 # A camera, and whether the position is inside the calibrated volume.
 Seen = tuple[str, bool | None]
 
@@ -101,6 +102,8 @@ class History:
 
     def _forget(self) -> None:
         oldest_ns = self.times_ns[-1] - HISTORY_NS
+        if self.times_ns[0] > oldest_ns - _SLACK_NS:  # mostly: several records are forgotten together
+            return
         # The last record before the oldest time stays: a sighting at that time starts from it.
         forgotten = max(bisect_right(self.times_ns, oldest_ns) - 1, 0)
         if forgotten:

@@ -230,7 +230,7 @@ class RobotTracks:
         accepted = self._filter(batch, robots, np.array(rows), tracks, places)
         return [
             pose
-            for row, track, is_accepted in zip(rows, tracks, accepted.tolist(), strict=True)
+            for row, track, is_accepted in zip(rows, tracks, accepted, strict=True)
             if is_accepted and (pose := self._pose(robots[row], track, batch, row))
         ]
 
@@ -262,10 +262,10 @@ class RobotTracks:
         rows: NDArray[np.intp],
         tracks: list[_Track],
         places: list[int],
-    ) -> NDArray[np.bool_]:
-        """Filter the sightings of some rows, and the later ones again; return a mask of the accepted rows."""
-        states, accepted = self._states_after(batch, rows, tracks, places)
-        later = []
+    ) -> list[bool]:
+        """Filter the sightings of some rows, and the later ones again; return which rows are accepted."""
+        states, mask = self._states_after(batch, rows, tracks, places)
+        accepted, later = mask.tolist(), []
         for number, (row, track, place) in enumerate(zip(rows.tolist(), tracks, places, strict=True)):
             record = Record(
                 batch.times_ns[row], batch.camera, batch.inside[row], batch.sightings, row, states, number

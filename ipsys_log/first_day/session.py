@@ -95,7 +95,7 @@ class SetupSession:
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
                 "logs": [[log.path.name, log.points] for log in progress.logs if log.points],
             },
-            "fit": None if progress.fit is None else _describe_fit(progress.fit),
+            "accuracy": None if progress.fit is None else _describe_fit(progress.fit),
             "tracked": [log.path.name for log in progress.logs if log.tracked],
             "faults": [log.fault for log in progress.logs if log.fault],
             "job": None if job is None else job.describe(),

@@ -14,6 +14,7 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
+from ipsys_log.messages import kind_of
 from ipsys_log.runs.pieces import FrameResult, PieceResult
 
 __all__ = ["from_bytes", "to_bytes"]
@@ -68,9 +69,10 @@ def _hash(body: bytes) -> bytes:
 
 def _entry(payload: Any, blobs: list[bytes]) -> list[Any]:
     """Return the entry of a payload in the index: its schema and length, or its type and fields."""
-    if type(payload) in PAYLOADS.values():
+    kind = kind_of(payload)
+    if kind in PAYLOADS.values():
         blobs.append(encode(payload))
-        return [schema_name(type(payload)), len(blobs[-1])]
+        return [schema_name(kind), len(blobs[-1])]
     values = {field.name: getattr(payload, field.name) for field in fields(payload)}
     return [type(payload).__name__, {name: _value(value, blobs) for name, value in values.items()}]
 

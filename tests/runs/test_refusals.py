@@ -293,7 +293,7 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "joint.solver._more": _JOINT,
     "joint.solver.solve": _JOINT,
     "joint.start._anchor": _JOINT,
-    "joint.start.place_cameras": _JOINT,
+    "joint.start._chain": _JOINT,
     "models.ann.NeuralNetwork.fit": _FIT,
     "models.kriging.Kriging.fit": _FIT,
     "models.ray_models.RayDepth.fit": _FIT,

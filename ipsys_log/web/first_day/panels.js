@@ -15,7 +15,7 @@ function report(state) {
 export function shownPart(name, state) {
   const parts = {
     rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
-    points: [state.points, state.measured_now], accuracy: [state.fit, state.points], live: state.tracked,
+    points: [state.points, state.measured_now], accuracy: [state.accuracy, state.points], live: state.tracked,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
   return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
@@ -261,7 +261,7 @@ function outlier(one, several, state, act) {
 }
 
 function accuracy(state, act, step) {
-  const { fit } = state;
+  const fit = state.accuracy;
   const parts = [
     paragraph("The fit computes a model from the measured points: positions in the images become positions on the floor. Then it tells the error of the positions."),
     make("div", { className: "actions" }, starter(fit ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),

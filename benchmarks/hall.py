@@ -49,8 +49,8 @@ _MOST_EXPONENT = 1.2
 class Figures:
     """The figures of one hall.
 
-    ``unmeasured`` cameras see no taped point. ``start_s`` and ``fit_s`` are processor times of the rough poses,
-    and of the whole calibration. ``start_mm`` is the largest error of a rough camera position. The other
+    ``unmeasured`` cameras see no taped point. ``start_s`` and ``fit_s`` are processor times of the rough
+    poses, and of the whole calibration. ``start_mm`` is the largest error of a rough origin. The other
     errors are those over the floor; ``aligned_mm`` is the mean after the best rigid alignment.
     """
 

@@ -34,13 +34,15 @@ class Frame(NamedTuple):
 
     ``format`` is jpeg, png, h264 or h265; or markers, if a node has detected them and sends no image.
     ``time_ns`` is the driver's stamp in UTC; None without a stamp. ``missed`` is the number of frames lost
-    directly before this frame, by the count of the driver.
+    directly before this frame, by the count of the driver. ``received_ns`` is the arrival of a frame that
+    has waited in a queue of the source; None for other frames.
     """
 
     data: bytes
     format: str
     time_ns: int | None
     missed: int = 0
+    received_ns: int | None = None
 
 
 class SourceMessage(NamedTuple):

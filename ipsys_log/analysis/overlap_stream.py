@@ -109,12 +109,11 @@ class OverlapSummary:
             if len(lengths_m) >= _FEWEST
         }
         shown = sorted(sorted(pairs, key=lambda pair: -pairs[pair][0])[:_MOST_LINES])
-        lines = [
-            f"positions of cameras {first} and {second} differ by {median_mm:.1f} mm (median), {p95_mm:.1f} mm"
-            " (p95)"
-            for first, second in shown
-            for median_mm, p95_mm in [pairs[first, second]]
-        ]
+        lines = []
+        for first, second in shown:
+            median_mm, p95_mm = pairs[first, second]
+            figures = f"{median_mm:.1f} mm (median), {p95_mm:.1f} mm (p95)"
+            lines.append(f"positions of cameras {first} and {second} differ by {figures}")
         if len(pairs) > len(shown):
             lines.append(f"the other {len(pairs) - len(shown)} pairs of cameras differ less")
         return lines

@@ -49,16 +49,23 @@ class NodeModes:
 
     Attributes
     ----------
-    modes_m : (n, 3, M), errors by all M amplitudes; NaN at a node that the camera cannot see.
+    modes_m : (n, 3, c), errors by the amplitudes in ``columns``; NaN at a node that the camera cannot see.
     rest_m2 : (n, 3, 3), covariances of local errors.
     clock_s : (M,), error of the camera's clock by the amplitudes.
     rows : (n,), the nodes by their number in the grid; the camera cannot see the others. None: all nodes.
+    columns : (c,), the amplitudes on which the errors depend. None: all M amplitudes.
     """
 
     modes_m: Array
     rest_m2: Array
     clock_s: Array
     rows: NDArray[np.intp] | None = None
+    columns: NDArray[np.intp] | None = None
+
+    def project(self, axes: Array) -> Array:
+        """Return the errors (n, 3, k) by combinations (M, k) of the amplitudes."""
+        product: Array = self.modes_m @ (axes if self.columns is None else axes[self.columns])
+        return product
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,8 +164,8 @@ def reduce_modes(grid: Grid, cameras: Mapping[str, NodeModes], count: int) -> Bi
     size = kept.shape[1]
     total, tables, clock_s, columns = size + 3 * len(cameras), {}, {}, {}
     for number, (name, node) in enumerate(cameras.items()):
-        left, modes_m = node.modes_m @ others, np.empty((len(node.modes_m), 3, size + 3))
-        modes_m[:, :, :size] = node.modes_m @ kept
+        left, modes_m = node.project(others), np.empty((len(node.modes_m), 3, size + 3))
+        modes_m[:, :, :size] = node.project(kept)
         modes_m[:, :, size:] = _roots(node.rest_m2 + left @ left.swapaxes(1, 2))
         tables[name] = _fill(grid, modes_m, node.rows)
         clock_s[name] = np.append(node.clock_s @ kept, np.zeros(total - size))
@@ -189,8 +196,11 @@ def _rows(node: NodeModes) -> Array:
     seen = np.isfinite(node.modes_m).all(axis=(1, 2))
     modes_m = node.modes_m[seen]
     sizes_m = np.sqrt((modes_m**2).sum(axis=(1, 2), keepdims=True))
-    flat = (modes_m / np.maximum(sizes_m, 1e-12)).reshape(-1, modes_m.shape[2])
-    return np.concatenate([flat / np.sqrt(max(seen.sum(), 1)), node.clock_s[None] / _CLOCK_S])
+    flat = (modes_m / np.maximum(sizes_m, 1e-12)).reshape(-1, modes_m.shape[2]) / np.sqrt(max(seen.sum(), 1))
+    if node.columns is not None:
+        own, flat = flat, np.zeros((len(flat), len(node.clock_s)))
+        flat[:, node.columns] = own
+    return np.concatenate([flat, node.clock_s[None] / _CLOCK_S])
 
 
 def _roots(covariances: Array) -> Array:
@@ -211,8 +221,8 @@ def _fill(grid: Grid, own: Array, rows: NDArray[np.intp] | None) -> Array:
     if seen.any():
         known_m, known = points_m[seen], values[seen]
         for some in np.array_split(np.flatnonzero(~seen), 1 + len(points_m) // _NODES_AT_ONCE):
-            apart = ((points_m[some, None] - known_m) ** 2).sum(axis=2)
-            values[some] = known[apart.argmin(axis=1)]
+            x_m, y_m = (points_m[some, None, axis] - known_m[:, axis] for axis in (0, 1))
+            values[some] = known[(x_m**2 + y_m**2).argmin(axis=1)]
     else:
         values = np.zeros_like(values)
     return values.reshape(*grid.shape, *values.shape[1:])

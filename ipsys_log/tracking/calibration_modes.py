@@ -21,7 +21,7 @@ _ROBOT_HEIGHT_M = 0.1
 _MARKER_M = 0.2
 # Standard deviation of a corner of detect: a weight of corners without noise.
 _USUAL_PX = 0.012
-# With more nodes of all cameras together, each camera has only the nodes in its view, and a margin of the view.
+# With more nodes of all cameras together, each camera has only the nodes in its view, with this factor.
 _MOST_NODES, _VIEW_MARGIN = 100_000, 1.2
 # Rays that are flatter than this (cosine with the vertical) do not belong to positions.
 _FLATTEST = 0.2
@@ -99,8 +99,8 @@ def _joint_nodes(
 ) -> NodeModes:
     """Return the modes of a joint model: those of level markers at the nodes, and the error of the height.
 
-    ``sigma_m`` is the standard deviation of the height; None for the usual one. ``in_view``: only of the nodes
-    in the view of the camera.
+    ``sigma_m`` is the standard deviation of the height; None for the usual one. ``in_view``: only
+    of the nodes in the view of the camera.
     """
     # Late: scipy takes 1 s.
     from ipsys_log.geometry.lenses import project
@@ -181,6 +181,11 @@ def _side_by_side(cameras: dict[str, NodeModes]) -> dict[str, NodeModes]:
     ends = np.cumsum([0, *counts])
     joined = {}
     for number, (name, node) in enumerate(cameras.items()):
+        if node.rows is not None:
+            # The zeros of all other cameras of a hall need too much memory.
+            columns = np.append(np.arange(ends[number], ends[number + 1]), ends[-1])
+            joined[name] = NodeModes(node.modes_m, node.rest_m2, np.zeros(ends[-1] + 1), node.rows, columns)
+            continue
         modes_m = np.zeros((*node.modes_m.shape[:2], ends[-1] + 1))
         modes_m[:, :, ends[number] : ends[number + 1]] = node.modes_m[:, :, :-1]
         modes_m[:, :, -1] = node.modes_m[:, :, -1]

@@ -72,7 +72,7 @@ def record_hall(folder: Path, lab: GeometricLab, markers: dict[str, list[Markers
 
     def say(text: str) -> None:
         if "its node answers" in text:
-            answered.add(text.split(":")[0])
+            answered.add(text.split(":", maxsplit=1)[0])
         if len(answered) == len(cameras):
             begin.set()
 

@@ -23,6 +23,7 @@ BENCHMARKS = {
     "replay": "the whole chain beside detection alone; memory over ten minutes",
     "jobs": "detection with worker processes, beside one process; latency after a reset",
     "live": "recording and tracking of streams on loopback: drops, processor time, latency",
+    "hall_nodes": "markers of 24 nodes at one centre: processor time, latency, losses, memory",
     "streams": "from a frame to ten clients of UDP, MAVLink, VRPN, ROS 2 and Foxglove",
     "log_write": "recording and small messages, beside mcap and foxglove-sdk",
     "log_read": "reading, beside mcap",

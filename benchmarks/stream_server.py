@@ -18,7 +18,7 @@ import numpy as np
 from ipsys_log.log.dataset import Session
 from ipsys_log.rig.file import rig_toml
 
-__all__ = ["Served", "free_ports", "loops_of", "serve"]
+__all__ = ["Served", "free_ports", "loops_of", "serve", "write_lens"]
 
 _TURN_S = 0.05
 _FORMAT = ("-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=ffmpeg", "-listen", "1")
@@ -73,7 +73,7 @@ def serve(lab: Path, loops: Mapping[str, Path], count: int, folder: Path, limit_
                 served.missing[name] = why
                 continue
             served.cameras.append(name)
-            file = _write_lens(folder / f"{name}.yaml", lens)
+            file = write_lens(folder / f"{name}.yaml", lens)
             text += f'[[cameras]]\nname = "{name}"\nsource = "{address}"\ncalibration = "{file}"\n'
         served.rig.write_text(text, encoding="utf-8")
         yield served
@@ -125,7 +125,8 @@ def _listened_at(port: int) -> bool:
         return False
 
 
-def _write_lens(path: Path, lens: Any) -> str:
+def write_lens(path: Path, lens: Any) -> str:
+    """Write the intrinsics of a camera as a file of OpenCV; return its name."""
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     file.write("camera_matrix", np.ascontiguousarray(lens.K))
     file.write("distortion_coefficients", np.ascontiguousarray(lens.D))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from math import hypot
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,8 @@ _BEFORE_NS, _FEWEST_BEFORE = 3 * NS_PER_S, 5
 # difference also changes with the place of the robot: at most so many m per m.
 _LEAST_MARKER_M, _LEAST_OVERLAP_M, _SPREADS = 0.002, 0.015, 6.0
 _OVERLAP_SLOPE = 0.02
+# Values within such an extent cannot have changed by _LEAST_OVERLAP_M, also with rounding.
+_CALM_M = 0.99 * _LEAST_OVERLAP_M
 # A motion must last so long. Meanwhile the other cameras send their frames.
 _CONFIRMED_NS = NS_PER_S // 5
 # A camera without a reference marker for so long counts as one without reference markers.
@@ -56,6 +59,8 @@ class _History:
     fewest: int
     rows: deque[tuple[int, Array]] = field(default_factory=deque)
     changed_ns: int | None = None
+    # Bounds of x and y of all rows: low x, high x, low y, high y. They can be too wide.
+    bounds: tuple[float, float, float, float] | None = None
 
     def add(self, time_ns: int, value: Array) -> None:
         if self.rows and time_ns <= self.rows[-1][0]:
@@ -76,6 +81,19 @@ class _History:
         spread = 1.5 * np.median(np.abs(before - middle), axis=0)
         return np.median(recent, axis=0) - middle, spread
 
+    def is_within(self, extent: float) -> bool:
+        """Return whether the first two values of all rows lie within an extent.
+
+        Medians take ten times as long, and a hall has thousands of differences per second.
+        """
+        x, y = self.rows[-1][1][:2].tolist()
+        low_x, high_x, low_y, high_y = self.bounds or (x, x, y, y)
+        self.bounds = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
+        if not _is_short(self.bounds, extent):
+            xs, ys = zip(*(value[:2].tolist() for _, value in self.rows), strict=True)
+            self.bounds = min(xs), max(xs), min(ys), max(ys)
+        return _is_short(self.bounds, extent)
+
     def note(self, is_changed: bool) -> bool:
         """Note whether the value is changed now; return whether it has been for long enough."""
         newest_ns = self.rows[-1][0]
@@ -88,6 +106,11 @@ class _History:
     def restart(self) -> None:
         self.rows.clear()
         self.changed_ns = None
+
+
+def _is_short(bounds: tuple[float, float, float, float], extent: float) -> bool:
+    low_x, high_x, low_y, high_y = bounds
+    return hypot(high_x - low_x, high_y - low_y) <= extent
 
 
 class KnockMonitor:
@@ -177,7 +200,7 @@ class KnockMonitor:
             for camera in pair
             if now_ns - self._watched_ns.get(camera, -_UNWATCHED_NS) >= _UNWATCHED_NS
         ]
-        change = history.change() if suspects else None
+        change = history.change() if suspects and not history.is_within(_CALM_M) else None
         size_m = 0.0 if change is None else float(np.linalg.norm(change[0][:2]))
         if not history.note(change is not None and size_m > _overlap_limit_m(*change)):
             return

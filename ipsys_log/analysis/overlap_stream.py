@@ -16,8 +16,10 @@ from ipsys_log.units import MM_PER_M
 __all__ = ["Difference", "OverlapStream", "OverlapSummary"]
 
 # Number of the last differences of a pair that a summary uses.
-_REMEMBERED = 20_000
+_REMEMBERED = 5_000
 _FEWEST = 10
+# A display has room for so many pairs. A hall of 24 cameras has dozens.
+_MOST_LINES = 6
 
 
 class Difference(NamedTuple):
@@ -48,7 +50,8 @@ class OverlapStream:
 
     def __init__(self, rig: Rig | None = None) -> None:
         self._rig, self._run = rig, ""
-        self._last: dict[tuple[int, str], tuple[int, Position]] = {}
+        # By marker, the last sighting of each camera: a hall has many cameras, and few see the same marker.
+        self._last: dict[int, dict[str, tuple[int, Position]]] = {}
 
     def __call__(self, message: Message) -> Iterator[Difference]:
         """Yield the differences that a message completes."""
@@ -62,22 +65,25 @@ class OverlapStream:
             is_reference = self._rig is not None and self._rig.is_reference(position.id)
             if position.inside is not False and not is_reference:
                 time_ns = message.payload.timestamp + (position.time_offset_ns or 0)
-                yield from self._compare(camera, time_ns, position)
-                self._last[position.id, camera] = time_ns, position
+                sightings = self._last.setdefault(position.id, {})
+                yield from self._compare(sightings, camera, time_ns, position)
+                sightings[camera] = time_ns, position
 
-    def _compare(self, camera: str, time_ns: int, position: Position) -> Iterator[Difference]:
-        before = self._last.get((position.id, camera))
+    def _compare(
+        self, sightings: dict[str, tuple[int, Position]], camera: str, time_ns: int, position: Position
+    ) -> Iterator[Difference]:
+        before = sightings.get(camera)
         if before is None or not 0 < time_ns - before[0] <= LONGEST_GAP_NS:
             return
-        for (marker_id, other), (other_ns, seen) in self._last.items():
-            if marker_id != position.id or other == camera or not before[0] <= other_ns < time_ns:
+        for other, (other_ns, seen) in sightings.items():
+            if other == camera or not before[0] <= other_ns < time_ns:
                 continue
             share = (other_ns - before[0]) / (time_ns - before[0])
             x_m = (1 - share) * before[1].x_m + share * position.x_m - seen.x_m
             y_m = (1 - share) * before[1].y_m + share * position.y_m - seen.y_m
             sign = 1.0 if camera < other else -1.0
             pair = min(camera, other), max(camera, other)
-            yield Difference(pair, marker_id, other_ns, sign * x_m, sign * y_m, seen.x_m, seen.y_m)
+            yield Difference(pair, position.id, other_ns, sign * x_m, sign * y_m, seen.x_m, seen.y_m)
 
 
 class OverlapSummary:
@@ -96,11 +102,18 @@ class OverlapSummary:
             lengths_m.append(float(np.hypot(difference.x_m, difference.y_m)))
 
     def lines(self) -> list[str]:
-        """Return one line for each pair of cameras."""
+        """Return one line for each pair of cameras; of many pairs, only those that differ most."""
+        pairs = {
+            pair: (np.percentile(lengths_m, [50, 95]) * MM_PER_M).tolist()
+            for pair, lengths_m in sorted(self._lengths_m.items())
+            if len(lengths_m) >= _FEWEST
+        }
+        shown = sorted(sorted(pairs, key=lambda pair: -pairs[pair][0])[:_MOST_LINES])
         lines = []
-        for (first, second), lengths_m in sorted(self._lengths_m.items()):
-            if len(lengths_m) >= _FEWEST:
-                median_mm, p95_mm = (np.percentile(lengths_m, [50, 95]) * MM_PER_M).tolist()
-                figures = f"{median_mm:.1f} mm (median), {p95_mm:.1f} mm (p95)"
-                lines.append(f"positions of cameras {first} and {second} differ by {figures}")
+        for first, second in shown:
+            median_mm, p95_mm = pairs[first, second]
+            figures = f"{median_mm:.1f} mm (median), {p95_mm:.1f} mm (p95)"
+            lines.append(f"positions of cameras {first} and {second} differ by {figures}")
+        if len(pairs) > len(shown):
+            lines.append(f"the other {len(pairs) - len(shown)} pairs of cameras differ less")
         return lines

@@ -56,8 +56,10 @@ class Waiting:
         if isinstance(message.payload, CompressedVideo):
             return self._put_video(message)
         self._frames.append(message)
+        if not isinstance(message.payload, CompressedImage):
+            return []
         mine = self._of(message.camera)
-        if not isinstance(message.payload, CompressedImage) or len(mine) <= _SEARCHED:
+        if len(mine) <= _SEARCHED:
             return []
         self._frames.remove(mine[0])
         return [mine[0]]

@@ -222,7 +222,8 @@ class CameraReader:
         state.missed += frame.missed
         topic, payload = self._payload(frame, time_ns)
         self._note_size(frame, payload)
-        if not self._shared.put(Arrival(now_ns, topic, time_ns, payload, camera.name)):
+        received_ns = now_ns if frame.received_ns is None else frame.received_ns
+        if not self._shared.put(Arrival(received_ns, topic, time_ns, payload, camera.name)):
             state.dropped += 1
             return
         state.frames += 1

@@ -39,8 +39,9 @@ class Frame(NamedTuple):
 
     ``format`` is jpeg, png, h264 or h265; or markers, if a node has detected them and sends no image.
     ``time_ns`` is the driver's stamp in UTC; None without a stamp. ``missed`` is the number of frames lost
-    directly before this frame, by the count of the driver. A frame of a node has the session of the node, and
-    its number in it.
+    directly before this frame, by the count of the driver. ``received_ns`` is the arrival of a frame that
+    has waited in a queue of the source; None for other frames. A frame of a node has the session of the node,
+    and its number in it.
     """
 
     data: bytes
@@ -49,6 +50,7 @@ class Frame(NamedTuple):
     missed: int = 0
     session: str | None = None
     number: int | None = None
+    received_ns: int | None = None
 
 
 class SourceMessage(NamedTuple):

@@ -69,6 +69,8 @@ class LogWriter:
         self._images = ChunkBuilder(IMAGES, compress=False)
         self._small = ChunkBuilder(limits, compress=True)
         self._channels: dict[str, tuple[int, ChunkBuilder]] = {}
+        # The last declaration of each topic: a search of all channels for each message takes too long.
+        self._declared: dict[str, tuple[Schema | None, str]] = {}
         self._hashes: dict[str, ChannelHash] = {}
         self._stored: dict[str, ChannelHash] = {}
         self._open = True
@@ -197,6 +199,8 @@ class LogWriter:
             The log has this topic with a schema of another name, or another encoding.
         """
         self._check_open()
+        if self._declared.get(topic) == (schema, message_encoding):
+            return
         self._check_kind(topic, schema, message_encoding)
         schema_id = self._schema_id(schema) if schema else 0
         for channel in self._contents.channels.values():
@@ -214,6 +218,7 @@ class LogWriter:
             self._contents.channels[channel.id] = channel
         image = schema is not None and schema.name in IMAGE_SCHEMAS
         self._channels[topic] = (channel.id, self._images if image else self._small)
+        self._declared[topic] = schema, message_encoding
 
     def adopt_channel(
         self, channel: mcap.Channel, schema: mcap.Schema | None, is_distinct: bool = False
@@ -249,6 +254,7 @@ class LogWriter:
             self._contents.channels[same.id] = same
         image = own is not None and own.name in IMAGE_SCHEMAS
         self._channels[channel.topic] = (same.id, self._images if image else self._small)
+        self._declared.pop(channel.topic, None)
         return same.id
 
     def copy_chunk(

@@ -17,6 +17,7 @@ from ipsys_log.analysis.coverage import FloorCoverage
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.report.alignment import AlignedLab
+from ipsys_log.report.camera_labels import legend_label, name_cameras
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_figure import draw_ground
@@ -93,9 +94,11 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: FloorCoverage) -> None:
             np.concatenate([[v[0] - half_m], v, [v[-1] + half_m]]) for v in (coverage.xs_m, coverage.ys_m)
         ]
         axes.contour(*around_m, seen, levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
-        axes.plot(
-            *mounted.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(mounted.camera)
-        )
+        label = legend_label(shorten(mounted.camera), len(styles))
+        axes.plot(*mounted.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=label)
+    beside_m = 0.03 * float(np.ptp(axes.get_ylim()))
+    places_m = {one.camera: np.array(one.foot_m) - [0.0, beside_m] for one in lab.mounted_cameras}
+    name_cameras(axes, places_m, {name: colour for name, (colour, _) in styles.items()})
     for overlap in coverage.overlaps:
         good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M
         text = f"overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from dataclasses import asdict
+from statistics import fmean, median
 from typing import Any
 
 from rich.table import Table
@@ -71,6 +73,10 @@ def intervals_table(found: list[dict[str, Any]]) -> Table:
     return table
 
 
+# More cameras than these share one row, and more pairs of cameras than these are not shown.
+_MOST_CAMERAS, _MOST_PAIRS = 6, 10
+# A camera with a smaller share of the usual number of messages has its own row.
+_USUAL_SHARE = 0.95
 # Messages of several cameras have no regular interval. On their channels, a gap is longer than this time.
 _MERGED_GAP_S = 0.5
 # Schemas with one message per frame; the other channels have no rate.
@@ -222,10 +228,14 @@ def _overlap_table(rows: list[dict[str, Any]]) -> Table:
     """Return a table of the difference of positions of the same robot and instant, by two cameras."""
     numbers = ("count", "median mm", "p95 mm", "in 95 % region")
     table = _table(f"Disagreement of cameras, run {rows[0]['run']}", "cameras", *numbers, right=numbers)
-    for row in rows:
+    largest = sorted(rows, key=lambda row: -float(row["median_m"]))[:_MOST_PAIRS]
+    for row in (row for row in rows if row in largest):
         within = "-" if row["within_95"] is None else f"{100 * row['within_95']:.0f} %"
         lengths_mm = (f"{row[key] * MM_PER_M:.1f}" for key in ("median_m", "p95_m"))
         table.add_row(" and ".join(row["cameras"]), str(row["count"]), *lengths_mm, within)
+    if len(rows) > len(largest):
+        table.caption = f"The other {len(rows) - len(largest)} pairs differ less. All pairs: --json"
+        table.caption_justify = "left"
     return table
 
 
@@ -237,7 +247,8 @@ def _channels_table(found: dict[str, Any]) -> Table:
         column.no_wrap = True
     table.columns[4].overflow = "ellipsis"
     run = ""
-    for topic, row in found["channels"].items():
+    channels = _grouped(found["channels"])
+    for topic, row in channels.items():
         within, _, rest = topic.removeprefix("/runs/").partition("/")
         if topic.startswith("/runs/") and rest:
             if within != run:
@@ -246,8 +257,46 @@ def _channels_table(found: dict[str, Any]) -> Table:
             topic = f"  {rest}"  # noqa: PLW2901
         gaps = f"{row['gaps']} ({row['longest_gap_s']:.1f} s)" if row["gaps"] else ""
         schema = re.split(r"[./]", row["schema"] or "-")[-1]
-        table.add_row(topic, str(row["messages"]), _rate(row), gaps, schema)
+        table.add_row(topic, row.get("count") or str(row["messages"]), _rate(row), gaps, schema)
+    if len(channels) < len(found["channels"]):
+        table.caption = "*: all cameras, with their mean rate and the sum of gaps; each one: --json"
+        table.caption_justify = "left"
     return table
+
+
+def _grouped(channels: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the channels with one row for equal channels of many cameras; ``count`` is its text."""
+    groups: dict[str, dict[str, dict[str, Any]]] = defaultdict(dict)
+    for topic, row in channels.items():
+        camera = camera_of_topic(topic)
+        name = topic if camera is None else topic.replace(f"/cameras/{camera}/", "/cameras/*/")
+        groups[name][topic] = row
+    rows: dict[str, dict[str, Any]] = {}
+    for name, group in groups.items():
+        if len(group) <= _MOST_CAMERAS:
+            rows |= group
+        else:
+            rows[name] = _together(group)
+            rows |= {topic: row for topic, row in group.items() if _is_unusual(row, group)}
+    return rows
+
+
+def _together(group: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    counts = [int(row["messages"]) for row in group.values()]
+    rates_hz = [row["rate_hz"] for row in group.values() if row["rate_hz"] is not None]
+    low, high = min(counts), max(counts)
+    return {
+        "schema": next(iter(group.values()))["schema"],
+        "count": f"{len(group)} x {low}" if low == high else f"{len(group)} x {low}-{high}",
+        "rate_hz": fmean(rates_hz) if rates_hz else None,
+        "gaps": sum(row["gaps"] for row in group.values()),
+        "longest_gap_s": max((row["longest_gap_s"] or 0.0 for row in group.values()), default=0.0),
+    }
+
+
+def _is_unusual(row: dict[str, Any], group: dict[str, dict[str, Any]]) -> bool:
+    usual, usual_gaps = (median(other[key] for other in group.values()) for key in ("messages", "gaps"))
+    return bool(row["messages"] < _USUAL_SHARE * usual or row["gaps"] > usual_gaps)
 
 
 def _rate(channel: dict[str, Any]) -> str:

@@ -22,6 +22,8 @@ from ipsys_log.units import MM_PER_M, NS_PER_S
 __all__ = ["draw_drift"]
 
 _NORMAL_95 = 1.96
+# Rows of the legend; further cameras are in further columns.
+_ROWS = 8
 
 
 def draw_drift(reading: DriftReading, path: Path) -> None:
@@ -54,7 +56,8 @@ def draw_drift(reading: DriftReading, path: Path) -> None:
         f"Drift of the cameras since {shorten(reading.names[0])}; bands: 95 %", loc="left", fontsize=11
     )
     style_axes(axes)
-    axes.legend(loc="upper left", fontsize=9, frameon=False)
+    columns = -(-len(drift.baselines) // _ROWS)
+    axes.legend(loc="upper left", fontsize=9 if columns == 1 else 7, ncols=columns, frameon=False)
     write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 

@@ -31,6 +31,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.camera_labels import legend_label, name_cameras
 from ipsys_log.report.errors_figure import count_rows, draw_errors
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
@@ -204,12 +205,22 @@ def _draw_errors(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, s
     residuals = [residual for row in rows for residual in row.residuals]
     span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
     factor = arrow_factor([r.predicted_m - r.world_m for r in residuals], span_m)
+    middles_m: dict[str, NDArray[np.float64]] = {}
     for row in rows:
         colour, shape = styles[row.camera]
         start_m = np.array([residual.world_m[:2] for residual in row.residuals])
         error_m = np.array([residual.predicted_m[:2] for residual in row.residuals]) - start_m
-        axes.plot(*start_m.T, shape, color=colour, ms=4.5, zorder=4, label=f"held out, {row.camera}")
+        axes.plot(
+            *start_m.T,
+            shape,
+            color=colour,
+            ms=4.5,
+            zorder=4,
+            label=legend_label(f"held out, {row.camera}", len(rows)),
+        )
         arrows = draw_arrows(axes, start_m, error_m, factor, color=colour)
+        middles_m[row.camera] = start_m.mean(axis=0)
+    name_cameras(axes, middles_m, {camera: colour for camera, (colour, _) in styles.items()})
     draw_key(axes, arrows, factor)
     times = f", arrows {factor} times true length" if factor > 1 else ""
     return f"Errors of {scene.evaluation.model} at held-out points{times}"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 from ipsys_log.messages import Rig
+from ipsys_log.report.camera_labels import has_legend, name_cameras
 from ipsys_log.report.figures import style_axes
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
@@ -43,7 +44,8 @@ def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure
     beside.set_xlim(above.get_ylim() if axis else above.get_xlim())
     for axes in (above, beside):
         axes.tick_params(labelsize=8)
-    figure.legend(loc="outside lower center", frameon=False, fontsize=8)
+    if has_legend(len(cameras)):
+        figure.legend(loc="outside lower center", frameon=False, fontsize=8)
     return figure
 
 
@@ -58,6 +60,9 @@ def _draw_above(axes: Axes, cameras: Sequence[CalibratedCamera], rig: Rig | None
         x_m, y_m, _ = camera.origin_m.tolist()
         axes.plot(x_m, y_m, shape, color=colour, ms=8, label=_pose_label(camera), zorder=4)
         _draw_axis(axes, camera, colour)
+    beside_m = 0.03 * float(np.ptp(axes.get_ylim()))
+    places_m = {camera.camera: camera.origin_m[:2] - [0.0, beside_m] for camera in cameras}
+    name_cameras(axes, places_m, {name: colour for name, (colour, _) in styles.items()})
     axes.set_title("From above", loc="left", fontsize=10)
 
 

@@ -19,6 +19,8 @@ from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 __all__ = ["overlap_pictures"]
 
 _CELL_M = 0.25
+# Lines of more pairs cannot be told apart.
+_MOST_PAIRS = 6
 
 
 def overlap_pictures(pairs: Sequence[PairDisagreement], rig: Rig | None) -> list[dict[str, Any]]:
@@ -49,7 +51,9 @@ def _floor_picture(pairs: Sequence[PairDisagreement], rig: Rig | None) -> dict[s
 def _time_picture(pairs: Sequence[PairDisagreement]) -> dict[str, Any]:
     figure, axes = new_figure(2.8)
     start_ns = min(int(pair.times_ns[0]) for pair in pairs)
-    for number, pair in enumerate(pairs):
+    worst = sorted(pairs, key=lambda pair: -pair.median_m)[:_MOST_PAIRS]
+    shown = [pair for pair in pairs if any(pair is one for one in worst)]
+    for number, pair in enumerate(shown):
         intervals = divide_time(pair)
         times_s = np.array([one.time_ns - start_ns for one in intervals]) / NS_PER_S
         medians_mm = np.array([one.median_m for one in intervals]) * MM_PER_M
@@ -60,4 +64,10 @@ def _time_picture(pairs: Sequence[PairDisagreement]) -> dict[str, Any]:
     axes.set(xlabel="time in s", ylabel="difference in mm", ylim=(0, None))
     style_axes(axes)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    return picture(figure, "Disagreement of the cameras over time: median (line) and 95 % limit (dashed)")
+    few = (
+        f". Of {len(pairs)} pairs, the {len(shown)} with the largest medians"
+        if len(shown) < len(pairs)
+        else ""
+    )
+    text = "Disagreement of the cameras over time: median (line) and 95 % limit (dashed)"
+    return picture(figure, text + few)

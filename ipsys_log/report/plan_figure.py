@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ipsys_log.analysis.drive_plan import PlannedDrive
+from ipsys_log.report.camera_labels import legend_label, name_cameras
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE, REST, camera_styles
@@ -98,10 +99,14 @@ def _drive_area(drive: PlannedDrive) -> Rectangle:
 def _draw_views(axes: Axes, found: PlannedFloor, shape: tuple[int, int], half_m: float) -> None:
     """Draw the outline of each camera's field of view, smoothed to hide the steps of the cells."""
     around_m = [np.array([m[0] - 2 * half_m, *m, m[-1] + 2 * half_m]) for m in (found.xs_m, found.ys_m)]
-    for camera, (colour, _) in camera_styles(found.plan.seen).items():
+    styles = camera_styles(found.plan.seen)
+    places_m = mesh(found.xs_m, found.ys_m, [0.0])[:, :2]
+    middles_m = {name: places_m[seen].mean(axis=0) for name, seen in found.plan.seen.items() if seen.any()}
+    name_cameras(axes, middles_m, {name: colour for name, (colour, _) in styles.items()})
+    for camera, (colour, _) in styles.items():
         seen = gaussian_filter(found.plan.seen[camera].reshape(shape).astype(float), 2.0, mode="nearest")
         axes.contour(*around_m, np.pad(seen, 1), levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
-        axes.plot([], [], color=colour, lw=1.8, label=f"seen by {camera}")
+        axes.plot([], [], color=colour, lw=1.8, label=legend_label(f"seen by {camera}", len(styles)))
 
 
 def _draw_rings(axes: Axes, found: PlannedFloor, width_m: float) -> None:

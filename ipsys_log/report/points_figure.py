@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from ipsys_log.report.camera_labels import has_legend, legend_label, name_cameras
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, TEST, camera_styles, shorten
@@ -83,11 +84,13 @@ def hull_m(points_m: Array) -> Array | None:
 
 def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
     """Draw the convex hull of the fitted points of each camera on the floor."""
-    styles = camera_styles(findings.cameras)
-    for camera, points_m in findings.training_m().items():
+    styles, training_m = camera_styles(findings.cameras), findings.training_m()
+    middles_m, colours = {}, {}
+    for camera, points_m in training_m.items():
         corners_m = hull_m(points_m)
         if corners_m is not None:
             colour, _ = styles.get(camera, (NOTE, "o"))
+            middles_m[camera], colours[camera] = corners_m.mean(axis=0), colour
             if fill:
                 axes.add_patch(Polygon(corners_m, fc="white", ec="none", zorder=1.5))
             axes.add_patch(
@@ -98,9 +101,10 @@ def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
                     lw=1.3,
                     ls="--",
                     zorder=2.2,
-                    label=f"camera {shorten(camera)}",
+                    label=legend_label(f"camera {shorten(camera)}", len(training_m)),
                 )
             )
+    name_cameras(axes, middles_m, colours)
 
 
 def draw_coverage(axes: Axes, findings: Findings) -> None:
@@ -116,4 +120,5 @@ def draw_coverage(axes: Axes, findings: Findings) -> None:
     for camera, points_m in training_m.items():
         colour, shape = styles.get(camera, (NOTE, "o"))
         axes.plot(*points_m[:, :2].T, shape, color=colour, ms=4, alpha=0.8, zorder=3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False, fontsize=9)
+    if has_legend(len(training_m)):
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False, fontsize=9)

@@ -22,6 +22,7 @@ __all__ = [
     "robot_colour",
     "robot_line",
     "shorten",
+    "to_rgb",
 ]
 
 _LONGEST = 24
@@ -41,6 +42,9 @@ _MODELS = {
     "best": ("#000000", "X"),
     "joint": ("#882255", "*"),
 }
+
+# Lightness, in OKLab, of colours that are visible on white paper.
+_ON_PAPER = (0.35, 0.75)
 
 # Colours for the less important parts of a figure.
 REST = "#B5B5B5"
@@ -64,8 +68,24 @@ class ModelStyle(NamedTuple):
 
 def camera_styles(cameras: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Return colour and marker shape of each camera, independent of the order of the names."""
-    colours = assign_colours(cameras, _NAMED, _COLOURS)
-    return {camera: (colours[camera], _SHAPES[n % len(_SHAPES)]) for n, camera in enumerate(sorted(colours))}
+    named = {name: to_rgb(colour) for name, colour in _NAMED.items()}
+    colours = assign_colours(cameras, named, [to_rgb(colour) for colour in _COLOURS], _ON_PAPER)
+    return {
+        camera: ("#{:02X}{:02X}{:02X}".format(*colours[camera]), _SHAPES[n % len(_SHAPES)])
+        for n, camera in enumerate(sorted(colours))
+    }
+
+
+def to_rgb(colour: str) -> tuple[int, int, int]:
+    """Return red, green and blue of a colour, 0 to 255.
+
+    Examples
+    --------
+    >>> to_rgb("#0072B2")
+    (0, 114, 178)
+    """
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
 
 
 def model_styles(models: Iterable[str]) -> dict[str, ModelStyle]:

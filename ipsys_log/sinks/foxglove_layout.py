@@ -7,6 +7,7 @@ errors from the messages of the log.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,6 +24,8 @@ Panel = dict[str, Any]
 # More lines in one plot cannot be told apart.
 _MOST_ROBOTS = 8
 _DIVISIONS = 10
+# Images in one column, and columns of images per row of more images.
+_MOST_ROWS, _TILES_ACROSS = 6, 0.7
 _LATENCY = "/foxglove_script/latency"
 _ERROR = "/foxglove_script/position_error"
 
@@ -81,7 +84,7 @@ def make_layout(session: Session, runs: Sequence[str] = ()) -> dict[str, Any]:
         "globalVariables": {},
         "userNodes": scripts,
         "playbackConfig": {"speed": 1},
-        "layout": _join("row", _split("column", list(images)), right, 40) if images else right,
+        "layout": _join("row", _grid(list(images)), right, 40) if images else right,
     }
 
 
@@ -143,7 +146,10 @@ def _plots(
         plots["Plot!error"] = _plot("Position error, mm", paths)
     if session.topics(LATENCY):
         scripts["latency"] = _script("latency", _LATENCY_SCRIPT, [LATENCY_TOPIC], _LATENCY)
-        paths = {camera: f'{_LATENCY}{{camera=="{camera}"}}.latency_ms' for camera in cameras}
+        shown = cameras if len(cameras) <= _MOST_ROBOTS else ()
+        paths = {camera: f'{_LATENCY}{{camera=="{camera}"}}.latency_ms' for camera in shown}
+        # The lines of more cameras cannot be told apart: one line has all of them.
+        paths = paths or {"all cameras": f"{_LATENCY}.latency_ms"}
         plots["Plot!latency"] = _plot("Latency, ms", paths)
     return plots, scripts
 
@@ -169,11 +175,18 @@ def _plot(title: str, values: Mapping[str, str]) -> Panel:
     }
 
 
-def _split(direction: str, ids: Sequence[str], first_share: float | None = None) -> Any:
+def _split(direction: str, ids: Sequence[Any], first_share: float | None = None) -> Any:
     """Return panels one after the other; the first one has its share in per cent, the others equal parts."""
     if len(ids) == 1:
         return ids[0]
     return _join(direction, ids[0], _split(direction, ids[1:]), first_share or 100 / len(ids))
+
+
+def _grid(ids: Sequence[str]) -> Any:
+    """Return panels as rows of one column, or of a few columns for many panels."""
+    columns = 1 if len(ids) <= _MOST_ROWS else math.ceil(math.sqrt(len(ids) * _TILES_ACROSS))
+    rows = [_split("row", ids[first : first + columns]) for first in range(0, len(ids), columns)]
+    return _split("column", rows)
 
 
 def _join(direction: str, first: Any, second: Any, share: float) -> dict[str, Any]:

@@ -21,6 +21,8 @@ _ROBOT_HEIGHT_M = 0.1
 _MARKER_M = 0.2
 # Standard deviation of a corner of detect: a weight of corners without noise.
 _USUAL_PX = 0.012
+# With more nodes of all cameras together, each camera has only the nodes in its view, with this factor.
+_MOST_NODES, _VIEW_MARGIN = 100_000, 1.2
 # Rays that are flatter than this (cosine with the vertical) do not belong to positions.
 _FLATTEST = 0.2
 
@@ -46,11 +48,15 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     usual_m = rig.marker_height_m if rig and rig.marker_height_m is not None else _ROBOT_HEIGHT_M
     height_m = float(np.median(known_m)) if known_m else usual_m
     sigma_m = _height_sigma(rig)
+    # In a small lab, each camera sees most nodes.
+    in_view = len(grid.points_m) * len(model.cameras) > _MOST_NODES
     if reads_corners(model.name):
-        nodes = {camera.camera: _joint_nodes(camera, grid, height_m, sigma_m) for camera in model.cameras}
+        nodes = {
+            camera.camera: _joint_nodes(camera, grid, height_m, sigma_m, in_view) for camera in model.cameras
+        }
     else:
         separate = {
-            camera.camera: _table_nodes(model.name, camera, grid, height_m, sigma_m)
+            camera.camera: _table_nodes(model.name, camera, grid, height_m, sigma_m, in_view)
             for camera in model.cameras
         }
         nodes = _side_by_side({name: node for name, node in separate.items() if node is not None})
@@ -88,10 +94,13 @@ def _below_cameras(model: Model) -> list[Array]:
     ]
 
 
-def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None) -> NodeModes:
+def _joint_nodes(
+    camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None, in_view: bool
+) -> NodeModes:
     """Return the modes of a joint model: those of level markers at the nodes, and the error of the height.
 
-    ``sigma_m`` is the standard deviation of the height; None for the usual one.
+    ``sigma_m`` is the standard deviation of the height; None for the usual one. ``in_view``: only
+    of the nodes in the view of the camera.
     """
     # Late: scipy takes 1 s.
     from ipsys_log.geometry.lenses import project
@@ -102,7 +111,12 @@ def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, sigma_m: floa
     from ipsys_log.joint.settings import JointSettings
 
     sigma_m = JointSettings().robot_height_sigma_m if sigma_m is None else sigma_m
-    model, flat_m = restore_joint(camera), grid.points_m
+    model, flat_m, rows = restore_joint(camera), grid.points_m, None
+    if in_view:
+        rays = (np.insert(flat_m, 2, height_m, axis=1) - model.origin_m) @ model.camera_from_world.T
+        # The principal point is near the middle of the image, whose size the model does not have.
+        rows = _rows_in_view(rays, model.lens[2:4] / model.lens[:2])
+        flat_m = flat_m[rows]
     count = len(flat_m)
     floor_m, _ = model.floor.heights(flat_m, model.amplitudes)
     centres_m = np.column_stack([flat_m, floor_m + height_m])
@@ -119,11 +133,22 @@ def _joint_nodes(camera: CameraModel, grid: Grid, height_m: float, sigma_m: floa
     modes_m[steep, :, :-1] = located.modes_m[steep]
     modes_m[steep, :, -1] = (higher.points_m - located.points_m)[steep]
     clock = len(model.lens) + 7
-    return NodeModes(modes_m, np.zeros((count, 3, 3)), np.append(model.modes[clock], 0.0))
+    return NodeModes(modes_m, np.zeros((count, 3, 3)), np.append(model.modes[clock], 0.0), rows)
+
+
+def _rows_in_view(points_c: Array, most: Array) -> NDArray[np.intp]:
+    """Return the rows of points (n, 3) in camera coordinates with x/z and y/z up to ``most`` (2,), or nearly.
+
+    The nearest point is always one of them.
+    """
+    ahead = points_c[:, 2] > 0
+    shares = np.abs(points_c[:, :2]) / np.where(ahead, points_c[:, 2], 1.0)[:, None] / (_VIEW_MARGIN * most)
+    largest = np.where(ahead, shares.max(axis=1), np.inf)
+    return np.flatnonzero(largest <= max(1.0, largest.min()))
 
 
 def _table_nodes(
-    name: str, camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None
+    name: str, camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None, in_view: bool
 ) -> NodeModes | None:
     """Return the modes of a model of the table, at the camera points of the nodes; None if it has none."""
     from ipsys_log.models.rigid import rigid_transform
@@ -133,8 +158,11 @@ def _table_nodes(
     world_m = np.array([pair.world_m for pair in camera.pairs])
     # The rigid transform is a few cm wrong: the sensitivities hardly change over that distance.
     rotation, origin_m = rigid_transform(world_m, fitted_m)
-    flat_m = grid.points_m
+    flat_m, rows = grid.points_m, None
     points_m = np.column_stack([flat_m, np.full(len(flat_m), height_m)]) @ rotation.T + origin_m
+    if in_view:
+        rows = _rows_in_view(points_m, np.abs(fitted_m[:, :2] / fitted_m[:, 2:]).max(axis=0))
+        flat_m, points_m = flat_m[rows], points_m[rows]
     steep = points_m[:, 2] > _FLATTEST * np.linalg.norm(points_m, axis=1)
     points_m[~steep] = fitted_m[0]
     sigmas_m = None if sigma_m is None else np.full(len(flat_m), sigma_m)
@@ -144,7 +172,7 @@ def _table_nodes(
     modes_m, rest_m2 = parts
     modes_m[~steep] = np.nan
     rest_m2[~steep] = np.nan
-    return NodeModes(modes_m, rest_m2, np.zeros(modes_m.shape[2]))
+    return NodeModes(modes_m, rest_m2, np.zeros(modes_m.shape[2]), rows)
 
 
 def _side_by_side(cameras: dict[str, NodeModes]) -> dict[str, NodeModes]:
@@ -153,8 +181,13 @@ def _side_by_side(cameras: dict[str, NodeModes]) -> dict[str, NodeModes]:
     ends = np.cumsum([0, *counts])
     joined = {}
     for number, (name, node) in enumerate(cameras.items()):
+        if node.rows is not None:
+            # The zeros of all other cameras of a hall need too much memory.
+            columns = np.append(np.arange(ends[number], ends[number + 1]), ends[-1])
+            joined[name] = NodeModes(node.modes_m, node.rest_m2, np.zeros(ends[-1] + 1), node.rows, columns)
+            continue
         modes_m = np.zeros((*node.modes_m.shape[:2], ends[-1] + 1))
         modes_m[:, :, ends[number] : ends[number + 1]] = node.modes_m[:, :, :-1]
         modes_m[:, :, -1] = node.modes_m[:, :, -1]
-        joined[name] = NodeModes(modes_m, node.rest_m2, np.zeros(ends[-1] + 1))
+        joined[name] = NodeModes(modes_m, node.rest_m2, np.zeros(ends[-1] + 1), node.rows)
     return joined

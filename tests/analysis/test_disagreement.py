@@ -149,6 +149,20 @@ def test_display_has_one_line_for_each_pair() -> None:
     assert summary.lines() == ["positions of cameras a and b differ by 3.2 mm (median), 3.2 mm (p95)"]
 
 
+def test_display_of_many_pairs_has_the_worst_ones() -> None:
+    """Camera k is wrong by k mm: the pairs with the last camera differ most."""
+    summary, cameras = OverlapSummary(), "abcdefgh"
+    for number in range(30):
+        for offset, camera in enumerate(cameras):
+            time_ns = number * STEP_NS + offset * 1_000_000
+            row = Positions(time_ns, (Position(1, offset / 1000, 0.0, 0.1),))
+            topic = f"/runs/poly/cameras/{camera}/positions"
+            summary(Message(topic, time_ns, time_ns, row, camera))
+    *lines, rest = summary.lines()
+    assert [line.split()[3] + line.split()[5] for line in lines] == ["af", "ag", "ah", "bg", "bh", "ch"]
+    assert rest == "the other 22 pairs of cameras differ less"
+
+
 def test_info_shows_the_disagreement(log: Path, ipsys: Ipsys) -> None:
     shown = ipsys("info", log)
     assert (shown.code, shown.err) == (0, "")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ipsys_log.analysis import knocks
 from ipsys_log.analysis.floor_cameras import FloorCamera, move_camera, shift_floor_map
 from ipsys_log.analysis.knocks import Knock, KnockMonitor
 from ipsys_log.geometry.lenses import in_image, project
@@ -131,6 +132,22 @@ def test_overlap_names_a_knocked_camera_without_references() -> None:
     first, *_ = warnings(positions(turned, 30.0), Rig("lab", "DICT_4X4_100", LENGTH_M))
     assert AT_S < first.time_ns / NS_PER_S < AT_S + 1.0
     assert "white" in first.text
+
+
+@pytest.mark.parametrize("bias_m", [0.0, 0.006, 0.020])
+@pytest.mark.parametrize("turn_rad", [0.0, 0.004, 0.0175])
+def test_extents_leave_out_no_warning(
+    bias_m: float, turn_rad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The extents of the differences only save time: all medians give the same warnings."""
+
+    def turned(camera: str, time_s: float) -> Array:
+        return np.array([0.0, turn_rad, 0, 0, 0, 0]) * (camera == "white" and time_s >= AT_S)
+
+    rig = Rig("lab", "DICT_4X4_100", LENGTH_M)
+    quick = warnings(positions(turned, 10.0, bias_m), rig)
+    monkeypatch.setattr(knocks._History, "is_within", lambda history, extent: False)
+    assert quick == warnings(positions(turned, 10.0, bias_m), rig)
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0])

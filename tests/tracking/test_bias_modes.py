@@ -16,6 +16,8 @@ from ipsys_log.joint.payload import joint_payload, restore_joint
 from ipsys_log.messages import Model, Pair, Rig, RigMarker
 from ipsys_log.models.table import AppliedModel
 from ipsys_log.stages.fit import fit_model
+from ipsys_log.tracking import bias_modes as modes_module
+from ipsys_log.tracking import calibration_modes as table_module
 from ipsys_log.tracking.bias_modes import LOCAL_M, BiasModes, Grid, NodeModes, reduce_modes
 from ipsys_log.tracking.calibration_modes import calibration_modes
 from tests.joint.small_lab import LENGTH_M, make_lab
@@ -101,6 +103,17 @@ def rig_with(height_sigma_m: float | None) -> Rig:
     )
 
 
+@pytest.fixture(params=["lab", "hall"])
+def size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Let a small lab count as a hall, whose cameras have nodes in their views only."""
+    if request.param == "hall":
+        monkeypatch.setattr(table_module, "_MOST_NODES", 0)
+        monkeypatch.setattr(modes_module, "_MOST_NUMBERS", 100)
+        monkeypatch.setattr(modes_module, "_NODES_AT_ONCE", 7)
+    return str(request.param)
+
+
+@pytest.mark.usefixtures("size")
 @pytest.mark.parametrize("sigma_m", [None, 0.0001, 0.004])
 def test_joint_modes_are_the_covariance_of_located_markers(joint: Model, sigma_m: float | None) -> None:
     """The part of the calibration in the covariance of real sightings, against the table."""
@@ -134,6 +147,17 @@ def level_corners(model: JointModel, places_m: Array, headings_rad: Array) -> Ar
     return np.array(corners)
 
 
+def test_camera_of_a_hall_has_nodes_in_its_view_only(joint: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table continues outside of the view with the values of its edge."""
+    monkeypatch.setattr(table_module, "_MOST_NODES", 0)
+    monkeypatch.setattr(table_module, "_VIEW_MARGIN", 0.5)
+    modes, model = calibration_modes(joint, rig_with(None)), restore_joint(joint.cameras[0])
+    edges = [model.origin_m[:2] + np.array([reach_m, 0.0]) for reach_m in (1.6, 1.8)]
+    near, far = (modes.at(joint.cameras[0].camera, np.array([place_m]), np.zeros(1)) for place_m in edges)
+    np.testing.assert_array_equal(near[:, 0], far[:, 0])
+
+
+@pytest.mark.usefixtures("size")
 @pytest.mark.parametrize(
     ("name", "sigma_m"), [("poly", None), ("best", None), ("rayplane", None), ("rayplane", 0.004)]
 )

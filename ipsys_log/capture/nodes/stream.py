@@ -163,7 +163,7 @@ class NodeStream:
         number = header.number
         if header.session != self._session or not (number in self._missing or number >= self._expected):
             return
-        frame = self._frame(header, data)
+        frame = self._frame(header, data, now_ns)
         # A recording that begins in the middle of a video begins with a keyframe.
         if self._next is None and self._first > 0 and not is_decodable_start(frame):
             self._first = number + 1
@@ -248,13 +248,20 @@ class NodeStream:
         self._history, self._counts, self._rival = ClockHistory(), deque(), None
         self._missing, self._gap_count = {}, 0
 
-    def _frame(self, header: FrameHeader, data: bytes) -> Frame:
+    def _frame(self, header: FrameHeader, data: bytes, now_ns: int) -> Frame:
         time_ns = self._history.to_centre_ns(header.time_ns)
         if time_ns is not None:
             # The node has given the middle of the exposure. The reader of the camera adds this distance
             # again.
             time_ns -= mid_exposure_ns(0, self._camera)
-        return Frame(data, header.format, time_ns, session=header.session, number=header.number)
+        return Frame(
+            data,
+            header.format,
+            time_ns,
+            received_ns=now_ns,
+            session=header.session,
+            number=header.number,
+        )
 
     def _is_plausible(self, frame: Frame, now_ns: int) -> bool:
         return frame.time_ns is not None and _YOUNGEST_NS <= now_ns - frame.time_ns <= _OLDEST_NS

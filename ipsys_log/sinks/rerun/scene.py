@@ -31,6 +31,8 @@ _LEGEND = """\
 | green outline in an image | corners of a detected marker, with its id |
 """
 
+# Columns of tiles per row of a large grid of cameras, which is as wide as two fifths of the window.
+_TILES_ACROSS = 0.7
 _GRID_M = 0.5
 _MOST_LINES = 100
 _TRAIL_S = 15.0
@@ -118,8 +120,9 @@ def layout(
     right.append(rrb.Tabs(*lists))
     floor = rrb.Vertical(*right, row_shares=[5, *[1.2] * len(plots or {}), 1.2])
     views = [rrb.Spatial2DView(origin=f"/cameras/{camera}", name=camera) for camera in cameras]
-    # Frames are wide: up to three of them fit best in one column, beside a square floor.
-    columns = 1 if len(views) <= 3 else 2
+    # Frames are wide: up to three of them fit best in one column, beside a square floor. The tiles of a hall
+    # keep the shape of a frame: there are more rows than columns.
+    columns = 1 if len(views) <= 3 else max(2, math.floor(math.sqrt(len(views) * _TILES_ACROSS)))
     whole = (
         rrb.Horizontal(rrb.Grid(*views, grid_columns=columns), floor, column_shares=[2, 3])
         if views

@@ -3,6 +3,8 @@ import { element, make } from "./make.js";
 
 const PAD = { left: 34, right: 12, top: 12, bottom: 40 };
 const TRAIL_MS = 10000, STALE_MS = 500;
+// A legend of more cameras is longer than the map: their names are on the map instead.
+const MOST_IN_LEGEND = 6;
 const STEPS_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 
 export class FloorMap {
@@ -62,6 +64,13 @@ export class FloorMap {
       inside.append(element("polygon", { points: path(view.outline), class: "view-area", fill: view.colour }),
         element("polygon", { points: path(view.outline), class: "view-halo" }),
         element("polygon", { points: path(view.outline), class: "view", stroke: view.colour }));
+    }
+    if (this.floor.views.length > MOST_IN_LEGEND) {
+      for (const view of this.floor.views) {
+        const middle = (axis) => view.outline.reduce((sum, point) => sum + point[axis], 0) / view.outline.length;
+        const [x, y] = at(middle(0), middle(1));
+        inside.append(element("text", { x, y: y + 4, class: "camera middle" }, view.camera));
+      }
     }
     parts.push(inside);
     for (const point of this.floor.references) {
@@ -135,7 +144,9 @@ export class FloorMap {
       const halo = element("line", { x1: 0, x2: 22, y1: 6, y2: 6, class: "view-halo" });
       return element("svg", { width: 22, height: 12, "aria-hidden": "true" }, ...(kind === "view" ? [halo, line] : [line]));
     };
-    const rows = this.floor.views.map((view) => [swatch("view", view.colour), `view of ${view.camera}`]);
+    const views = this.floor.views, few = views.length <= MOST_IN_LEGEND ? views : [];
+    const rows = few.map((view) => [swatch("view", view.colour), `view of ${view.camera}`]);
+    if (views.length > few.length) rows.push([swatch("view", "currentColor"), "view of a camera, with its name"]);
     if (this.floor.measured.length) rows.push([swatch("measured-edge"), "calibrated area"]);
     legend.replaceChildren(...rows.map((row) => make("li", {}, ...row)));
   }

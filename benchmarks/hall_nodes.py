@@ -1,0 +1,291 @@
+"""A hall at its centre: markers of 24 nodes at 30/s, over sessions of Zenoh on loopback.
+
+    python benchmarks/hall_nodes.py --hall-seconds 30 --cameras 6x4
+
+The markers of twelve robots come from exact geometry, with the noise of ``detect``. No image is rendered.
+Nodes play them in real time, several in one process; ``ipsys live`` runs as for a user, in a process of its
+own. The first seconds are not counted. The latency is the time from the arrival of the markers at the
+centre, in the thread of Zenoh, to the published position. The processor time is that of the whole process of
+the centre. All programs share the cores of this machine, so another program increases the latency. The steps
+are processor times of a message, in one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from results import Report, command
+from rounds import Row
+from stream_server import free_ports, write_lens
+
+from ipsys_log import pipeline
+from ipsys_log.analysis.latency import recorded_latencies, step_times_s
+from ipsys_log.capture.camera_thread import NODES_RUN
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import FRAME_SKIPPED, Latency, RigNodes, Tracks
+from ipsys_log.messages.channels import EVENTS, MARKERS, TRACKS
+from ipsys_log.rig.file import rig_toml
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.hall import hall_settings, parse_grid
+
+__all__ = ["measure"]
+
+_ROBOTS, _RATE_HZ = 12, 30.0
+# Taped points for each camera: the models of the table need their own.
+_POINTS = 10
+_PER_PROCESS = 6
+# The time between the start signal and the first frame, and the time before the measurement begins.
+_AHEAD_S, _WARM_S = 1.0, 5.0
+_NS_PER_S, _MS = 1_000_000_000, 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Hall:
+    """The files of a hall: the log with the model, the log with the markers, and the cameras."""
+
+    calibrated: Path
+    played: Path
+    cameras: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Usage:
+    """Processor time in s, and largest memory in MB, of a process so far; ``time_s`` is the time of day."""
+
+    time_s: float
+    cpu_s: float
+    memory_mb: float
+
+    @classmethod
+    def of(cls, pid: int) -> _Usage:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        status = Path(f"/proc/{pid}/status").read_text().splitlines()
+        peak_kb = next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
+        ticks = int(fields[11]) + int(fields[12])
+        return cls(time.time(), ticks / os.sysconf("SC_CLK_TCK"), peak_kb / 1000)
+
+
+def make_hall(folder: Path, grid: str, seconds: float, model: str, in_step: bool) -> _Hall:
+    """Simulate a hall: its calibration, and the markers of a drive of the robots."""
+    size = parse_grid(grid)
+    still = hall_settings(*size, markers=_ROBOTS, rate_hz=_RATE_HZ, drive_s=0.0)
+    count = len(still.cameras)
+    calibrated, played = folder / "calibration.mcap", folder / "markers.mcap"
+    points = GeometricSettings(lab=still, points=_POINTS * count)
+    write_log(calibrated, simulate_session(build_lab(points)))
+    pipeline.replay([calibrated], Request(models=(model,)), "fit")
+    delays_s = (0.0,) if in_step else tuple(n / count / _RATE_HZ for n in range(count))
+    drive = GeometricSettings(lab=replace(still, drive_s=seconds), points=0, frame_delays_s=delays_s)
+    write_log(played, simulate_session(build_lab(drive)))
+    return _Hall(calibrated, played, list(still.cameras))
+
+
+def write_rig(hall: _Hall, folder: Path, port: int) -> Path:
+    """Write the rig file of the centre: all cameras are those of nodes."""
+    with Session([hall.calibrated]) as session:
+        (rig,) = session.payloads(["/rig"])
+        lenses = {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
+    cameras = tuple(
+        replace(
+            camera,
+            source=f"zenoh:{camera.name}",
+            calibration=write_lens(folder / f"{camera.name}.yaml", lenses[camera.name]),
+        )
+        for camera in rig.cameras
+    )
+    path = folder / "lab.toml"
+    path.write_text(rig_toml(replace(rig, cameras=cameras, nodes=RigNodes(f"127.0.0.1:{port}"))))
+    return path
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A run of the centre: its ledger, usage between two instants, and the numbers of messages.
+
+    ``sent`` and ``recorded`` are messages of markers, ``left`` those that the nodes still have at the end.
+    """
+
+    latencies: list[Latency]
+    begin: _Usage
+    end: _Usage
+    sent: int
+    recorded: int
+    left: int
+    events: dict[str, int]
+    robots: set[str]
+
+
+def run_centre(
+    hall: _Hall,
+    folder: Path,
+    model: str,
+    options: Sequence[str] = (),
+    program: Sequence[str] = ("-m", "ipsys_log"),
+) -> _Run:
+    """Run ``ipsys live`` with nodes that play the markers of a hall.
+
+    Parameters
+    ----------
+    options : further options of the command.
+    program : the arguments of Python before those of the command.
+    """
+    port, log = free_ports(1)[0], folder / "live.mcap"
+    log.unlink(missing_ok=True)
+    rig = write_rig(hall, folder, port)
+    centre = ["live", "--rig", rig, "--model-from", hall.calibrated, "--model", model, "-o", log, *options]
+    groups = [hall.cameras[n : n + _PER_PROCESS] for n in range(0, len(hall.cameras), _PER_PROCESS)]
+    with ExitStack() as stack:
+        said = stack.enter_context(tempfile.TemporaryFile("w+"))
+        live = stack.enter_context(_program([*program, *centre], stdout=subprocess.DEVNULL, stderr=said))
+        script = str(Path(__file__).with_name("node_players.py"))
+        players = [
+            stack.enter_context(
+                _program(
+                    [script, hall.played, f"127.0.0.1:{port}", ",".join(group)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                )
+            )
+            for group in groups
+        ]
+        Thread(target=_end_with, args=(live, players), daemon=True).start()
+        try:
+            begin, end, reports = _follow(live, players)
+        finally:
+            if live.wait():
+                said.seek(0)
+                raise SystemExit(f"ipsys live ended with {live.returncode}: {said.read().strip()[-300:]}")
+    return _read(log, model, begin, end, reports)
+
+
+@contextmanager
+def _program(arguments: Iterable[object], **streams: Any) -> Iterator[subprocess.Popen[str]]:
+    """Start a program of Python; end it with the block."""
+    with subprocess.Popen([sys.executable, *map(str, arguments)], text=True, **streams) as program:
+        try:
+            yield program
+        finally:
+            program.kill()
+
+
+def _end_with(live: subprocess.Popen[str], players: Sequence[subprocess.Popen[str]]) -> None:
+    """End the nodes of a centre that has failed."""
+    if live.wait():
+        for player in players:
+            player.kill()
+
+
+def _follow(
+    live: subprocess.Popen[str], players: Sequence[subprocess.Popen[str]]
+) -> tuple[_Usage, _Usage, list[dict[str, Any]]]:
+    """Start all players at one time; return the usage of the centre after the warm-up and at the end."""
+    for player in players:
+        _read_line(player, "asked")
+    start_ns = time.time_ns() + round(_AHEAD_S * _NS_PER_S)
+    for player in players:
+        assert player.stdin is not None
+        player.stdin.write(f"{start_ns}\n")
+        player.stdin.flush()
+    time.sleep(_AHEAD_S + _WARM_S)
+    begin = _Usage.of(live.pid)
+    for player in players:
+        _read_line(player, "played")
+    end = _Usage.of(live.pid)
+    return begin, end, [json.loads(player.communicate()[0]) for player in players]
+
+
+def _read_line(player: subprocess.Popen[str], expected: str) -> None:
+    assert player.stdout is not None
+    line = player.stdout.readline().strip()
+    if line != expected:
+        raise SystemExit(f"the nodes ended before they were {expected}")
+
+
+def _read(log: Path, model: str, begin: _Usage, end: _Usage, reports: list[dict[str, Any]]) -> _Run:
+    with Session([log]) as session:
+        kinds = [event.kind for event in session.payloads(session.topics(EVENTS))]
+        recorded = sum(session.count(topic) for topic in session.topics(MARKERS, NODES_RUN))
+        tracks: list[Tracks] = session.payloads(session.topics(TRACKS, model))
+    return _Run(
+        [entry for entry in recorded_latencies([log]) if entry.received >= begin.time_s * _NS_PER_S],
+        begin,
+        end,
+        sum(sum(report["sent"].values()) for report in reports),
+        recorded,
+        sum(report["left"] for report in reports),
+        {kind: kinds.count(kind) for kind in sorted(set(kinds))},
+        {track.robot for row in tracks for track in row.tracks},
+    )
+
+
+def _most_waiting(entries: Iterable[Latency]) -> int:
+    """Return the largest number of messages that have arrived and have no position yet."""
+    changes = sorted(
+        (time_ns, step) for e in entries for time_ns, step in ((e.received, 1), (e.published, -1))
+    )
+    return int(np.cumsum([step for _, step in changes]).max()) if changes else 0
+
+
+def _rows(title: str, runs: Sequence[_Run]) -> Iterator[Row]:
+    totals_ms = [_MS * step_times_s(run.latencies)["total"] for run in runs]
+    cores = [(run.end.cpu_s - run.begin.cpu_s) / (run.end.time_s - run.begin.time_s) for run in runs]
+    yield Row(f"{title}: centre, cores", tuple(cores), "cores", ("<=", 1.0))
+    for name, share, wanted in (("median", 50, None), ("99 %", 99, ("<=", 50.0))):
+        values = tuple(float(np.percentile(total, share)) for total in totals_ms)
+        yield Row(f"{title}: position, {name}", values, "ms", wanted)
+    counts: Mapping[str, Iterable[float]] = {
+        "not recorded": (run.sent - run.recorded for run in runs),
+        "most waiting": (_most_waiting(run.latencies) for run in runs),
+        "skipped": (run.events.get(FRAME_SKIPPED, 0) for run in runs),
+        "robots": (len(run.robots) for run in runs),
+    }
+    for name, values in counts.items():
+        wanted = {"not recorded": ("<=", 0.0), "robots": (">=", float(_ROBOTS))}.get(name)
+        yield Row(f"{title}: {name}", tuple(map(float, values)), "", wanted)
+    yield Row(f"{title}: memory", tuple(run.end.memory_mb for run in runs), "MB")
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """Measure the centre of a hall, with cameras that take turns and with cameras in step."""
+    report = Report("hall_nodes")
+    grid, seconds = ("2x1", 7.0) if options.smoke else (options.cameras, options.hall_seconds + _WARM_S)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for title, in_step in (("in turns", False), ("in step", True)):
+            hall = make_hall(folder, grid, seconds, options.hall_model, in_step)
+            runs = [run_centre(hall, folder, options.hall_model) for _ in range(options.rounds)]
+            report.rows += _rows(title, runs)
+            report.details[title] = [
+                {"events": run.events, "sent": run.sent, "left": run.left, "positions": len(run.latencies)}
+                for run in runs
+            ]
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+    return report
+
+
+def add_options(parser: argparse._ArgumentGroup) -> None:
+    parser.add_argument("--cameras", default="6x4", help="columns x rows of the hall")
+    parser.add_argument("--hall-seconds", type=float, default=30.0, help="of a run, after its first 5 s")
+    parser.add_argument("--hall-model", default="rayplane", help="the model of the positions")
+
+
+if __name__ == "__main__":
+    command("hall_nodes")

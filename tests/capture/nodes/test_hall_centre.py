@@ -1,0 +1,122 @@
+"""The centre of a hall: the markers of 24 nodes, its log, and the repetition of its results."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+
+from ipsys_log import __version__, pipeline
+from ipsys_log.capture.camera_thread import NODES_RUN
+from ipsys_log.capture.devices import source_opener
+from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.nodes.network import NodeNetwork
+from ipsys_log.capture.nodes.node import Node
+from ipsys_log.capture.recorder import first_messages
+from ipsys_log.log.codec import encode
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Markers, Message, RigCamera, RigNodes, Tracks
+from ipsys_log.messages.channels import EVENTS, MARKERS, TRACKS
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import MARKERS_RUN, geometric_rig, simulate_session
+from ipsys_log.simulation.hall import hall_settings
+from tests.capture.nodes.lab_of_nodes import PATIENCE_S, free_port
+from tests.conftest import Ipsys
+
+ROBOTS, SECONDS, RATE_HZ = 12, 2.0, 30.0
+HALL = hall_settings(6, 4, markers=ROBOTS, rate_hz=RATE_HZ, drive_s=0.0, frames_per_station=2)
+MODEL = "rigid"
+
+
+def calibrate(path: Path) -> None:
+    """Write a log with the model of all cameras, from taped points for each of them."""
+    points = GeometricSettings(lab=HALL, points=6 * len(HALL.cameras))
+    write_log(path, simulate_session(build_lab(points)))
+    pipeline.replay([path], Request(models=(MODEL,)), "fit")
+
+
+def driven_markers(lab: GeometricLab) -> dict[str, list[Markers]]:
+    markers: dict[str, list[Markers]] = defaultdict(list)
+    for message in simulate_session(lab):
+        if isinstance(message.payload, Markers):
+            markers[str(message.camera)].append(message.payload)
+    return markers
+
+
+def send(nodes: dict[str, Node], markers: dict[str, list[Markers]], begin: Event, clock: Clock) -> None:
+    """Send all markers as soon as the centre knows all nodes; their times are those of the last seconds."""
+    assert begin.wait(PATIENCE_S)
+    later_ns = clock.now_ns() - max(row.timestamp for rows in markers.values() for row in rows)
+    for number in range(round(SECONDS * RATE_HZ)):
+        for camera, node in nodes.items():
+            row = markers[camera][number]
+            stamp_ns = row.timestamp + later_ns
+            topic = MARKERS.topic_of(MARKERS_RUN, camera)
+            node(Message(topic, stamp_ns, stamp_ns, replace(row, timestamp=stamp_ns), camera))
+    for node in nodes.values():
+        node.finish(has_ended=True)
+
+
+def record_hall(folder: Path, lab: GeometricLab, markers: dict[str, list[Markers]]) -> Path:
+    """Run the centre with one node for each camera; return its log."""
+    network, clock, target = NodeNetwork("127.0.0.1", free_port()), Clock(), folder / "hall.mcap"
+    cameras = [RigCamera(name, source=f"zenoh:{name}") for name in lab.settings.lab.cameras]
+    answered, begin = set[str](), Event()
+
+    def say(text: str) -> None:
+        if "its node answers" in text:
+            answered.add(text.split(":", maxsplit=1)[0])
+        if len(answered) == len(cameras):
+            begin.set()
+
+    with ExitStack() as stack:
+        nodes = {
+            camera.name: stack.enter_context(
+                Node(camera.name, network, __version__, target, clock, lambda text: None, sends_markers=True)
+            )
+            for camera in cameras
+        }
+        sender = Thread(target=send, args=(nodes, markers, begin, clock))
+        sender.start()
+        stack.callback(sender.join)
+        rig = replace(geometric_rig(lab), cameras=tuple(cameras), nodes=RigNodes(str(network)))
+        opener = stack.enter_context(source_opener(rig, cameras, folder))
+        live = stack.enter_context(LiveCameras(cameras, opener, clock, say))
+        settings = first_messages(rig, dict(lab.calibrations), live.now_ns, live.imported_run)
+        request = Request(models=(MODEL,), model_from=folder / "calibration.mcap")
+        pipeline.live(live, settings, target, request)
+    return target
+
+
+@pytest.mark.slow
+def test_centre_of_24_nodes_has_all_markers_and_tracks(tmp_path: Path, ipsys: Ipsys) -> None:
+    calibrate(tmp_path / "calibration.mcap")
+    lab = build_lab(GeometricSettings(lab=replace(HALL, drive_s=SECONDS), points=0))
+    markers = driven_markers(lab)
+    log = record_hall(tmp_path, lab, markers)
+    with Session([log]) as session:
+        for camera, sent in markers.items():
+            received = session.payloads([MARKERS.topic_of(NODES_RUN, camera)])
+            received.sort(key=lambda row: row.timestamp)
+            assert len(received) == round(SECONDS * RATE_HZ) == len(sent)
+            # The times are those of the centre; all other bytes are those of the node.
+            for row, own in zip(received, sent, strict=True):
+                assert encode(replace(row, timestamp=0)) == encode(replace(own, timestamp=0))
+        tracks: list[Tracks] = session.payloads([TRACKS.topic_of(MODEL)])
+        kinds = {event.kind for event in session.payloads(session.topics(EVENTS))}
+    cameras_of = defaultdict(set)
+    for row in tracks:
+        for track in row.tracks:
+            cameras_of[track.robot].update(track.cameras)
+    assert sorted(cameras_of) == sorted(f"robot_{number}" for number in range(ROBOTS))
+    assert all(len(cameras) >= 2 for cameras in cameras_of.values())
+    assert kinds <= {"node_gap", "node_gap_filled"}
+    done = ipsys("verify", log)
+    assert done.code == 0, done.out + done.err

@@ -29,6 +29,7 @@ BENCHMARKS = {
     "log_read": "reading, beside mcap",
     "table": "a channel as a table, beside decoding its messages",
     "batch": "many logs by one worker and by two, overhead for each log, memory of the driver",
+    "batch_pieces": "one long log by one worker and by two, overhead of the cluster, memory of the workers",
     "handling": "cut, compact, merge, check and view of whole logs, beside cp; memory",
     "remote": "requests and bytes for a log in an S3 server, beside mcap through s3fs",
     "startup": "ipsys --help and ipsys info",

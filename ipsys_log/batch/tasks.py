@@ -257,10 +257,10 @@ def replay_log(
     except WriteError:
         raise
     except IpsysError:
-        if output is None and 0 < stored.count == stored.merged:  # the log has their run already
-            stored.folder.clear(stored.merged)
+        if output is None and stored.is_complete:  # the log has their run already
+            stored.folder.clear(stored.keys)
         raise
-    lost = stored.folder.clear(stored.merged)
+    lost = stored.folder.clear(stored.keys)
     new = [outcome for outcome in outcomes if outcome.fresh]
     remarks += [f"{outcome.run}: {remark}" for outcome in new for remark in outcome.remarks]
     return LogResult(

@@ -126,7 +126,10 @@ def _local_workers(settings: WorkerSettings, tasks: int) -> Iterator[Workers]:
 
 def dask_setup(_worker: object) -> None:
     """Prepare a worker process of this machine: Ctrl-C is for the driver, which ends the workers."""
+    import cv2
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)  # each core has a process
 
 
 def _parse_limit(text: str | None) -> int | None:

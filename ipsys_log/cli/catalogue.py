@@ -30,7 +30,7 @@ def catalogue(
         typer.Argument(
             metavar="FOLDER",
             help="The folder, or its URL; all logs below it are in the catalogue. A URL may have a pattern, "
-            "such as 's3://lab/2026-*/*.mcap'.",
+            "such as s3://lab/2026-*/*.mcap.",
         ),
     ],
     output: Annotated[

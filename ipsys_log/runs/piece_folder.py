@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,17 +91,17 @@ class PieceFolder:
             finally:
                 partial.unlink(missing_ok=True)
 
-    def clear(self, merged: int) -> int:
-        """Delete the folder; return the number of attempts in it beyond those that were merged."""
+    def clear(self, merged: Collection[str]) -> int:
+        """Delete the folder; return the number of further attempts at the pieces with ``merged`` keys."""
         # Under its new name, no late attempt comes into the folder.
         old = self.path.with_name(f"{self.path.name}.{secrets.token_hex(4)}")
         try:
             self.path.rename(old)
         except FileNotFoundError:
             return 0
-        count = sum(file.suffix in (_COMPLETE, _PARTIAL) for file in old.iterdir())
+        count = sum(file.name.partition(".")[0] in merged for file in old.iterdir())
         shutil.rmtree(old, ignore_errors=True)
-        return max(count - merged, 0)
+        return max(count - len(merged), 0)
 
 
 @dataclass(slots=True)
@@ -110,13 +110,19 @@ class StoredPieces:
 
     Attributes
     ----------
-    count, merged : the number of pieces of the run, and of those that were merged.
+    keys : of the pieces of the run, as soon as all of them are stored.
+    merged : the number of those that were merged.
     """
 
     folder: PieceFolder
-    count: int = 0
+    keys: tuple[str, ...] = ()
     merged: int = 0
     divides: bool = field(default=True, init=False)
+
+    @property
+    def is_complete(self) -> bool:
+        """True if all pieces of a run were merged."""
+        return 0 < len(self.keys) == self.merged
 
     def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
         """Yield the results in the folder, in the order of the plan.
@@ -140,7 +146,7 @@ class StoredPieces:
 
         if places := [n for n, key in enumerate(keys) if key not in attempts]:
             raise missing(places)
-        self.count = len(keys)
+        self.keys = tuple(keys)
         for n, key in enumerate(keys):
             result = _first_complete(attempts[key], interim)
             if result is None:

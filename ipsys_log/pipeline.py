@@ -114,7 +114,7 @@ def replay(
     local, one_pass = LocalWorkers(jobs), OnePass(request, stages[-1])
 
     def make(
-        task: Task, session: Session, name: str, following: Sequence[Stage], model: str | None
+        task: Task, session: Session, name: str, following: Sequence[Stage], model: str
     ) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
         waiting = one_pass.results(session, task, name, progress)
@@ -126,7 +126,7 @@ def replay(
                 check_fits(session, request, task.inputs, unchecked)
                 unchecked.clear()
             messages = compute_messages(task, session, name, progress, workers or local)
-            if task.stage.in_threads and fits:
+            if task.stage.in_threads and fits and request.model_from is None:
                 messages = preload(messages, models)
             yield from one_pass.follow(messages, session, task, name, following, model)
 
@@ -143,20 +143,24 @@ def replay(
                     options = request.options(model)
                     task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
                 if isinstance(task, Task):
-                    compute = partial(make, following=following, model=model)
+                    compute = partial(make, following=following, model=model or models[0])
                     outcomes.append(run_stage(session, target, task, request, stages[-1], compute, say))
                     task = outcomes[-1].run
             inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
 
         def do_all(parts: Sequence[Stage], inputs: dict[Channel, str], model: str | None = None) -> None:
             for number, stage in enumerate(parts, 1):
-                do(stage, parts[number:], inputs, model)
+                following = (*parts[number:], *(of_model if model is None and is_copied else ()))
+                do(stage, following, inputs, model)
 
         shared: dict[Channel, str] = {}
-        do_all([stage for stage in stages if not is_of_model(stage)], shared)
+        of_model = [stage for stage in stages if is_of_model(stage)]
+        # A copied model is known before its turn: its stages can follow the first ones.
+        is_copied = request.model_from is not None and len(models) == 1
+        do_all([stage for stage in stages if stage not in of_model], shared)
         for model in models:
             try:
-                do_all([stage for stage in stages if is_of_model(stage)], dict(shared), model)
+                do_all(of_model, dict(shared), model)
             except FitError as error:
                 # The checks before cannot know if corners determine all cameras.
                 if model in request.models or not reads_corners(model):

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import marshal
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import decode, encode, payload_type, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Encoded, Event, Message
-from ipsys_log.messages.channels import RUN_EVENTS, Channel
+from ipsys_log.messages.channels import MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.runs.execute import has_given_name
-from ipsys_log.runs.graph import Task, plan_stage
+from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.inputs import first_settings, leaves_out_frames
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.stream import Route, run, wire
@@ -65,21 +65,19 @@ class OnePass:
         Parameters
         ----------
         messages, leader, name : the messages of a run, its task and its name.
-        stages : the next stages in order. The first one that is not causal, or that does not read the stage
-            before it, ends the pass.
+        stages : the next stages in order. A model that is copied from another log is known before its turn.
+            The first stage that cannot follow ends the pass; stages that read the whole log are left out.
         model : the model of the stages.
         """
+        if leader.step is None:
+            yield from messages
+            return
         self._forget()
-        if leader.step is not None:
-            self._plan(session, leader, name, stages, model)
+        self._plan(session, leader, name, stages, model)
         for message in messages:
-            given = [message]
-            for follower in self._followers:
-                given = follower.step(given)
+            self._give([message], _Follower.step)
             yield message
-        given = []
-        for follower in self._followers:
-            given = follower.finish(given)
+        self._give([], _Follower.finish)
 
     def results(
         self, session: Session, task: Task, name: str, progress: Progress
@@ -91,20 +89,44 @@ class OnePass:
                 return follower.results()
         return None
 
+    def _give(
+        self, messages: list[Message], take: Callable[[_Follower, Sequence[Message]], list[Message]]
+    ) -> None:
+        """Give messages of the first stage to those that read them, and their messages to the next ones."""
+        made: dict[_Follower | None, list[Message]] = {None: messages}
+        for follower in self._followers:
+            made[follower] = take(follower, made[follower.before])
+
     def _plan(
         self, session: Session, leader: Task, name: str, stages: Sequence[Stage], model: str | None
     ) -> None:
         inputs = dict(leader.inputs)
-        before, run_before = leader.stage, name
+        sources: dict[_Follower | None, _Source] = {None: _Source(leader.stage, name)}
+        waiting: set[Channel] = set()
+        inputs.update(dict.fromkeys(_own(leader.stage), name))
         for stage in stages:
-            written = {channel: run_before for channel in before.writes if channel is not RUN_EVENTS}
-            inputs.update(written)
-            task = self._task(session, stage, inputs, model)
-            name_next = self._name(session, task, name) if task is not None else None
-            if task is None or name_next is None or not written.keys() & task.inputs.keys():
+            if MODEL in stage.writes and self._request.model_from is not None:
+                task, payload = copy_model(self._request, str(model))
+                run = self._name(session, task, name)
+                topic, start_ns = MODEL.topic_of(str(run)), session.start_ns
+                session = session.with_message(Message(topic, start_ns, payload.timestamp, payload))
+            elif not stage.causal:
+                waiting |= _own(stage)
+                continue
+            elif waiting & set(stage.reads):
                 return
-            self._followers.append(_Follower(session, task, name_next, before, run_before))
-            before, run_before = stage, name_next
+            else:
+                planned = self._task(session, stage, inputs, model if is_of_model(stage) else None)
+                run = self._name(session, planned, name) if planned is not None else None
+                read = [key for key, source in sources.items() if planned and source.is_read_by(planned)]
+                if planned is None or run is None or len(read) != 1:
+                    return
+                follower = _Follower(session, planned, run, read[0], sources[read[0]])
+                self._followers.append(follower)
+                sources[follower] = _Source(stage, run)
+            if run is None:
+                return
+            inputs.update(dict.fromkeys(_own(stage), run))
 
     def _task(
         self, session: Session, stage: Stage, inputs: Mapping[Channel, str], model: str | None
@@ -130,37 +152,57 @@ class OnePass:
             self._followers.pop().close()
 
 
+def _own(stage: Stage) -> set[Channel]:
+    return set(stage.writes) - {RUN_EVENTS}
+
+
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """The input of a stage that follows: recorded topics with their counts, and the run before it."""
+    """A stage of the pass, and its run."""
 
-    counts: Mapping[str, int]
     stage: Stage
     run: str
 
-    @classmethod
-    def of(cls, session: Session, task: Task, stage: Stage, run: str) -> _Source:
-        made = {topic for channel in stage.writes for topic in session.topics(channel, run)}
-        recorded = [topic for topic in task.topics if topic not in made]
-        return cls({topic: session.count(topic) for topic in recorded}, stage, run)
+    def is_read_by(self, task: Task) -> bool:
+        return any(task.inputs.get(channel) == self.run for channel in _own(self.stage))
+
+    def topics(self, session: Session) -> set[str]:
+        return {topic for channel in self.stage.writes for topic in session.topics(channel, self.run)}
+
+    def others(self, session: Session, task: Task) -> dict[str, tuple[int, list[bytes]]]:
+        """Return the topics that a task reads from the log: their counts, and the content of a model."""
+        made, models = self.topics(session), session.topics(MODEL, task.inputs.get(MODEL))
+        return {
+            topic: (
+                session.count(topic),
+                [encode(payload) for payload in session.payloads([topic])] if topic in models else [],
+            )
+            for topic in task.topics
+            if topic not in made
+        }
 
 
 class _Follower:
-    """A causal stage that gets the messages of the stage before it, and those of its recorded topics."""
+    """A causal stage that gets the messages of a stage before it, and those of topics in the log.
 
-    def __init__(self, session: Session, task: Task, name: str, before: Stage, run_before: str) -> None:
+    ``before`` is the stage that it follows; None for the first stage of the pass.
+    """
+
+    def __init__(
+        self, session: Session, task: Task, name: str, before: _Follower | None, source: _Source
+    ) -> None:
         assert task.step is not None
-        self._task, self._name = task, name
+        self.before = before
+        self._task, self._name, self._source = task, name, source
         self._wired = wire(task.stage, name, task.inputs, task.step(name))
-        self._source = _Source.of(session, task, before, run_before)
-        self._routes = {Route(channel, run_before) for channel in before.writes} & self._wired.reads
-        self._types = {payload for route in self._routes for payload in route.channel.payloads}
+        routes = {Route(channel, source.run) for channel in source.stage.writes} & self._wired.reads
+        self._types = {payload for route in routes for payload in route.channel.payloads}
+        self._others = source.others(session, task)
         self._given = 0
         self._has_failed = self._is_complete = False
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115
-        topics = list(self._source.counts)
-        self._settings = first_settings(session, task, topics)
-        self._recorded = session.messages(topics)
+        self._settings = first_settings(session, task, self._others)
+        self._recorded = session.messages(self._others)
         self._next = next(self._recorded, None)
 
     def step(self, messages: Sequence[Message], is_last: bool = False) -> list[Message]:
@@ -190,14 +232,14 @@ class _Follower:
 
     def has_done(self, session: Session, task: Task, name: str) -> bool:
         """Return whether the results are those of a task: the same stage with the same input."""
-        mine, before = self._task, self._source
+        mine, source = self._task, self._source
         if not self._is_complete or (task.stage, name) != (mine.stage, self._name):
             return False
-        made = {topic for channel in before.stage.writes for topic in session.topics(channel, before.run)}
+        made = source.topics(session).intersection(task.topics)
         return (
             _settings_of(task) == _settings_of(mine)
-            and _Source.of(session, task, before.stage, before.run).counts == before.counts
-            and sum(session.count(topic) for topic in made.intersection(task.topics)) == self._given
+            and source.others(session, task) == self._others
+            and sum(session.count(topic) for topic in made) == self._given
         )
 
     def results(self) -> Iterator[Message]:

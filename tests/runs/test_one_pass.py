@@ -44,6 +44,29 @@ def test_one_pass_has_the_bytes_of_single_stages(
 
 
 @pytest.mark.slow
+def test_model_of_another_log_lets_all_stages_follow(
+    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, alone = (Path(shutil.copy(lab, tmp_path / f"{name}.mcap")) for name in ("other", "alone"))
+    replay([other], Request(models=("rigid",)), "fit")
+    computed: list[str] = []
+
+    def watched(task: Task, *rest: Any) -> Iterator[Message]:
+        computed.append(task.stage.name)
+        return compute_messages(task, *rest)
+
+    monkeypatch.setattr(pipeline, "compute_messages", watched)
+    request = Request(models=("rigid",), model_from=other)
+    fresh = [outcome.stage for outcome in replay([lab], request) if outcome.fresh]
+    assert fresh == ["detect", "camera-frame", "fit", "evaluate", "locate", "fuse"]
+    assert computed == ["detect", "fit", "evaluate"]
+    monkeypatch.setattr(OnePass, "follow", lambda self, messages, *_: messages)
+    replay([alone], request)
+    assert computed[3:] == fresh
+    assert lab.read_bytes() == alone.read_bytes()
+
+
+@pytest.mark.slow
 def test_one_pass_does_not_read_its_own_markers(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: set[Any] = set()
     messages = Session.messages

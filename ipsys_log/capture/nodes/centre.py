@@ -1,7 +1,7 @@
 """The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
 
 All cameras of a recording share one session. The centre asks each node for its state ten times a second, more
-often in the first 20 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
+often in the first 30 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
 waits in a queue with a limit; a dropped frame is missing, so the node sends it again.
 """
 
@@ -37,7 +37,7 @@ __all__ = ["Centre", "is_of_node", "node_of"]
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
 # The period of the exchanges up to a number of them: the first ones together find offset and drift.
-_TURNS_S = ((250, 0.02), (625, 0.04))
+_TURNS_S = ((500, 0.02), (1000, 0.04))
 _TURN_S = 0.1
 _FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from ipsys_log.analysis.node_clock import ClockHistory, Exchange, fit_clock
-from ipsys_log.capture.nodes.centre import _TURN_S, _TURNS_S
+from ipsys_log.capture.nodes.centre import exchange_period_s
 from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
@@ -183,4 +183,4 @@ def test_error_is_below_1_ms_from_2_5_s_on(seed: int) -> None:
             assert centre_ns is not None
             assert abs(centre_ns - row.sent_ns) < MS
         history.add(row)
-        at_s += next((turn_s for count, turn_s in _TURNS_S if number < count), _TURN_S)
+        at_s += exchange_period_s(number + 1)

@@ -32,7 +32,7 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["Centre", "is_of_node", "node_of"]
+__all__ = ["Centre", "exchange_period_s", "is_of_node", "node_of"]
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
@@ -42,6 +42,17 @@ _TURN_S = 0.1
 _FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S
 _ANSWER_S, _FRAMES_S = 3.0, 20.0
+
+
+def exchange_period_s(exchanges: int) -> float:
+    """Return the period of the exchanges of times with a node after a number of them, in s.
+
+    Examples
+    --------
+    >>> exchange_period_s(0), exchange_period_s(100_000)
+    (0.02, 0.1)
+    """
+    return next((period_s for count, period_s in _TURNS_S if exchanges < count), _TURN_S)
 
 
 def is_of_node(camera: RigCamera) -> bool:
@@ -195,13 +206,10 @@ class _Link:
     def _take(self) -> _Arrival | None:
         with self._arrived:
             if not self._waiting:
-                self._arrived.wait(self._turn_s())
+                self._arrived.wait(exchange_period_s(self._exchanges))
             arrival = self._waiting.popleft() if self._waiting else None
             self._waiting_bytes -= arrival.size if arrival else 0
             return arrival
-
-    def _turn_s(self) -> float:
-        return next((turn_s for count, turn_s in _TURNS_S if self._exchanges < count), _TURN_S)
 
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
         with self._arrived:
@@ -229,7 +237,7 @@ class _Link:
         import zenoh
 
         now_ns = self._clock.now_ns()
-        if now_ns - self._state_asked_ns < self._turn_s() * NS_PER_S:
+        if now_ns - self._state_asked_ns < exchange_period_s(self._exchanges) * NS_PER_S:
             return
         self._state_asked_ns = sent_ns = self._clock.now_ns()
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from ipsys_log.analysis.node_clock import ClockHistory, Exchange, fit_clock
-from ipsys_log.capture.nodes.centre import _TURN_S, _TURNS_S
+from ipsys_log.capture.nodes.centre import exchange_period_s
 from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
@@ -168,7 +168,7 @@ def test_jump_of_5_ms_is_found_when_the_exchanges_show_it() -> None:
     assert jumps[50] == pytest.approx(5 * MS, abs=1.5 * MS)
 
 
-# The greatest error of 1,000 random clocks was 0.85 ms.
+# The greatest error of 1,000 random clocks was 0.91 ms.
 @pytest.mark.parametrize("seed", range(3))
 def test_error_is_below_1_ms_from_2_5_s_on(seed: int) -> None:
     """The exchanges have the times of the centre; a frame is converted by the estimate before it."""
@@ -176,11 +176,11 @@ def test_error_is_below_1_ms_from_2_5_s_on(seed: int) -> None:
     offset_ns, drift = rng.randint(-3600 * NS_PER_S, 3600 * NS_PER_S), 100e-6 * (-1) ** seed
     for number in range(700):
         delays_ns = [round((0.1 + rng.random() * 20) * MS) for _ in range(2)]
-        row = exchange(round(at_s * NS_PER_S), *delays_ns, offset_ns, drift)
+        row = exchange(round(at_s * NS_PER_S), delays_ns[0], delays_ns[1], offset_ns, drift)
         node_ns = START_NS - offset_ns + round((1 - drift) * (row.sent_ns - START_NS))
         centre_ns = history.to_centre_ns(node_ns)
         if at_s > 2.5:
             assert centre_ns is not None
             assert abs(centre_ns - row.sent_ns) < MS
         history.add(row)
-        at_s += next((turn_s for count, turn_s in _TURNS_S if number < count), _TURN_S)
+        at_s += exchange_period_s(number + 1)

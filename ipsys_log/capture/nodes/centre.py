@@ -1,7 +1,7 @@
 """The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
 
 All cameras of a recording share one session. The centre asks each node for its state ten times a second, more
-often in the first 20 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
+often in the first 30 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
 waits in a queue with a limit; a dropped frame is missing, so the node sends it again.
 """
 
@@ -32,16 +32,27 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["Centre", "is_of_node", "node_of"]
+__all__ = ["Centre", "exchange_period_s", "is_of_node", "node_of"]
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
 # The period of the exchanges up to a number of them: the first ones together find offset and drift.
-_TURNS_S = ((250, 0.02), (625, 0.04))
+_TURNS_S = ((500, 0.02), (1000, 0.04))
 _TURN_S = 0.1
 _FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S
 _ANSWER_S, _FRAMES_S = 3.0, 20.0
+
+
+def exchange_period_s(exchanges: int) -> float:
+    """Return the period of the exchanges of times with a node after a number of them, in s.
+
+    Examples
+    --------
+    >>> exchange_period_s(0), exchange_period_s(100_000)
+    (0.02, 0.1)
+    """
+    return next((period_s for count, period_s in _TURNS_S if exchanges < count), _TURN_S)
 
 
 def is_of_node(camera: RigCamera) -> bool:
@@ -212,13 +223,10 @@ class _Link:
     def _take(self) -> _Arrival | None:
         with self._arrived:
             if not self._waiting:
-                self._arrived.wait(self._turn_s())
+                self._arrived.wait(exchange_period_s(self._exchanges))
             arrival = self._waiting.popleft() if self._waiting else None
             self._waiting_bytes -= arrival.size if arrival else 0
             return arrival
-
-    def _turn_s(self) -> float:
-        return next((turn_s for count, turn_s in _TURNS_S if self._exchanges < count), _TURN_S)
 
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
         with self._arrived:
@@ -246,7 +254,7 @@ class _Link:
         import zenoh
 
         now_ns = self._clock.now_ns()
-        if now_ns - self._state_asked_ns < self._turn_s() * NS_PER_S:
+        if now_ns - self._state_asked_ns < exchange_period_s(self._exchanges) * NS_PER_S:
             return
         self._state_asked_ns = sent_ns = self._clock.now_ns()
 

@@ -50,7 +50,7 @@ def _run(offset_ns: int) -> None:
         anchor(clock)
         clock._offset_ns = offset_ns
 
-    Clock.__init__ = start  # type: ignore[method-assign]
+    Clock.__init__ = start  # type: ignore[method-assign, assignment]
     OPENERS["usb"] = _open_numbered
     node._SILENT_NS = round(PATIENCE_S * NS_PER_S)
     centre._FIRST_ANSWER_S = camera_thread._DRAW_S = PATIENCE_S

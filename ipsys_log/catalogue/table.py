@@ -61,11 +61,14 @@ def update_catalogue(
     Raises
     ------
     IpsysError
-        There is no such folder, PyArrow is not installed, or the target is another file.
+        There is no such folder, it has no logs and had none before, PyArrow is not installed, or the target
+        is another file.
     """
     paths = {str(path.relative_to(folder)): path for path in logs_below(folder)}
     mark = _mark(baseline)
     before = _earlier_rows(target, mark) if target.exists() else {}
+    if not paths and not before:
+        raise IpsysError(f"{folder}: has no file that ends in .mcap; name another folder")
     rows: list[dict[str, Any]] = []
     read = 0
     for number, (name, path) in enumerate(paths.items()):

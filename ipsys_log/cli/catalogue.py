@@ -55,11 +55,10 @@ def catalogue(
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.plain_text import plain_text
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_file, check_parquet_name
 
     check_installed("catalogue needs", "pyarrow")
-    if output.suffix != ".parquet":
-        raise IpsysError(f"-o {output}: a catalogue ends in .parquet; use {output.stem}.parquet")
+    check_parquet_name(output, "-o")
     check_file(output, "-o", [])
     for name, log in (("--baseline", baseline), ("--model-from", model_from)):
         if log is not None and not log.is_file():

@@ -235,6 +235,8 @@ def test_port_in_use_and_foreign_address_are_refused() -> None:
     text = r"\[nodes\] centre 192\.0\.2\.7:7449: is another machine, so nodes and centre need certificates"
     with pytest.raises(IpsysError, match=text):
         read_network(RigNodes("192.0.2.7:7449"), Path())
+    with pytest.raises(IpsysError, match="need certificates; give --certificates FOLDER"):
+        read_network(None, Path(), "192.0.2.7:7449")
     with pytest.raises(IpsysError, match="--centre 7449: is not an address; write HOST:PORT"):
         read_network(None, Path(), "7449")
     assert read_network(RigNodes("[::1]:7449"), Path()).endpoint == "tcp/[::1]:7449"
@@ -261,4 +263,6 @@ def test_wrong_certificates_are_named(tmp_path: Path) -> None:
     (folder / "white.pem").write_bytes((other / "red.pem").read_bytes())
     assert "white.pem: is not accepted by authority.pem" in refusal("white")
     (folder / "white.pem").write_bytes(b"garbage")
-    assert "a file is damaged" in refusal("white")
+    assert "a file is damaged (not in PEM form)" in refusal("white")
+    (folder / "authority.pem").write_bytes(b"garbage")
+    assert refusal("red").startswith("authority.pem: is not a certificate in PEM form")

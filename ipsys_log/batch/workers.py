@@ -29,6 +29,8 @@ _PIECE_BYTES = 4 << 20
 _MOST_PIECES = 1024  # of a log of unknown size
 # An existing cluster can grow, and it grows only if tasks wait.
 _LEAST_WAITING = 8
+# With less, Dask ends each worker process before its first task, and starts it again without end.
+_LEAST_MEMORY_BYTES = 256 * 10**6
 # Dask's settings of the workers on this machine.
 _CONFIG: Mapping[str, Any] = {
     # The batch itself counts how often a log has ended its worker.
@@ -143,6 +145,11 @@ def _parse_limit(text: str | None) -> int | None:
         size = 0
     if size <= 0:
         raise IpsysError(f"--memory-limit {text}: is not a size; write a number with its unit, such as 2GB")
+    if size < _LEAST_MEMORY_BYTES:
+        raise IpsysError(
+            f"--memory-limit {text}: a worker needs {_LEAST_MEMORY_BYTES // 10**6} MB or more without a log; "
+            "give more, such as 2GB"
+        )
     return size
 
 

@@ -126,7 +126,10 @@ class CameraReader:
         self._broken = False
         self._since_key = 0
         self._late = LateFrameDetector(shared.heartbeat, camera.rate_hz)
-        self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
+        # Zenoh's threads are daemons if their caller is one. Python ends a daemon within a call of Zenoh,
+        # and the program aborts. The thread of a device is a daemon, because a driver can block for ever.
+        is_daemon = not str(camera.source).startswith("zenoh:")
+        self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=is_daemon)
 
     def wait_for_first_frame(self) -> None:
         """Wait for the first frame.

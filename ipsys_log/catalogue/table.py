@@ -62,12 +62,14 @@ def update_catalogue(
     Raises
     ------
     IpsysError
-        There is no such folder, a store cannot be listed, PyArrow is not installed, or the target is another
-        file.
+        There is no such folder, it has no logs and had none before, a store cannot be listed, PyArrow is not
+        installed, or the target is another file.
     """
     logs = {name: (log, state) for name, log, state in states_below(folder)}
     mark = _mark(baseline)
     before = _earlier_rows(target, mark) if target.exists() else {}
+    if not logs and not before:
+        raise IpsysError(f"{folder}: has no file that ends in .mcap; name another folder")
     rows: list[dict[str, Any]] = []
     read = 0
     for number, (name, (log, state)) in enumerate(logs.items()):

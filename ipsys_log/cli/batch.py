@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks, say
-from ipsys_log.cli.options import AsJson, LogList, log_argument
+from ipsys_log.cli.options import AsJson, LogList, check_present, log_argument
 from ipsys_log.cli.stages import build_command, options_until, replay_options
 
 if TYPE_CHECKING:
@@ -267,8 +267,11 @@ def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of :func:`ipsys_log.api.replay`; rig and intrinsics are read once."""
     from ipsys_log.cli.options import load_calibrations
     from ipsys_log.errors import IpsysError
+    from ipsys_log.models.table import check_name
     from ipsys_log.rig.file import load_rig
 
+    for model in options["model"] or ():
+        check_name(model)
     rig, calibration = options.pop("rig"), options.pop("calibration") or []
     for text in calibration:
         if "=" not in text:
@@ -287,13 +290,15 @@ def _run(
     from ipsys_log.batch.settings import WorkerSettings
     from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_file, check_parquet_name
 
     check_installed("batch needs", "dask", "distributed", "bokeh", "cryptography")
     if table is not None:
         check_installed("--table needs", "pyarrow")
+        check_parquet_name(table, "--table")
         check_file(table, "--table", logs)
     workers, paths = WorkerSettings(**settings), expand_folders(logs)
+    check_present(paths)
     if workers.scheduler is not None:  # its workers have other working directories
         paths = [path.absolute() if isinstance(path, Path) else path for path in paths]
         task = replace(task, options={name: _absolute(value) for name, value in task.options.items()})

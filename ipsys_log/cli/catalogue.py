@@ -64,11 +64,10 @@ def catalogue(
     from ipsys_log.extras import check_installed
     from ipsys_log.log.location import parse_location
     from ipsys_log.plain_text import plain_text
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_file, check_parquet_name
 
     check_installed("catalogue needs", "pyarrow")
-    if output.suffix != ".parquet":
-        raise IpsysError(f"-o {output}: a catalogue ends in .parquet; use {output.stem}.parquet")
+    check_parquet_name(output, "-o")
     check_file(output, "-o", [])
     if model_from is not None and baseline is None:
         raise IpsysError("--model-from: has an effect only with --baseline; give the log before all moves")

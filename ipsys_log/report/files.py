@@ -126,6 +126,20 @@ def check_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:
     _check_writable(path.parent, f"{option} {path}")
 
 
+def check_parquet_name(path: Path, option: str) -> None:
+    """Check that the name of a table ends in ``.parquet``: its readers choose the format by the name.
+
+    Raises
+    ------
+    IpsysError
+        The name has another end.
+    """
+    if path.suffix != ".parquet":
+        raise IpsysError(
+            f"{option} {path}: the name must end in .parquet; use {path.with_suffix('.parquet')}"
+        )
+
+
 def check_figure_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:
     """Check that a figure can be written and has a valid format, before any work is done.
 

@@ -179,6 +179,8 @@ def load_rig(path: Path) -> Rig:
         if path.stat().st_size > _LARGEST_FILE:
             raise IpsysError(f"{path}: is too large for a rig file; to write one: ipsys init lab.toml")
         table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise IpsysError(f"{path}: does not exist; to write a rig file: ipsys init {path}") from error
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -360,7 +362,7 @@ def _build(item: type[Item], row: Any, where: str) -> Item:
         raise IpsysError(f"{where}: unknown key {unknown[0]!r}{meant}")
     missing = [n for n, f in known.items() if f.default is MISSING and n not in row]
     if missing:
-        raise IpsysError(f"{where}: {missing[0]} is missing")
+        raise IpsysError(f"{where}: {missing[0]} is missing; 'ipsys init' writes an example")
     return item(**{name: _value(str(known[name].type), row[name], f"{where}: {name}") for name in row})
 
 

@@ -31,6 +31,7 @@ from ipsys_log.errors import IpsysError, WriteError
 from ipsys_log.log.log_files import expand_folders
 from ipsys_log.runs.piece_folder import PieceTask
 from ipsys_log.runs.pieces import Piece, PieceRun
+from tests.conftest import Ipsys
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
 
@@ -286,6 +287,33 @@ def test_settings_without_effect_or_protection_are_refused(settings: WorkerSetti
     with pytest.raises(IpsysError) as caught:
         settings.check()
     assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["logs", "--model", "bst"], "model 'bst' is not known; use one of rigid, poly"),
+        (["logs", "--memory-limit", "much"], "--memory-limit much: is not a size"),
+        (["logs", "--memory-limit", "10MB"], "--memory-limit 10MB: a worker needs 256 MB or more"),
+        (["logs", "--table", "rows.csv"], "--table rows.csv: the name must end in .parquet"),
+        (["lgs"], "lgs does not exist"),
+    ],
+)
+def test_wrong_options_are_refused_before_a_worker_starts(
+    options: list[str], text: str, tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("logs").mkdir()
+    Path("logs/a.mcap").write_bytes(b"")
+
+    def start(**_: object) -> None:
+        raise AssertionError("a worker is started")
+
+    monkeypatch.setattr(distributed, "LocalCluster", start)
+    done = ipsys("batch", "replay", *options)
+    assert (done.code, done.out) == (1, "")
+    assert done.err.startswith(f"ipsys: {text}")
+    assert done.err.count("\n") == 1
 
 
 def test_logs_are_named_once_and_folders_searched(tmp_path: Path) -> None:

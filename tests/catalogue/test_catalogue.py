@@ -181,9 +181,20 @@ def test_file_of_another_kind_is_not_overwritten(folder: Path, tmp_path: Path, i
     assert (done.code, "is not a catalogue" in done.err) == (1, True)
     assert pd.read_parquet(target)["robot"].tolist() == ["ada"]
     done = ipsys("catalogue", folder, "-o", tmp_path / "c.csv")
-    assert (done.code, "a catalogue ends in .parquet" in done.err) == (1, True)
+    assert (done.code, "the name must end in .parquet; use" in done.err) == (1, True)
     with pytest.raises(IpsysError, match="is not a folder"):
         update_catalogue(GOLDEN, tmp_path / "c.parquet")
+
+
+def test_folder_without_logs_gets_no_catalogue(folder: Path, tmp_path: Path) -> None:
+    """A wrong folder is refused; a catalogue whose logs have gone becomes empty."""
+    target, empty = tmp_path / "c.parquet", tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(IpsysError, match=r"empty: has no file that ends in \.mcap"):
+        update_catalogue(empty, target)
+    assert not target.exists()
+    update_catalogue(folder, target)
+    assert update_catalogue(empty, target).logs == 0
 
 
 def test_rows_of_parquet_come_back(tmp_path: Path) -> None:

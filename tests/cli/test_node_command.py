@@ -115,6 +115,9 @@ def test_wrong_node_is_refused_with_one_line(tmp_path: Path, ipsys: Ipsys) -> No
     assert "zenoh:red, which belongs to the centre" in refusal(
         str(tmp_path / "centre.toml"), "--camera", "red"
     )
+    assert "none.toml: does not exist; to write a rig file: ipsys init" in refusal(
+        "none.toml", "--camera", "red"
+    )
     assert "--centre far: is not an address" in refusal(node, "--camera", "red", "--centre", "far")
     assert not list(tmp_path.glob("*.mcap"))
 

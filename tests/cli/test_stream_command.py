@@ -218,7 +218,7 @@ def test_second_server_names_the_port(ipsys: Ipsys, log: Path) -> None:
 REFUSED = {
     "--udp 10.0.0.1:9870": "is another machine",
     "--udp 9870 --robot eve": "robot 'eve' is not known; the rig has ada, bob",
-    "--udp 9870 --key none.key": "none.key: cannot be read",
+    "--udp 9870 --key none.key": "none.key: does not exist; to make it: openssl rand -hex 32",
     "--udp 9870 --key short.key": "short.key: has 5 bytes; write 16 to 4096",
     "--udp 9870 --rate 0": "rate 0: give a number from 0.01 to 100",
     "--udp 9870 --restamp later": "--restamp later: is not known; use original or now",
@@ -227,6 +227,7 @@ REFUSED = {
     "--udp 9870 --topics /rig": "name one topic with tracks: /runs/poly/tracks",
     "--udp 9870 --start-offset 7": "start offset 7 s: the log ends after 1.960 s",
     "--udp 9870 --start-offset -1": "start offset -1.0 s: give a time of at least 0 s",
+    "--mavlink 127.0.0.1:9870": "--mavlink 127.0.0.1:9870: write ROBOT=HOST:PORT",
     "--mavlink eve=9870": "robot 'eve' is not known; the rig has ada, bob",
     "--host 0.0.0.0": "--host: has no effect without a stream",
     "--robot ada": "--robot: has no effect without a stream",

@@ -88,7 +88,10 @@ def _own_subject(files: Certificates) -> str:
 def _context(files: Certificates, protocol: int) -> ssl.SSLContext:
     context = ssl.SSLContext(protocol)
     context.check_hostname, context.verify_mode = False, ssl.CERT_REQUIRED
-    context.load_verify_locations(files.authority)
+    try:
+        context.load_verify_locations(files.authority)
+    except ssl.SSLError as error:
+        raise IpsysError(f"{files.authority}: is not a certificate in PEM form; {_GUIDE}") from error
     # Without a password, an encrypted key would ask for one in the terminal.
     context.load_cert_chain(files.certificate, files.key, password=lambda: b"")
     return context
@@ -136,4 +139,5 @@ def _shake_hands(context: ssl.SSLContext, plain: socket.socket, host: str) -> No
 
 
 def _reason(error: ssl.SSLError) -> str:
-    return (error.reason or str(error)).lower().replace("_", " ")
+    # Without a reason, the text of OpenSSL names only its own library and source line.
+    return error.reason.lower().replace("_", " ") if error.reason else "not in PEM form"

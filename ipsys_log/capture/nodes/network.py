@@ -98,9 +98,10 @@ def read_network(
     if certificates is None and named is not None:
         certificates = folder / named
     if certificates is None and not _is_loopback(host):
+        setting = "give --certificates FOLDER" if centre else 'write certificates = "FOLDER" into [nodes]'
         raise IpsysError(
-            f"{where} {address}: is another machine, so nodes and centre need certificates; write "
-            'certificates = "FOLDER" into [nodes]; docs/nodes.md shows how to make them'
+            f"{where} {address}: is another machine, so nodes and centre need certificates; {setting}; "
+            "docs/nodes.md shows how to make them"
         )
     return NodeNetwork(host, int(port), certificates)
 

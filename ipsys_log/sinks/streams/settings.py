@@ -70,7 +70,7 @@ class StreamSettings:
     @property
     def named_robots(self) -> tuple[str, ...]:
         """The robots that the settings name."""
-        return (*self.robots, *(text.partition("=")[0] for text in self.mavlink))
+        return (*self.robots, *(text.partition("=")[0] for text in self.mavlink if "=" in text))
 
     def __bool__(self) -> bool:
         servers = (self.vrpn, self.ros2, self.foxglove)

@@ -82,6 +82,10 @@ def read_key(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             key = file.read(_MOST_KEY_BYTES + 1).strip()
+    except FileNotFoundError as error:
+        raise IpsysError(
+            f"--key {path}: does not exist; to make it: openssl rand -hex 32 > {path}"
+        ) from error
     except OSError as error:
         raise IpsysError(f"--key {path}: cannot be read: {error.strerror}") from error
     if not _FEWEST_KEY_BYTES <= len(key) <= _MOST_KEY_BYTES:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ from typing import Any
 import pytest
 import zenoh
 
+from ipsys_log.capture.devices import open_source
 from ipsys_log.capture.frames import Clock, SourceError
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes import node as node_module
-from ipsys_log.capture.nodes.centre import Centre
+from ipsys_log.capture.nodes.centre import Centre, _Link
 from ipsys_log.capture.nodes.network import NodeNetwork, read_network
 from ipsys_log.capture.nodes.wire import FrameHeader, frames_key
 from ipsys_log.errors import IpsysError
@@ -193,6 +196,25 @@ def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path)
 
 
 @pytest.mark.slow
+def test_calls_of_zenoh_end_before_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python ends a daemon thread within a call of Zenoh, and the program would abort (exit code 134)."""
+    monkeypatch.setattr("ipsys_log.capture.nodes.centre._FIRST_ANSWER_S", 0.5)
+    daemons: set[str] = set()
+    ask = _Link._ask_state
+
+    def watch(link: _Link) -> None:
+        ask(link)
+        daemons.update(thread.name for thread in threading.enumerate() if thread.daemon)
+
+    monkeypatch.setattr(_Link, "_ask_state", watch)
+    with Centre(cameras(), local(), "0.1.0") as centre:
+        open_camera = centre.choose_opener(open_source)
+        with pytest.raises(SourceError, match="no node red"), LiveCameras(cameras(), open_camera, Clock()):
+            pass
+    assert not [name for name in daemons if name == "red" or "closure" in name]
+
+
+@pytest.mark.slow
 def test_centre_without_a_node_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.nodes.centre._FIRST_ANSWER_S", 0.5)
     with (
@@ -213,6 +235,8 @@ def test_port_in_use_and_foreign_address_are_refused() -> None:
     text = r"\[nodes\] centre 192\.0\.2\.7:7449: is another machine, so nodes and centre need certificates"
     with pytest.raises(IpsysError, match=text):
         read_network(RigNodes("192.0.2.7:7449"), Path())
+    with pytest.raises(IpsysError, match="need certificates; give --certificates FOLDER"):
+        read_network(None, Path(), "192.0.2.7:7449")
     with pytest.raises(IpsysError, match="--centre 7449: is not an address; write HOST:PORT"):
         read_network(None, Path(), "7449")
     assert read_network(RigNodes("[::1]:7449"), Path()).endpoint == "tcp/[::1]:7449"
@@ -239,4 +263,6 @@ def test_wrong_certificates_are_named(tmp_path: Path) -> None:
     (folder / "white.pem").write_bytes((other / "red.pem").read_bytes())
     assert "white.pem: is not accepted by authority.pem" in refusal("white")
     (folder / "white.pem").write_bytes(b"garbage")
-    assert "a file is damaged" in refusal("white")
+    assert "a file is damaged (not in PEM form)" in refusal("white")
+    (folder / "authority.pem").write_bytes(b"garbage")
+    assert refusal("red").startswith("authority.pem: is not a certificate in PEM form")

@@ -23,6 +23,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -33,16 +34,22 @@ from rounds import Row
 from stream_server import free_ports, write_lens
 
 from ipsys_log import pipeline
+from ipsys_log.analysis.knocks import KnockMonitor
 from ipsys_log.analysis.latency import recorded_latencies, step_times_s
-from ipsys_log.capture.camera_thread import NODES_RUN
+from ipsys_log.analysis.overlap_stream import OverlapSummary
+from ipsys_log.capture.camera_thread import NODES_RUN, CameraState
+from ipsys_log.capture.live_plan import plan_live
+from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import FRAME_SKIPPED, Latency, RigNodes, Tracks
 from ipsys_log.messages.channels import EVENTS, MARKERS, TRACKS
 from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
+from ipsys_log.runs.output import write_log, write_message
+from ipsys_log.runs.stream import run
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.geometric_session import MARKERS_RUN, simulate_session
 from ipsys_log.simulation.hall import hall_settings, parse_grid
 
 __all__ = ["measure"]
@@ -247,29 +254,79 @@ def _rows(title: str, runs: Sequence[_Run]) -> Iterator[Row]:
     totals_ms = [_MS * step_times_s(run.latencies)["total"] for run in runs]
     cores = [(run.end.cpu_s - run.begin.cpu_s) / (run.end.time_s - run.begin.time_s) for run in runs]
     yield Row(f"{title}: centre, cores", tuple(cores), "cores", ("<=", 1.0))
-    for name, share, wanted in (("median", 50, None), ("99 %", 99, ("<=", 50.0))):
+    limits: tuple[tuple[str, int, tuple[str, float] | None], ...]
+    limits = (("median", 50, None), ("99 %", 99, ("<=", 50.0)))
+    for name, share, wanted in limits:
         values = tuple(float(np.percentile(total, share)) for total in totals_ms)
         yield Row(f"{title}: position, {name}", values, "ms", wanted)
-    counts: Mapping[str, Iterable[float]] = {
-        "not recorded": (run.sent - run.recorded for run in runs),
-        "most waiting": (_most_waiting(run.latencies) for run in runs),
-        "skipped": (run.events.get(FRAME_SKIPPED, 0) for run in runs),
-        "robots": (len(run.robots) for run in runs),
+    skipped = [run.events.get(FRAME_SKIPPED, 0) for run in runs]
+    counts: Mapping[str, tuple[str, Sequence[float], tuple[str, float] | None]] = {
+        "not recorded": ("messages", [run.sent - run.recorded for run in runs], ("<=", 0.0)),
+        "most waiting": ("messages", [_most_waiting(run.latencies) for run in runs], None),
+        "skipped": ("messages", skipped, ("<=", 0.0)),
+        "tracked": ("robots", [len(run.robots) for run in runs], (">=", float(_ROBOTS))),
     }
-    for name, values in counts.items():
-        wanted = {"not recorded": ("<=", 0.0), "robots": (">=", float(_ROBOTS))}.get(name)
-        yield Row(f"{title}: {name}", tuple(map(float, values)), "", wanted)
+    for name, (unit, values, wanted) in counts.items():
+        yield Row(f"{title}: {name}", tuple(map(float, values)), unit, wanted)
     yield Row(f"{title}: memory", tuple(run.end.memory_mb for run in runs), "MB")
+
+
+def step_rows(hall: _Hall, folder: Path, model: str) -> Iterator[Row]:
+    """Yield the processor time of a message in each stage, in the writer, and in the overlap of cameras.
+
+    The first messages are not counted: they contain the preparation of the stages.
+    """
+    with Session([hall.calibrated]) as session:
+        settings = list(session.messages(["/rig", *session.calibrations.values()]))
+    with Session([hall.played]) as session:
+        topics = {MARKERS.topic_of(MARKERS_RUN, camera): camera for camera in hall.cameras}
+        markers = [
+            replace(message, topic=MARKERS.topic_of(NODES_RUN, topics[message.topic]))
+            for message in session.messages(list(topics))
+        ]
+    states = {camera: CameraState(format=MARKERS_FORMAT) for camera in hall.cameras}
+    plan = plan_live(states, settings, Request(models=(model,), model_from=hall.calibrated), None)
+    messages = markers
+    for wired in plan.stages:
+        begin_s = time.process_time()
+        list(run(settings, [wired]))
+        yield Row(f"preparation of {wired.stage.name}", (time.process_time() - begin_s,), "s")
+        begin_s = time.process_time()
+        messages = list(run(messages, [wired]))
+        yield _cost(wired.stage.name, begin_s, len(markers))
+    begin_s, counts = time.process_time(), dict[str, int]()
+    with LogWriter.create(folder / "written.mcap") as writer:
+        for message in (*settings, *messages):
+            write_message(writer, message, counts)
+    yield _cost("write", begin_s, len(markers))
+    consumers: dict[str, Any] = {
+        "overlap of cameras": OverlapSummary(),
+        "knocks": KnockMonitor(settings[0].payload),
+    }
+    for name, consumer in consumers.items():
+        begin_s = time.process_time()
+        for message in messages:
+            list(consumer(message) or ())
+        yield _cost(name, begin_s, len(markers))
+
+
+def _cost(name: str, begin_s: float, count: int) -> Row:
+    return Row(f"{name}, of a message", (_MS * (time.process_time() - begin_s) / count,), "ms")
 
 
 def measure(options: argparse.Namespace) -> Report:
     """Measure the centre of a hall, with cameras that take turns and with cameras in step."""
     report = Report("hall_nodes")
+    if find_spec("zenoh") is None:
+        report.remarks.append("no Zenoh for the nodes: pip install 'ipsys_log[ros2]'")
+        return report
     grid, seconds = ("2x1", 7.0) if options.smoke else (options.cameras, options.hall_seconds + _WARM_S)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for title, in_step in (("in turns", False), ("in step", True)):
             hall = make_hall(folder, grid, seconds, options.hall_model, in_step)
+            if not in_step:
+                report.rows += step_rows(hall, folder, options.hall_model)
             runs = [run_centre(hall, folder, options.hall_model) for _ in range(options.rounds)]
             report.rows += _rows(title, runs)
             report.details[title] = [

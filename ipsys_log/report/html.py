@@ -117,7 +117,7 @@ def _overlap(session: Session, findings: Findings) -> dict[str, Any]:
     run = newest_run(session, POSITIONS)
     pairs = read_disagreement(session, run, reference_ids(session)) if run else []
     return {
-        "overlap": {"run": run, "rows": html_sections.overlap_rows(pairs)} if pairs else None,
+        "overlap": {"run": run, **html_sections.overlap_tables(pairs)} if pairs else None,
         "overlap_pictures": overlap_pictures(pairs, findings.rig) if pairs else [],
     }
 

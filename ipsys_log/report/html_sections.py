@@ -29,10 +29,13 @@ __all__ = [
     "in_order",
     "model_rows",
     "overlap_rows",
+    "overlap_tables",
     "suspects",
 ]
 
 _TRUTH = "truth"
+# Of more pairs of cameras, the page shows those that differ most; all others are folded.
+_MOST_PAIRS = 10
 
 
 def format_cm(value_m: float | None, digits: int = 2) -> str:
@@ -269,6 +272,14 @@ def calibration(findings: Findings) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def overlap_tables(pairs: Sequence[PairDisagreement]) -> dict[str, list[dict[str, str]]]:
+    """Return the ``rows`` that the page shows, and ``all`` rows if these are only the largest ones."""
+    if len(pairs) <= _MOST_PAIRS:
+        return {"rows": overlap_rows(pairs), "all": []}
+    largest = sorted(pairs, key=lambda pair: -pair.median_m)[:_MOST_PAIRS]
+    return {"rows": overlap_rows(largest), "all": overlap_rows(pairs)}
 
 
 def overlap_rows(pairs: Sequence[PairDisagreement]) -> list[dict[str, str]]:

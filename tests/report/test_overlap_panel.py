@@ -9,21 +9,23 @@ import pytest
 
 from ipsys_log.analysis.disagreement import CameraPositions, PairDisagreement, compare_cameras
 from ipsys_log.messages import Floor, Rig
-from ipsys_log.report.html_sections import overlap_rows
+from ipsys_log.report.html_sections import overlap_rows, overlap_tables
 from ipsys_log.report.overlap_figure import overlap_pictures
 from ipsys_log.units import NS_PER_S
 
 
-def pairs(sigma_m: float | None) -> list[PairDisagreement]:
-    """Return two cameras that differ by 5 mm in x, with a stated standard deviation."""
+def pairs(
+    sigma_m: float | None, cameras: tuple[str, str] = ("red", "white"), apart_m: float = 0.005
+) -> list[PairDisagreement]:
+    """Return two cameras that differ in x, with a stated standard deviation."""
     times_ns = np.arange(200) * NS_PER_S // 30
     points_m = np.column_stack([1 + times_ns / NS_PER_S * 0.3, np.full(200, 2.0)])
     covariances = np.broadcast_to((np.nan if sigma_m is None else sigma_m**2) * np.eye(2), (200, 2, 2))
     ids = np.zeros(200, dtype=np.int64)
     return compare_cameras(
         [
-            CameraPositions("red", ids, times_ns, points_m + np.array([0.005, 0.0]), covariances),
-            CameraPositions("white", ids, times_ns, points_m, covariances),
+            CameraPositions(cameras[0], ids, times_ns, points_m + np.array([apart_m, 0.0]), covariances),
+            CameraPositions(cameras[1], ids, times_ns, points_m, covariances),
         ]
     )
 
@@ -45,3 +47,11 @@ def test_panel_has_a_map_and_a_time_course(rig: Rig | None) -> None:
     for one in shown:
         assert b"</svg>" in base64.b64decode(one["uri"].partition(",")[2])
     assert shown == overlap_pictures(pairs(0.005), rig)
+
+
+def test_page_shows_the_pairs_that_differ_most_and_folds_all() -> None:
+    many = [pair for n in range(12) for pair in pairs(0.005, ("a", f"b{n}"), n / 1000)]
+    tables = overlap_tables(many)
+    assert [row["cameras"] for row in tables["rows"]] == [f"a and b{n}" for n in range(11, 1, -1)]
+    assert [row["cameras"] for row in tables["all"]] == [f"a and b{n}" for n in range(12)]
+    assert overlap_tables(many[:3])["all"] == []

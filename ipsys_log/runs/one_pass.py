@@ -2,9 +2,9 @@
 
 The first stage works in threads or in processes, so that its followers have the core of this thread. A log
 holds its runs one after the other: the run of a stage begins when the run before it is complete. So the
-results of the followers wait in a temporary file for their turn. Then they are written as if the stage had read
-its input from the log. They are used only if the log has exactly this input by then; otherwise the stage is
-computed again.
+results of the followers wait in a temporary file for their turn. Then they are written as if the stage had
+read its input from the log. They are used only if the log has exactly this input by then; otherwise the stage
+is computed again.
 """
 
 from __future__ import annotations

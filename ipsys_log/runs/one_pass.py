@@ -1,9 +1,10 @@
 """One pass over a log for several stages: causal stages follow the stage whose messages they read.
 
-A log holds its runs one after the other: the run of a stage begins when the run before it is complete. So
-the results of the stages that follow wait in a temporary file for their turn. Then they are written as if the
-stage had read its input from the log. They are used only if the log has exactly this input by then; otherwise
-the stage is computed again.
+The first stage works in threads or in processes, so that its followers have the core of this thread. A log
+holds its runs one after the other: the run of a stage begins when the run before it is complete. So the
+results of the followers wait in a temporary file for their turn. Then they are written as if the stage had
+read its input from the log. They are used only if the log has exactly this input by then; otherwise the stage
+is computed again.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ipsys_log.runs.execute import has_given_name
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.inputs import first_settings, leaves_out_frames
 from ipsys_log.runs.options import Progress, Request
-from ipsys_log.runs.stream import Route, run, wire
+from ipsys_log.runs.stream import Route, derive, reader_of, wire
 
 __all__ = ["OnePass"]
 
@@ -64,12 +65,15 @@ class OnePass:
 
         Parameters
         ----------
-        messages, leader, name : the messages of a run, its task and its name.
+        messages, leader, name : the messages of a run, its task and its name. Nothing follows a stage without
+            threads.
         stages : the next stages in order. A model that is copied from another log is known before its turn.
             The first stage that cannot follow ends the pass; stages that read the whole log are left out.
         model : the model of the stages.
         """
-        if leader.step is None:
+        # After a stage in Python, reading its results from the log takes less time than keeping those of the
+        # next stage.
+        if not leader.stage.in_threads:
             yield from messages
             return
         self._forget()
@@ -85,7 +89,7 @@ class OnePass:
         """Return the results of a task that were computed before its turn; None if there are none."""
         for follower in self._followers:
             if follower.has_done(session, task, name):
-                progress(task.stage.name, 0, None)
+                progress(task.stage.name, follower.given, follower.given)
                 return follower.results()
         return None
 
@@ -185,7 +189,8 @@ class _Source:
 class _Follower:
     """A causal stage that gets the messages of a stage before it, and those of topics in the log.
 
-    ``before`` is the stage that it follows; None for the first stage of the pass.
+    ``before`` is the stage that it follows; None for the first stage of the pass. ``given`` is the number of
+    messages that it got.
     """
 
     def __init__(
@@ -195,10 +200,11 @@ class _Follower:
         self.before = before
         self._task, self._name, self._source = task, name, source
         self._wired = wire(task.stage, name, task.inputs, task.step(name))
+        self._payloads_of = reader_of(self._wired)
         routes = {Route(channel, source.run) for channel in source.stage.writes} & self._wired.reads
         self._types = {payload for route in routes for payload in route.channel.payloads}
         self._others = source.others(session, task)
-        self._given = 0
+        self.given = 0
         self._has_failed = self._is_complete = False
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115
         self._settings = first_settings(session, task, self._others)
@@ -214,7 +220,7 @@ class _Follower:
             for message in messages:
                 if type(message.payload) in self._types:
                     made += self._until(message.log_time_ns)
-                    self._given += 1
+                    self.given += 1
                     made += self._derive(message)
             if is_last:
                 made += self._until(None)
@@ -239,7 +245,7 @@ class _Follower:
         return (
             _settings_of(task) == _settings_of(mine)
             and source.others(session, task) == self._others
-            and sum(session.count(topic) for topic in made) == self._given
+            and sum(session.count(topic) for topic in made) == self.given
         )
 
     def results(self) -> Iterator[Message]:
@@ -266,8 +272,7 @@ class _Follower:
             self._next = next(self._recorded, None)
 
     def _derive(self, message: Message) -> list[Message]:
-        _, *made = run((message,), (self._wired,))
-        return made
+        return list(derive(self._wired, message, self._payloads_of(message)))
 
     def _keep(self, messages: Iterable[Message]) -> None:
         for message in messages:

@@ -17,7 +17,7 @@ from ipsys_log.messages import FrameTransforms, Message, kind_of
 from ipsys_log.messages.channels import Channel, channel_of
 from ipsys_log.messages.stage import Stage, Step
 
-__all__ = ["Route", "WiredStage", "derive", "in_threads", "run", "wire"]
+__all__ = ["Route", "WiredStage", "derive", "in_threads", "reader_of", "run", "wire"]
 
 Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
@@ -67,15 +67,25 @@ def run(source: Iterable[Message], stages: Sequence[WiredStage], map: Map = map)
     yield from source
 
 
-def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator[Message]:
+def reader_of(wired: WiredStage) -> Callable[[Message], list[Any]]:
+    """Return the function from a message to the payloads of a stage; none if the stage does not read it."""
     is_read: dict[tuple[str, type], bool] = {}
 
-    def work(message: Message) -> tuple[Message, list[Any]]:
+    def payloads_of(message: Message) -> list[Any]:
         key = message.topic, type(message.payload)
         if key not in is_read:
             channel = channel_of(*key)
             is_read[key] = channel is not None and Route(channel, run_of_topic(message.topic)) in wired.reads
-        return message, list(wired.step(message)) if is_read[key] else []
+        return list(wired.step(message)) if is_read[key] else []
+
+    return payloads_of
+
+
+def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator[Message]:
+    payloads_of = reader_of(wired)
+
+    def work(message: Message) -> tuple[Message, list[Any]]:
+        return message, payloads_of(message)
 
     for message, payloads in (map if wired.stage.per_camera else builtins.map)(work, source):
         yield message

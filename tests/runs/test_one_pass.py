@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,6 +20,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Marker, Markers, Message, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, channel_of
 from ipsys_log.pipeline import replay
+from ipsys_log.runs import execute
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, plan_stage, writer_of
 from ipsys_log.runs.one_pass import OnePass
@@ -29,7 +31,7 @@ from tests.geometry.squares import CENTRE, FISHEYE, corners_px, turned
 
 DETECT, CAMERA_FRAME = writer_of(MARKERS), writer_of(CAMERA_POINTS)
 STAGES = [DETECT.name, CAMERA_FRAME.name]
-MARKER = Marker(3, corners_px(FISHEYE, turned(0.3), CENTRE))
+MARKER = Marker(3, corners_px(FISHEYE, turned(0.3), np.array(CENTRE)))
 
 
 @pytest.mark.slow
@@ -108,7 +110,7 @@ def test_results_are_computed_again_after_a_change(
 ) -> None:
     """Another process appends a rig between two stages: the points must be those of the new rig."""
     alone = Path(shutil.copy(lab, tmp_path / "alone.mcap"))
-    run_stage = pipeline.run_stage
+    run_stage = execute.run_stage
 
     def run_and_append(session: Session, target: Path, task: Task, *rest: Any) -> Any:
         outcome = run_stage(session, target, task, *rest)

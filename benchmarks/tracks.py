@@ -268,7 +268,7 @@ def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--height-sigma-mm", type=float, default=0.0, help="sigma of the robots' heights")
     parser.add_argument("--condition", default="", help="only conditions with this in their name")
     parser.add_argument("--exactly", default="", help="only conditions with these names, separated by ;")
-    parser.add_argument("--rendered", action="store_true", help="render the labs: about 3 minutes for each")
+    parser.add_argument("--rendered", action="store_true", help="render the labs: a minute for each")
     parser.add_argument("--keep", default=str(CACHE / "labs"), help="folder of the rendered labs")
     parser.add_argument("--calibrations", default="", help=f"of {'; '.join(CALIBRATIONS)}")
     parser.add_argument("--contenders", default="", help=f"of {', '.join(CONTENDERS)}")

@@ -265,7 +265,8 @@ class RobotTracks:
     ) -> list[bool]:
         """Filter the sightings of some rows, and the later ones again; return which rows are accepted."""
         states, mask = self._states_after(batch, rows, tracks, places)
-        accepted, later = mask.tolist(), []
+        accepted: list[bool] = mask.tolist()
+        later = []
         for number, (row, track, place) in enumerate(zip(rows.tolist(), tracks, places, strict=True)):
             record = Record(
                 batch.times_ns[row], batch.camera, batch.inside[row], batch.sightings, row, states, number

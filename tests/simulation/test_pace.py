@@ -20,7 +20,7 @@ def test_way_of_a_pace_is_the_integral_of_its_speed() -> None:
     times_s = np.linspace(0.0, 60.0, 600_001)
     shares = pace.share_at(times_s)
     np.testing.assert_allclose(
-        pace.driven_s(times_s), cumulative_trapezoid(shares, times_s, initial=0.0), atol=1e-5
+        pace.driven_s(times_s), cumulative_trapezoid(shares, times_s, initial=0), atol=1e-5
     )
     assert shares.min() == 0.0
     assert shares.max() == 1.0

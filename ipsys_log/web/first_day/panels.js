@@ -108,11 +108,10 @@ function rig(state, act, step) {
   };
   form.addEventListener("input", show);
   show();
-  const help = [
+  const help = [make("div", { className: "help" }, make("div", {},
     make("p", { textContent: "Measure the side of the black square of a printed marker, without its white margin. With an error of 2 % in it, all heights have an error of 2 %." }),
-    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." }),
-  ];
-  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), sketch, make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
+    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." })), sketch)];
+  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
   const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
     make("h3", { textContent: "Without cameras" }),
@@ -122,7 +121,6 @@ function rig(state, act, step) {
     make("p", { textContent: "The fields have the values of an example: replace them by those of your lab." }),
     ...help,
     form,
-    sketch,
   ];
 }
 

@@ -11,7 +11,6 @@ from threading import Event, Thread
 import pytest
 
 from ipsys_log import __version__, pipeline
-from ipsys_log.capture.camera_thread import NODES_RUN
 from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
@@ -103,7 +102,7 @@ def test_centre_of_24_nodes_has_all_markers_and_tracks(tmp_path: Path, ipsys: Ip
     log = record_hall(tmp_path, lab, markers)
     with Session([log]) as session:
         for camera, sent in markers.items():
-            received = session.payloads([MARKERS.topic_of(NODES_RUN, camera)])
+            received = session.payloads([MARKERS.topic_of("nodes", camera)])
             received.sort(key=lambda row: row.timestamp)
             assert len(received) == round(SECONDS * RATE_HZ) == len(sent)
             # The times are those of the centre; all other bytes are those of the node.

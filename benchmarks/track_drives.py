@@ -164,7 +164,7 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
     )
     lab = build_lab(condition.settings(settings, 0))
     noise = replace(lab.settings, lab=replace(lab.settings.lab, seed=seed + _OTHER_NOISE))
-    lab = replace(lab, settings=noise, drive=replace(lab.drive, mirrored=not lab.drive.mirrored))
+    lab = replace(lab, settings=noise, drive=lab.drive.mirror())
     messages = list(simulate_session(lab))
     # The time of the joint model is that of its first camera.
     late_ns = lab.clock_offsets_ns[model.cameras[0].camera] if model.name == JOINT else 0

@@ -52,7 +52,7 @@ def observe(lab: GeometricLab) -> Observations:
 
 def origin_errors_m(lab: GeometricLab, observations: Observations, origins_m: list[Array]) -> Array:
     true_m = [lab.camera(camera.name).origin_m for camera in observations.cameras]
-    return np.linalg.norm(np.array(origins_m) - true_m, axis=1)
+    return np.asarray(np.linalg.norm(np.array(origins_m) - true_m, axis=1))
 
 
 @pytest.fixture(scope="module")

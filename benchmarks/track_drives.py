@@ -181,7 +181,7 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
     )
     lab = build_lab(condition.settings(settings, 0))
     noise = replace(lab.settings, lab=replace(lab.settings.lab, seed=seed + _OTHER_NOISE))
-    drive = replace(lab.drive, mirrored=not lab.drive.mirrored, paces=_paces(condition, seed, duration_s))
+    drive = replace(lab.drive.mirror(), paces=_paces(condition, seed, duration_s))
     lab = replace(lab, settings=noise, drive=drive)
     keep = condition.keep
     messages = list(simulate_session(lab)) if keep is None else rendered_session(lab, keep)

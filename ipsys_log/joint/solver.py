@@ -55,7 +55,7 @@ def solve(
     progress : called with the number of steps and the cost after each step.
     short : the fit has converged if a full step is shorter than this share of the standard deviation.
     patient : whether the limit falls only after convergence; until then, the whole lab moves to its measured
-        points after each step. In a hall, the sightings fit long before the cameras fit to the few measured
+        points before each step. In a hall, the sightings fit long before the cameras fit to the few measured
         points, which would then count as outliers.
 
     Raises
@@ -67,6 +67,7 @@ def solve(
     ----------
     Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000.
     """
+    state = anchor(problem, state) if patient else state
     ease, damping = problem.ease(state), _FIRST_DAMPING
     normal = problem.linearise(state, ease)
     for step in range(_MOST_STEPS):

@@ -45,6 +45,10 @@ class Drive:
     phases_rad: Array
     paces: Mapping[int, Pace] = field(default_factory=dict)
 
+    def mirror(self) -> Drive:
+        """Return the drive along the mirrored path."""
+        return replace(self, path=replace(self.path, mirrored=not self.path.mirrored))
+
     def poses_at(self, time_s: float) -> tuple[SimulatedPose, ...]:
         """Return the poses of all markers at a time after the start; before it, they are stationary."""
         return tuple(self.pose_at(marker_id, time_s) for marker_id in self.ahead_s)

@@ -211,6 +211,7 @@ def test_pieces_that_others_cannot_see_fail_the_log(monkeypatch: pytest.MonkeyPa
     scheduler.forgets = True
     results = run(scheduler, [Path("a.mcap"), Path("b.mcap")], 2, monkeypatch)
     assert results["b.mcap"].good
+    assert scheduler.starts["a.mcap"] == 4  # three divisions
     assert results["a.mcap"].text == (
         "its pieces are not in pieces: all workers must see this folder; use a shared file system"
     )

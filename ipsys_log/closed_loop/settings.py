@@ -259,8 +259,9 @@ def read_lab(log: Path, lab: LabSettings) -> LabSettings:
     ):
         return lab
     raise IpsysError(
-        f"--model-from {log}: is not a log of the simulated lab with seed {lab.seed}; make one with: ipsys "
-        f"simulate -o cal.mcap --seed {lab.seed}; ipsys replay cal.mcap"
+        f"--model-from {log}: is not a log of the simulated lab with seed {lab.seed}; give the seed of its "
+        f"'ipsys simulate' with --lab-seed, or make one: ipsys simulate -o cal.mcap "
+        f"--seed {lab.seed}; ipsys replay cal.mcap"
     )
 
 

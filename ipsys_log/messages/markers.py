@@ -30,8 +30,8 @@ class Marker:
 class Markers:
     """All markers in a frame of ``width`` x ``height`` px, sorted by id.
 
-    If a node has detected them, the log of the centre has the session of the node, and the number of the frame
-    in it.
+    If a node has detected them, the log of the centre has the session of the node, and the number of the
+    frame in it.
     """
 
     timestamp: TimeNs

@@ -4,8 +4,8 @@
 
 The exchanges have the times of the centre, and random delays in each direction, uniform up to 20 ms. Offsets
 are up to an hour, drifts up to 100 ppm. Before each exchange, the time of a frame of that instant is
-converted, as at the centre. A row is about the greatest error of each clock
-since the row before: median, minimum and maximum over all clocks.
+converted, as at the centre. A row is about the greatest error of each clock since the row before: median,
+minimum and maximum over all clocks.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from ipsys_log.units import NS_PER_S
 
 __all__ = ["measure"]
 
-_TIMES_S = (0.5, 1.0, 1.5, 2.5, 5.0, 10.0, 20.0, 30.0, 60.0, 90.0)
+_TIMES_S = (0.5, 1.0, 1.5, 2.5, 5.0, 10.0, 20.0, 30.0, 80.0)
 _START_NS = 1_700_000_000 * NS_PER_S
 _MS = NS_PER_S // 1000
-_LEAST_NS, _JITTER_NS, _WORK_NS = _MS // 10, 20 * _MS, _MS // 10
+_LEAST_MS, _JITTER_MS, _WORK_NS, _MOST_OFFSET_NS = 0.1, 20, _MS // 10, 3600 * NS_PER_S
 
 
 def _errors_ms(seed: int) -> Iterator[tuple[float, float]]:
     """Yield the time of each exchange in s, and the error of a frame at this instant in ms."""
     rng, history, at_s = random.Random(seed), ClockHistory(), 0.0
-    offset_ns, drift = rng.randint(-3600, 3600) * NS_PER_S, rng.uniform(-100e-6, 100e-6)
+    offset_ns, drift = rng.randint(-_MOST_OFFSET_NS, _MOST_OFFSET_NS), rng.uniform(-100e-6, 100e-6)
 
     def by_node(ns: int) -> int:
         return ns - offset_ns - round(drift * (ns - _START_NS))
@@ -42,7 +42,7 @@ def _errors_ms(seed: int) -> Iterator[tuple[float, float]]:
         centre_ns = history.to_centre_ns(by_node(sent_ns))
         if centre_ns is not None:
             yield at_s, abs(centre_ns - sent_ns) / _MS
-        there_ns, back_ns = (_LEAST_NS + rng.randrange(_JITTER_NS) for _ in range(2))
+        there_ns, back_ns = (round((_LEAST_MS + rng.random() * _JITTER_MS) * _MS) for _ in range(2))
         received_ns = sent_ns + there_ns
         replied_ns = received_ns + _WORK_NS
         history.add(Exchange(sent_ns, by_node(received_ns), by_node(replied_ns), replied_ns + back_ns))

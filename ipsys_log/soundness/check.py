@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 
 from ipsys_log.errors import IpsysError, reason_without
 from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.contents import StoredChannel, camera_of_topic
 from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
+from ipsys_log.messages.channels import clock_topic
 from ipsys_log.runs.options import Progress
 from ipsys_log.soundness.channels import (
     check_events,
@@ -73,13 +75,7 @@ def _check_log(path: LogLocation, others: Sequence[LogLocation], progress: Progr
 def _check_file(path: LogLocation, progress: Progress) -> Iterator[LogFinding]:
     advice = f"run: ipsys repair {path}"
     with LogReader(path) as reader:
-        times = MessageTimes(
-            {
-                topic
-                for topic in image_topics(reader.channels)
-                if reader.channels[topic].message_encoding != "cdr"  # its stamps are in the messages
-            }
-        )
+        times = MessageTimes(_stamped_topics(reader.channels))
         total = reader.size // _BYTES_PER_MB
 
         def show(checked: int) -> None:
@@ -97,6 +93,19 @@ def _check_file(path: LogLocation, progress: Progress) -> Iterator[LogFinding]:
         text = "another program changed messages: they do not match the hash that their writer stored"
         yield LogFinding("file", REMARK, text, "ask its sender for the original log", topic)
     yield from times.findings()
+
+
+def _stamped_topics(channels: Mapping[str, StoredChannel]) -> set[str]:
+    """Return the topics of images whose publish times are the stamps of a camera, in increasing order.
+
+    A bag of ROS 2 has its stamps in the messages. Late frames of a node come after newer ones.
+    """
+    return {
+        topic
+        for topic in image_topics(channels)
+        if channels[topic].message_encoding != "cdr"
+        and clock_topic(str(camera_of_topic(topic))) not in channels
+    }
 
 
 def _check_contents(

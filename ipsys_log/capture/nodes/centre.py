@@ -223,10 +223,15 @@ class _Link:
     def _take(self) -> _Arrival | None:
         with self._arrived:
             if not self._waiting:
-                self._arrived.wait(exchange_period_s(self._exchanges))
+                self._arrived.wait(self._until_request_s())
             arrival = self._waiting.popleft() if self._waiting else None
             self._waiting_bytes -= arrival.size if arrival else 0
             return arrival
+
+    def _until_request_s(self) -> float:
+        """Return the time until the next request for the state."""
+        since_s = (self._clock.now_ns() - self._state_asked_ns) / NS_PER_S
+        return max(exchange_period_s(self._exchanges) - since_s, 0.0)
 
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
         with self._arrived:
@@ -253,8 +258,7 @@ class _Link:
         """Ask the node for its state, if the last request is old enough."""
         import zenoh
 
-        now_ns = self._clock.now_ns()
-        if now_ns - self._state_asked_ns < exchange_period_s(self._exchanges) * NS_PER_S:
+        if self._until_request_s() > 0:
             return
         self._state_asked_ns = sent_ns = self._clock.now_ns()
 

@@ -16,6 +16,7 @@ import pytest
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.growing_channel import GrowingChannel
 from ipsys_log.messages import ClockEstimate, CompressedImage, clock_topic, image_topic
+from ipsys_log.soundness.check import check_logs
 from ipsys_log.units import NS_PER_S
 from tests.capture.nodes.lab_of_nodes import make_certificates
 from tests.capture.nodes.namespaces import CENTRE_IP, RELAY_IP, Hosts, in_host, three_hosts
@@ -149,6 +150,8 @@ def test_hosts_with_a_faulty_network_lose_no_frame_and_no_time(tmp_path: Path) -
         arrived = {m.payload.data: (m.publish_time_ns, m.payload) for m in centre.messages([topic])}
         estimates = centre.payloads([clock_topic("red")])
         kinds = [event.kind for event in centre.payloads(["/events"])]
+    (checked,) = check_logs([tmp_path / "centre.mcap"])
+    assert not [finding.text for finding in checked.findings if "capture times" in finding.text]
     first = min(index for index, row in enumerate(made) if row[2] in arrived)
     assert len({row[2] for row in made}) == len(made)
     for node_ns, image_format, data in made[first:]:

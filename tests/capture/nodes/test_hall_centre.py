@@ -117,6 +117,6 @@ def test_centre_of_24_nodes_has_all_markers_and_tracks(tmp_path: Path, ipsys: Ip
             cameras_of[track.robot].update(track.cameras)
     assert sorted(cameras_of) == sorted(f"robot_{number}" for number in range(ROBOTS))
     assert all(len(cameras) >= 2 for cameras in cameras_of.values())
-    assert kinds <= {"node_gap", "node_gap_filled"}
+    assert kinds <= {"camera_setting", "node_gap", "node_gap_filled"}
     done = ipsys("verify", log)
     assert done.code == 0, done.out + done.err

@@ -17,7 +17,7 @@ import pytest
 
 BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 # Benchmarks without ratios.
-FIGURES_ONLY = ("dashboard", "live", "remote", "robot_run", "streams")
+FIGURES_ONLY = ("dashboard", "hall", "live", "remote", "robot_run", "streams")
 
 
 @pytest.mark.slow

@@ -53,8 +53,8 @@ def test_log_of_another_lab_is_refused(replayed_log: Path, ipsys: Ipsys, tmp_pat
     options = ("--model-from", replayed_log, "-o", tmp_path / "run.mcap", "--lab-seed", "3")
     done = ipsys("drive", *options, "--program", PROGRAM)
     expected = (
-        f"ipsys: --model-from {replayed_log}: is not a log of the simulated lab with seed 3; give the seed of "
-        "its 'ipsys simulate' with --lab-seed, or make one: ipsys simulate -o cal.mcap --seed 3; "
+        f"ipsys: --model-from {replayed_log}: is not a log of the simulated lab with seed 3; give the seed "
+        "of its 'ipsys simulate' with --lab-seed, or make one: ipsys simulate -o cal.mcap --seed 3; "
         "ipsys replay cal.mcap\n"
     )
     assert (done.code, done.err) == (1, expected)

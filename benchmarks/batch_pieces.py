@@ -37,6 +37,8 @@ from ipsys_log.simulation.settings import LabSettings
 __all__ = ["measure"]
 
 _DIVIDED = BatchTask(replay_log, {"until": "detect"}, divides=True)
+_SCENE = LabSettings(width=960, height=540, stations=0, drive_s=4.0)
+_SMOKE = LabSettings(width=240, height=136, stations=0, rate_hz=5.0, drive_s=1.0)
 _LEAST_FRAMES = 1_200  # a shorter log is not divided
 _LEAST_WORK_S = 180.0
 
@@ -112,9 +114,7 @@ def measure(options: argparse.Namespace) -> Report:
     report = Report("batch_pieces")
     CACHE.mkdir(parents=True, exist_ok=True)
     frames = _LEAST_FRAMES if options.smoke else options.piece_frames
-    size = {"width": 240, "height": 136} if options.smoke else {"width": 960, "height": 540}
-    rate_hz = 5.0 if options.smoke else 30.0
-    settings = LabSettings(stations=0, rate_hz=rate_hz, drive_s=1.0 if options.smoke else 4.0, **size)
+    settings = _SMOKE if options.smoke else _SCENE
     with tempfile.TemporaryDirectory(dir=CACHE) as name:
         source, short = Path(name) / "long.mcap", Path(name) / "short.mcap"
         lengthened(drawn(settings), source, frames)

@@ -51,10 +51,10 @@ export function floorSketch(typed) {
   const { width_m: width, depth_m: depth } = typed;
   const points = [["A", typed.first_x_m, typed.first_y_m], ["B", typed.second_x_m, typed.second_y_m]];
   if (!(width > 0 && depth > 0) || points.flat().some((value) => Number.isNaN(value))) return [];
-  const unit = Math.max(width, depth) / 20, edge = 2 * unit;
-  const text = (x, y, content) => element("text", { x, y: depth - y, "font-size": unit }, content);
+  const unit = Math.max(width, depth) / 20, edge = 2.5 * unit;
+  const text = (x, y, content) => element("text", { x, y: depth - y, "font-size": 1.7 * unit }, content);
   const svg = element("svg", { viewBox: `${-edge} ${-edge} ${width + 2 * edge} ${depth + 2 * edge}`, role: "img", "aria-label": "The floor from above, with the reference points A and B" });
-  svg.append(element("rect", { width, height: depth }), element("path", { d: `M${unit * 4} ${depth}H0V${depth - unit * 4}`, class: "axes" }), text(unit * 4.3, -unit * 0.3, "x"), text(-unit * 0.3, unit * 4.6, "y"));
-  for (const [name, x, y] of points) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 3 }), text(x + unit / 2, y + unit / 2, name));
+  svg.append(element("rect", { width, height: depth }), element("path", { d: `M${unit * 4} ${depth}H0V${depth - unit * 4}`, class: "axes" }), text(unit * 4.4, -unit * 0.4, "x"), text(-unit * 0.4, unit * 4.6, "y"));
+  for (const [name, x, y] of points) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 2 }), text(x + unit, y + unit / 2, name));
   return [svg];
 }

@@ -53,14 +53,15 @@ def test_simulated_camera_in_use_is_not_offered_again() -> None:
 
 
 def test_each_camera_has_a_proposed_name_of_its_own(tmp_path: Path) -> None:
-    cameras = RigCamera("white", source="sim:black"), RigCamera("door")
-    rig = Rig("lab", "DICT_4X4_100", 0.2, cameras=cameras)
+    used = RigCamera("white", source="sim:black"), RigCamera("camera_1", source="rtsp://10.0.0.7/live")
+    rig = Rig("lab", "DICT_4X4_100", 0.2, cameras=(*used, RigCamera("door")))
     devices = [attached(tmp_path / f"video{number}", "Lab Camera") for number in range(2)]
     options = list_options(rig, devices)
     assert dict(zip([option.key for option in options], propose_names(options, rig), strict=True)) == {
         "sim:black": "white",
+        "rtsp://10.0.0.7/live": "camera_1",
         f"usb:{tmp_path / 'video0'}": "door",
-        f"usb:{tmp_path / 'video1'}": "camera_1",
+        f"usb:{tmp_path / 'video1'}": "camera_2",
         "sim:red": "red",
-        "sim:white": "camera_2",
+        "sim:white": "camera_3",
     }

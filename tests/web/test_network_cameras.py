@@ -21,6 +21,7 @@ from ipsys_log.web.server import serve_app
 from tests.capture.nodes.lab_of_nodes import free_port, sending
 from tests.capture.streams import encode, make_jpegs
 from tests.capture.test_rtsp import CODECS, HAS_SERVER, served
+from tests.playing import WAIT_LIMIT_S
 from tests.web.phone import Phone, phone
 from tests.web.test_connections import wait_until
 from tests.web.test_measuring_page import says
@@ -176,7 +177,8 @@ def test_camera_of_a_node_is_added_with_its_picture(folder: Path, tmp_path: Path
 
 
 def test_stop_ends_the_wait_for_a_node(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(centre, "_FIRST_ANSWER_S", 1e6)  # without a stop, the job does not end
+    # Without a stop, the wait is longer than that of this test.
+    monkeypatch.setattr(centre, "_FIRST_ANSWER_S", 2 * WAIT_LIMIT_S)
     (folder / "lab.toml").write_text(f'{RIG}[nodes]\ncentre = "127.0.0.1:{free_port()}"\n')
     with page_of(folder) as page:
         assert page.ask("/api/address", {"values": {"address": "zenoh:ceiling"}}) == (200, {})

@@ -198,7 +198,9 @@ def choose_paths(count: int, given: Sequence[str] = ()) -> dict[str, tuple[Waypo
     for text in given:
         robot, _, places = text.partition("=")
         if robot not in paths:
-            raise IpsysError(f"--path {text}: no robot {robot}; the robots are {', '.join(paths)}")
+            raise IpsysError(
+                f"--path {text}: no robot {robot}; write ROBOT=X,Y X,Y ... with one of {', '.join(paths)}"
+            )
         try:
             paths[robot] = tuple(_waypoint(place) for place in places.split())
         except ValueError as error:

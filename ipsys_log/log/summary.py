@@ -3,6 +3,7 @@
 import struct
 import zlib
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 from mcap import records as mcap
@@ -183,9 +184,12 @@ def _footer(view: LogBytes) -> tuple[int, int, bool]:
     footer_at = view.size - len(MAGIC) - FOOTER.size
     tail = view.read(footer_at, view.size - footer_at) if footer_at >= len(MAGIC) else b""
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
+        # A file is repaired in place; an object at a URL cannot be.
+        is_file = isinstance(path, Path)
+        steps = f"Run: ipsys repair {path}" if is_file else "Download the log, and repair the file"
         raise NoFooterError(
             f"{path} has no end: its recorder was killed, or the file was cut off. Its messages can be "
-            f"saved. Run: ipsys repair {path}"
+            f"saved. {steps}"
         )
     _, _, summary_start, _, crc = FOOTER.unpack_from(tail)
     if summary_start and not len(MAGIC) < summary_start <= footer_at:

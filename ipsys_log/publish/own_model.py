@@ -59,6 +59,8 @@ def load_own_model(text: str) -> OwnModel:
         raise IpsysError(
             f"--model {text}: write the file and the class of a model, such as mine.py:Estimator"
         )
+    if not path.exists():
+        raise IpsysError(f"--model {text}: {path} does not exist; give the file of your model")
     if path.suffix != ".py" or not path.is_file():
         raise IpsysError(f"--model {text}: {path} is not a Python file; give the file of your model")
     spec = importlib.util.spec_from_file_location(f"ipsys_own_model_{path.stem}", path)

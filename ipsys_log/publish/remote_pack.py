@@ -77,7 +77,9 @@ def _download(source: str) -> Iterator[bytes]:
             while piece := file.read(_PIECE):
                 yield piece
     except Exception as error:  # each file system of fsspec has errors of its own
-        text = plain_text(str(error) or type(error).__name__, longest=200)
+        # fsspec hides a failed connection behind a missing file, whose text is only the address.
+        cause = error.__cause__ if isinstance(error, FileNotFoundError) and error.__cause__ else error
+        text = plain_text(str(cause) or type(cause).__name__, longest=200)
         raise IpsysError(
             f"{_shown(source)}: the download failed: {text}; check the address and the connection"
         ) from error

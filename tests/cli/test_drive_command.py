@@ -14,7 +14,10 @@ PROGRAM = ROOT / "examples/robot/robot.py"
 
 REFUSED = {
     ("--robots", "9"): "--robots 9: give 1 to 3",
-    ("--path", "eve=1,1 2,2"): "--path eve=1,1 2,2: no robot eve; the robots are robot_0",
+    (
+        "--path",
+        "eve=1,1 2,2",
+    ): "--path eve=1,1 2,2: no robot eve; write ROBOT=X,Y X,Y ... with one of robot_0",
     ("--path", "robot_0=1,1"): "--path robot_0=1,1: a path has at least two waypoints",
     ("--path", "robot_0=1 2"): '--path robot_0=1 2: write ROBOT=X,Y X,Y in m, as "robot_0=0.5,0.5 2,1"',
     ("--path", "robot_0=1,1 nan,2"): "--path robot_0=1,1 nan,2: write ROBOT=X,Y X,Y in m, as "
@@ -54,8 +57,8 @@ def test_log_of_another_lab_is_refused(replayed_log: Path, ipsys: Ipsys, tmp_pat
     done = ipsys("drive", *options, "--program", PROGRAM)
     expected = (
         f"ipsys: --model-from {replayed_log}: is not a log of the simulated lab with seed 3; give the seed "
-        "of its 'ipsys simulate' with --lab-seed, or make one: ipsys simulate -o cal.mcap --seed 3; "
-        "ipsys replay cal.mcap\n"
+        "of its 'ipsys simulate' with --lab-seed, or make one: ipsys simulate -o cal.mcap --seed 3; ipsys "
+        "replay cal.mcap\n"
     )
     assert (done.code, done.err) == (1, expected)
 

@@ -94,6 +94,10 @@ def faults(store: Store) -> Iterator[tuple[str, str]]:
     store.with_ranges = True
     yield f"{store.put('/page.mcap', b'<html>' * 30_000)}", " is not an MCAP file"
     yield store.put("/empty.mcap", b""), " is empty: it has no messages"
+    text = (
+        " has no end: its recorder was killed, or the file was cut off. Its messages can be saved. Download"
+    )
+    yield store.put("/cut.mcap", GOLDEN.read_bytes()[:50_000]), text
 
 
 def test_faults_of_a_server_are_one_line(store: Store, ipsys: Ipsys) -> None:

@@ -318,7 +318,7 @@ def test_own_model_of_python_is_ranked(packed: Path) -> None:
 # The first cases need no run of the pipeline.
 _FAULTS = (
     ("mine.py:Missing", "has no class Missing"),
-    ("other.py:Estimator", "is not a Python file"),
+    ("other.py:Estimator", "other.py does not exist; give the file"),
     (":Estimator", "write the file and the class of a model"),
     ("polly", "model 'polly' is not known"),
     ("best", "states no score of best; it has rigid, poly"),

@@ -49,6 +49,12 @@ def test_missing_dataset_at_an_address_is_one_line(address: str, temporary: Path
     assert list(temporary.iterdir()) == []
 
 
+def test_failed_download_has_a_reason() -> None:
+    """Nothing listens on port 1."""
+    with pytest.raises(IpsysError, match=r"the download failed: Cannot connect to host 127\.0\.0\.1:1"):
+        ipsys_log.score("http://127.0.0.1:1/other.zip")
+
+
 def test_download_larger_than_the_disk_ends(
     address: str, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

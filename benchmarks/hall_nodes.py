@@ -266,8 +266,8 @@ def _rows(title: str, runs: Sequence[_Run]) -> Iterator[Row]:
         "skipped": ("messages", skipped, ("<=", 0.0)),
         "tracked": ("robots", [len(run.robots) for run in runs], (">=", float(_ROBOTS))),
     }
-    for name, (unit, values, wanted) in counts.items():
-        yield Row(f"{title}: {name}", tuple(map(float, values)), unit, wanted)
+    for name, (unit, numbers, wanted) in counts.items():
+        yield Row(f"{title}: {name}", tuple(map(float, numbers)), unit, wanted)
     yield Row(f"{title}: memory", tuple(run.end.memory_mb for run in runs), "MB")
 
 

@@ -1,6 +1,6 @@
 """A hall at its centre: markers of 24 nodes at 30/s, over sessions of Zenoh on loopback.
 
-    python benchmarks/hall_nodes.py --hall-seconds 30 --cameras 6x4
+    python benchmarks/hall_nodes.py --hall-seconds 30 --hall-cameras 6x4
 
 The markers of twelve robots come from exact geometry, with the noise of ``detect``. No image is rendered.
 Nodes play them in real time, several in one process; ``ipsys live`` runs as for a user, in a process of its
@@ -266,8 +266,8 @@ def _rows(title: str, runs: Sequence[_Run]) -> Iterator[Row]:
         "skipped": ("messages", skipped, ("<=", 0.0)),
         "tracked": ("robots", [len(run.robots) for run in runs], (">=", float(_ROBOTS))),
     }
-    for name, (unit, values, wanted) in counts.items():
-        yield Row(f"{title}: {name}", tuple(map(float, values)), unit, wanted)
+    for name, (unit, numbers, wanted) in counts.items():
+        yield Row(f"{title}: {name}", tuple(map(float, numbers)), unit, wanted)
     yield Row(f"{title}: memory", tuple(run.end.memory_mb for run in runs), "MB")
 
 
@@ -320,7 +320,7 @@ def measure(options: argparse.Namespace) -> Report:
     if find_spec("zenoh") is None:
         report.remarks.append("no Zenoh for the nodes: pip install 'ipsys_log[ros2]'")
         return report
-    grid, seconds = ("2x1", 7.0) if options.smoke else (options.cameras, options.hall_seconds + _WARM_S)
+    grid, seconds = ("2x1", 7.0) if options.smoke else (options.hall_cameras, options.hall_seconds + _WARM_S)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for title, in_step in (("in turns", False), ("in step", True)):
@@ -339,7 +339,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
-    parser.add_argument("--cameras", default="6x4", help="columns x rows of the hall")
+    parser.add_argument("--hall-cameras", default="6x4", help="columns x rows of the hall")
     parser.add_argument("--hall-seconds", type=float, default=30.0, help="of a run, after its first 5 s")
     parser.add_argument("--hall-model", default="rayplane", help="the model of the positions")
 

@@ -14,6 +14,7 @@ import sys
 import time
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 
@@ -49,7 +50,7 @@ def play(log: Path, network: NodeNetwork, cameras: list[str]) -> None:
                     __version__,
                     log,
                     clock,
-                    lambda text, flag=flag: flag.set() if text.startswith("the centre") else None,
+                    partial(_note_centre, flag),
                     sends_markers=True,
                 )
             )
@@ -62,6 +63,11 @@ def play(log: Path, network: NodeNetwork, cameras: list[str]) -> None:
         print("played", flush=True)
         left = sum(node.finish(has_ended=True) for node in nodes.values())
     print(json.dumps({"sent": sent, "left": left}), flush=True)
+
+
+def _note_centre(asked: Event, text: str) -> None:
+    if text.startswith("the centre"):
+        asked.set()
 
 
 def _send(messages: list[Message], nodes: dict[str, Node], clock: Clock, later_ns: int) -> dict[str, int]:

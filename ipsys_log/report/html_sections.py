@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 _TRUTH = "truth"
-# Of more pairs of cameras, the page shows those that differ most; all others are folded.
+# The page shows so many pairs of cameras, those that differ most; a folded table has all pairs.
 _MOST_PAIRS = 10
 
 

@@ -65,7 +65,7 @@ def _time_picture(pairs: Sequence[PairDisagreement]) -> dict[str, Any]:
     style_axes(axes)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     few = (
-        f". Of {len(pairs)} pairs, the {len(shown)} with the largest medians"
+        f". Shown are the {len(shown)} of {len(pairs)} pairs with the largest medians"
         if len(shown) < len(pairs)
         else ""
     )

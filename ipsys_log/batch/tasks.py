@@ -72,8 +72,8 @@ class LogResult:
     runs : the runs that were computed, compared or exported.
     messages : the number of messages that were written, compared or exported.
     trace : the traceback of a fault of the program; "" otherwise.
-    pieces : the number of pieces of a long log that were computed as tasks of their own.
-    lost_attempts : the number of results of pieces that were computed more than once, and deleted.
+    pieces : the number of merged pieces of a long log; None for a log that was one task.
+    lost_attempts : the number of their further results, which were deleted; None for a log that was one task.
     """
 
     log: str
@@ -83,8 +83,8 @@ class LogResult:
     runs: tuple[str, ...] = ()
     messages: int = 0
     trace: str = ""
-    pieces: int = 0
-    lost_attempts: int = 0
+    pieces: int | None = None
+    lost_attempts: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,8 +269,8 @@ def replay_log(
         text=_remarks_text(remarks),
         runs=tuple(dict.fromkeys(outcome.run for outcome in new)),
         messages=sum(outcome.messages for outcome in new),
-        pieces=stored.merged,
-        lost_attempts=lost,
+        pieces=stored.merged or None,
+        lost_attempts=lost if stored.merged else None,
     )
 
 

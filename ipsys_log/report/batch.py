@@ -54,7 +54,7 @@ def batch_json(results: Sequence[LogResult]) -> dict[str, Any]:
         "logs": len(results),
         "states": dict(Counter(result.state for result in results).most_common()),
         "results": [
-            {key: value for key, value in asdict(result).items() if value not in ("", ())}
+            {key: value for key, value in asdict(result).items() if value not in ("", (), None)}
             for result in results
         ],
     }

@@ -19,10 +19,10 @@ from ipsys_log.messages.channels import MARKERS
 from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["Arrival", "CameraReader", "CameraState", "ReaderContext", "imported_run"]
+__all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "ReaderContext", "imported_run"]
 
 # The run of markers that nodes have detected.
-_NODES_RUN = "nodes"
+NODES_RUN = "nodes"
 
 # Longest wait for the first frame of a camera.
 _FIRST_FRAME_S = 10.0
@@ -76,7 +76,7 @@ def imported_run(states: Mapping[str, CameraState]) -> str | None:
             f"camera {', '.join(names)} sends markers, but camera {others} sends frames; start all nodes with"
             " --detect, or none"
         )
-    return _NODES_RUN if names else None
+    return NODES_RUN if names else None
 
 
 class Arrival(NamedTuple):
@@ -254,7 +254,7 @@ class CameraReader:
         except LogError as error:
             raise SourceError(f"camera {name}: its node sends damaged markers ({error})") from error
         keyed = replace(markers, timestamp=time_ns, node_session=frame.session, node_frame=frame.number)
-        return MARKERS.topic_of(_NODES_RUN, name), keyed
+        return MARKERS.topic_of(NODES_RUN, name), keyed
 
     def _is_early(self, frame: Frame) -> bool:
         """Return whether a frame arrived before the recording began, or depends on a frame that did.

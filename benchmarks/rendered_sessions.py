@@ -59,7 +59,7 @@ def rendered_session(lab: GeometricLab, folder: Path) -> list[Message]:
 
 def _key(lab: GeometricLab) -> str:
     paces = {robot: (one.times_s.tolist(), one.shares.tolist()) for robot, one in lab.drive.paces.items()}
-    return simulator_key(f"{lab.settings} {lab.drive.mirrored} {paces} {dict(STAGE.versions)}")
+    return simulator_key(f"{lab.settings} {lab.drive.path} {paces} {dict(STAGE.versions)}")
 
 
 def _through_images(lab: GeometricLab) -> Iterator[Message]:

@@ -67,8 +67,8 @@ def draw_pace(stops: Stops, speed_m_s: float, duration_s: float, rng: np.random.
     --------
     >>> stops = Stops(legs_s=6.0, stands_s=2.0, acceleration_m_s2=2.5)
     >>> pace = draw_pace(stops, 0.26, 600.0, np.random.default_rng(0))
-    >>> round(float(pace.driven_s(np.array([600.0]))[0] / 600), 1)
-    0.7
+    >>> round(float(pace.driven_s(np.array([600.0]))[0] / 600), 2)
+    0.76
     """
     ramp_s, knots = speed_m_s / stops.acceleration_m_s2, [(0.0, 1.0)]
     time_s = rng.exponential(stops.legs_s)

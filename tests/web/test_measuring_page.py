@@ -309,7 +309,7 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
         assert hand.run("document.querySelector('#sides').hidden")
         for selector, text in (("#d-A", "170"), ("#d-C", "348"), ("#height", "10")):
             hand.type(selector, text)
-        says(hand, "#sides", "Stand at A and look at C")
+        says(hand, "#sides", "Seen from A towards C")
         says(hand, "#save", "Still missing: left or right of the line from A to C")
         hand.type("#d-B", "190")
         hand.wait("document.querySelector('#sides').hidden")

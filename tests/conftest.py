@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import typer.main
@@ -37,6 +37,7 @@ from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 from tests.capture.streams import encode
 from tests.live_recordings import record_every_frame
+from tests.s3_server import open_bucket, serve_s3
 from tests.shared_files import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -258,3 +259,16 @@ def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> U
 def unmeasured(unmeasured_log: Unmeasured, tmp_path: Path) -> Unmeasured:
     """Copy the session without measurements."""
     return unmeasured_log._replace(log=Path(shutil.copy(unmeasured_log.log, tmp_path / "unmeasured.mcap")))
+
+
+@pytest.fixture(scope="module")
+def s3_address() -> Iterator[str]:
+    with serve_s3() as address:
+        yield address
+
+
+@pytest.fixture
+def bucket(s3_address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Open an empty bucket of a real S3 server on loopback."""
+    with open_bucket(s3_address, monkeypatch) as bucket:
+        yield bucket

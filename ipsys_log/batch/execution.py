@@ -53,7 +53,7 @@ class _Log:
     """A log of the batch, and the number of its pieces that are not stored yet.
 
     ``divisions`` counts the times that pieces were missing; ``is_divided`` is False if the log must be one
-    task.
+    task; ``is_over`` is True when the log has a result.
     """
 
     path: LogLocation
@@ -61,7 +61,7 @@ class _Log:
     is_divided: bool = True
     pieces: int = 0
     missing: int = 0
-    failed: bool = False
+    is_over: bool = False
 
 
 @dataclass(slots=True)
@@ -80,8 +80,8 @@ class _Attempt:
 
     @property
     def is_needed(self) -> bool:
-        """False for a piece of a log that has failed, or is one task now."""
-        return self.piece is None or (self.division == self.log.divisions and not self.log.failed)
+        """False for a piece of a log that has a result already, or is one task now."""
+        return self.piece is None or (self.division == self.log.divisions and not self.log.is_over)
 
     @property
     def place(self) -> str:
@@ -173,7 +173,7 @@ class _Batch:
         elif answer is None:
             self._repeat(attempt)
         if answer is not None:
-            attempt.log.failed = True  # or done: no piece of it is needed
+            attempt.log.is_over = True
             self._done += 1
             if self._done % _GROW_AFTER == 0:
                 self._window = self._workers.window()

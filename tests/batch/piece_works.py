@@ -17,7 +17,7 @@ from ipsys_log.batch.tasks import LogResult, replay_log
 from ipsys_log.log.location import LogLocation
 from ipsys_log.runs import pieces
 from ipsys_log.runs.piece_folder import PieceTask, store_piece
-from tests.batch.works import DEADLY, HELD, PATIENCE_S
+from tests.batch.works import DEADLY, HELD, PATIENCE_S, is_first
 
 NOTES = "IPSYS_TEST_NOTES"
 # Short enough for several pieces of each camera in a small log.
@@ -41,8 +41,7 @@ def _store_and_note(task: PieceTask) -> None:
             (notes / "deadly_piece").symlink_to(task.key)
         if str((notes / "deadly_piece").readlink()) == task.key:
             os.kill(os.getpid(), signal.SIGKILL)
-    if log == HELD and not (notes / "killed").exists():
-        (notes / "killed").write_text(task.key)
+    if log == HELD and is_first(notes / "killed", task.key):
         (notes / "pid").write_text(str(os.getpid()))
         time.sleep(PATIENCE_S)
     store_piece(task)

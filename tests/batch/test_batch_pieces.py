@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ import pytest
 from ipsys_log import api
 from ipsys_log.batch.execution import MOST_ENDED_WORKERS
 from tests.batch.piece_works import NOTES, PARAMETERS, UNTIL
-from tests.batch.works import DEADLY, HELD, PATIENCE_S, wait_for
+from tests.batch.works import DEADLY, HELD, PATIENCE_S, one_worker_killed
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
@@ -74,27 +72,24 @@ def test_pieces_on_workers_give_the_bytes_of_one_process(
 
 
 def test_killed_worker_costs_only_its_piece(lab_log: Path, tmp_path: Path, replayed: bytes) -> None:
-    """One piece is killed in its middle and done again; one piece ends all its workers and is named."""
-    (tmp_path / "logs").mkdir()
-    logs = [Path(shutil.copy(lab_log, tmp_path / "logs" / name)) for name in (HELD, DEADLY)]
+    """A piece whose worker is killed in its middle is done again, and no other piece."""
+    log = Path(shutil.copy(lab_log, tmp_path / HELD))
     notes = tmp_path / "notes"
-
-    def kill() -> None:
-        wait_for(notes / "pid")
-        os.kill(int((notes / "pid").read_text()), signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    results = drive(logs, notes, workers=2)
-    killer.join()
-    killed = (notes / "killed").read_text()
+    with one_worker_killed(notes):
+        results = drive([log], notes, workers=2)
     counts = starts(notes, HELD)
     assert results[HELD]["state"] == "computed", results
-    assert {key for key, count in counts.items() if count > 1} == {killed}
-    assert logs[0].read_bytes() == replayed
-    failed = results[DEADLY]
+    assert {key for key, count in counts.items() if count > 1} == {(notes / "killed").read_text()}
+    assert log.read_bytes() == replayed
+
+
+def test_piece_that_ends_all_its_workers_is_named(lab_log: Path, tmp_path: Path) -> None:
+    """The log stays as it was, and its other pieces stay for the next call."""
+    log = Path(shutil.copy(lab_log, tmp_path / DEADLY))
+    notes = tmp_path / "notes"
+    failed = drive([log], notes, workers=2)[DEADLY]
     assert f"its worker ended {MOST_ENDED_WORKERS} times in the piece of " in failed["text"]
-    assert logs[1].read_bytes() == lab_log.read_bytes()
-    # The pieces that were done stay for the next call.
-    kept = list((tmp_path / "logs" / f"{DEADLY}.pieces").iterdir())
-    assert len(kept) == len(starts(notes, DEADLY)) - 1
+    assert log.read_bytes() == lab_log.read_bytes()
+    # A worker that ends loses results that Dask has not taken yet: such a piece has a second attempt.
+    kept = {file.name.partition(".")[0] for file in (tmp_path / f"{DEADLY}.pieces").iterdir()}
+    assert kept == starts(notes, DEADLY).keys() - {str((notes / "deadly_piece").readlink())}

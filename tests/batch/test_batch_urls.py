@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,41 +22,14 @@ from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.log.location import LogUrl
 from ipsys_log.runs import pieces
 from tests.batch.piece_works import PARAMETERS, UNTIL
-from tests.batch.works import PATIENCE_S
+from tests.batch.works import batch
 from tests.conftest import ROOT, Ipsys
-from tests.s3_server import open_bucket, put, serve_s3
+from tests.s3_server import put
 
 # The import of the server takes seconds; s3fs closes its connections after the test.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with serve_s3() as address:
-        yield address
-
-
-@pytest.fixture
-def bucket(address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with open_bucket(address, monkeypatch) as bucket:
-        yield bucket
-
-
-def batch(folder: Path, *arguments: object) -> dict[str, Any]:
-    """Run a command of the group as a program; return its JSON."""
-    done = subprocess.run(
-        [sys.executable, "-m", "ipsys_log", "batch", *map(str, arguments), "--json"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert done.stdout, done.stderr
-    answer: dict[str, Any] = json.loads(done.stdout)
-    return answer
 
 
 def test_results_of_objects_are_in_derived_logs(bucket: Any, tmp_path: Path) -> None:
@@ -69,13 +39,14 @@ def test_results_of_objects_are_in_derived_logs(bucket: Any, tmp_path: Path) -> 
         put(bucket, f"2026-{month}/lab.mcap", PAPER_LAB.read_bytes())
     api.replay(PAPER_LAB, models=("rigid",), output=tmp_path / "alone.mcap")
     command = ("replay", "s3://logs/2026-*/lab.mcap", "--model", "rigid", "-o", "out", "--workers", 1)
-    assert batch(tmp_path, *command)["states"] == {"computed": 2}
+    _, result, errors = batch(tmp_path, *command)
+    assert result["states"] == {"computed": 2}, errors
     derived = [tmp_path / "out" / f"2026-{month}" / "lab.derived.mcap" for month in ("01", "02")]
     assert sorted(path for path in (tmp_path / "out").rglob("*") if path.is_file()) == derived
     assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
     put(bucket, "2026-03/lab.mcap", b"no log")
-    result = batch(tmp_path, *command)
-    assert result["states"] == {"up to date": 2, "failed": 1}
+    _, result, errors = batch(tmp_path, *command)
+    assert result["states"] == {"up to date": 2, "failed": 1}, errors
     assert result["results"][2]["log"] == "s3://logs/2026-03/lab.mcap"
     assert len(result["results"][2]["text"].splitlines()) == 1
 

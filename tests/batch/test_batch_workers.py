@@ -22,7 +22,7 @@ from ipsys_log.batch.execution import MOST_ENDED_WORKERS
 from ipsys_log.batch.tasks import replay_log
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.soundness.finding import BROKEN
-from tests.batch.works import DEADLY, HELD, PATIENCE_S, wait_for
+from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, wait_for
 from tests.conftest import ROOT, small_disk
 
 pytestmark = pytest.mark.slow
@@ -43,19 +43,6 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     (log,) = copies(tmp_path_factory.mktemp("single"), "log.mcap")
     api.replay(log, models=("rigid",))
     return log.read_bytes()
-
-
-def batch(folder: Path, *arguments: object) -> tuple[int, Any, str]:
-    """Run a command of the group as a program; return its exit code, its JSON and its errors."""
-    done = subprocess.run(
-        [sys.executable, "-m", "ipsys_log", "batch", *map(str, arguments), "--json"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    return done.returncode, json.loads(done.stdout) if done.stdout else None, done.stderr
 
 
 def drive(logs: list[Path], notes: Path, **workers: object) -> dict[str, Any]:
@@ -108,14 +95,8 @@ def test_killed_workers_cost_only_the_log_that_ends_them(tmp_path: Path, replaye
     logs = copies(tmp_path / "logs", *names)
     notes = tmp_path / "notes"
 
-    def kill() -> None:
-        wait_for(notes / "pid")
-        os.kill(int((notes / "pid").read_text()), signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    results = drive(logs, notes, workers=2)
-    killer.join()
+    with one_worker_killed(notes):
+        results = drive(logs, notes, workers=2)
     assert {name for name, result in results.items() if not result["good"]} == {DEADLY}
     assert f"its worker ended {MOST_ENDED_WORKERS} times" in results[DEADLY]["text"]
     # A worker can end while a log waits for it.

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from ipsys_log.batch.tasks import LogResult, replay_log
 
@@ -23,14 +30,50 @@ def wait_for(path: Path) -> None:
         time.sleep(0.05)
 
 
+@contextmanager
+def one_worker_killed(notes: Path) -> Iterator[None]:
+    """Kill the worker that notes its process, by its id, while the block runs."""
+
+    def kill() -> None:
+        wait_for(notes / "pid")
+        os.kill(int((notes / "pid").read_text()), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    yield
+    killer.join()
+
+
+def batch(folder: Path, *arguments: object) -> tuple[int, Any, str]:
+    """Run a command of the group as a program; return its exit code, its JSON and its errors."""
+    done = subprocess.run(
+        [sys.executable, "-m", "ipsys_log", "batch", *map(str, arguments), "--json"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    return done.returncode, json.loads(done.stdout) if done.stdout else None, done.stderr
+
+
+def is_first(note: Path, text: str) -> bool:
+    """Return True in the one process that writes the note first."""
+    try:
+        with note.open("x") as file:
+            file.write(text)
+    except FileExistsError:
+        return False
+    return True
+
+
 def replay_and_note(path: Path, notes: Path) -> LogResult:
     """Replay a log; note each start. One log ends each of its workers, another one waits to be killed."""
     with (notes / f"{path.stem}.starts").open("a") as file:
         file.write("x")
     if path.name == DEADLY:
         os.kill(os.getpid(), signal.SIGKILL)
-    if path.name == HELD and not (notes / "killed").exists():
-        (notes / "killed").write_text("soon")
+    if path.name == HELD and is_first(notes / "killed", path.name):
         # The replay is in its middle: the log has some of its runs.
         replay_log(path, until="camera-frame")
         (notes / "pid").write_text(str(os.getpid()))

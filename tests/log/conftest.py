@@ -2,7 +2,7 @@
 
 import subprocess
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -10,9 +10,11 @@ from mcap import records as mcap
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
+from ipsys_log.log import remote_object
 from ipsys_log.log.contents import RawMessage, Schema
 from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.writer import LogWriter
+from tests.log.range_server import Store, serve_ranges
 from tests.node_packages import install
 
 IMAGE = Schema("foxglove.CompressedImage", "protobuf", b"image definition")
@@ -80,6 +82,14 @@ def rows() -> list[Row]:
 @pytest.fixture
 def log(tmp_path: Path, rows: list[Row]) -> Path:
     return create(tmp_path / "session.mcap", rows)
+
+
+@pytest.fixture
+def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    """Serve objects with ranges on loopback; a reader does not pause before it tries again."""
+    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,) * 4)
+    with serve_ranges() as store:
+        yield store
 
 
 @pytest.fixture(scope="session")

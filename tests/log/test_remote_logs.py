@@ -11,22 +11,14 @@ import pytest
 
 import ipsys_log
 from ipsys_log.errors import IpsysError
-from ipsys_log.log import remote_object
 from ipsys_log.log.codec import encode
 from tests.conftest import ROOT, Ipsys
-from tests.log.range_server import Store, serve_ranges
+from tests.log.range_server import Store
 
 PAPER_LAB, SMALL_LAB = (ROOT / "sample_logs" / f"{name}_lab.mcap" for name in ("paper", "small"))
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
 # aiohttp closes its connections after the test.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
-
-
-@pytest.fixture
-def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,) * 4)
-    with serve_ranges() as store:
-        yield store
 
 
 @pytest.fixture

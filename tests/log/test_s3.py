@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +14,11 @@ from ipsys_log.log.location import find_logs, parse_location
 from ipsys_log.log.log_files import states_below
 from ipsys_log.log.remote_object import open_object
 from tests.conftest import ROOT, Ipsys
-from tests.s3_server import open_bucket, put, serve_s3
+from tests.s3_server import put
 
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
 # The import of the server takes seconds; s3fs closes its connections after the test.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with serve_s3() as address:
-        yield address
-
-
-@pytest.fixture
-def bucket(address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with open_bucket(address, monkeypatch) as bucket:
-        yield bucket
 
 
 def test_results_from_s3_are_those_of_the_file(

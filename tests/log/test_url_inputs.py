@@ -5,29 +5,20 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from ipsys_log import api
-from ipsys_log.log import remote_object
 from ipsys_log.log.location import LogUrl
 from ipsys_log.runs.output import choose_target
 from tests.conftest import ROOT, Ipsys, small_disk
-from tests.log.range_server import Store, serve_ranges
+from tests.log.range_server import Store
 
 PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
 # aiohttp closes its connections after the test.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
-
-
-@pytest.fixture
-def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,) * 4)
-    with serve_ranges() as store:
-        yield store
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ _STEPS = 34
 # The round trip is never shorter, in s; the mean jitter is not 0.
 _LEAST_JITTER_S = 1e-6
 # Later estimates change slowly: they are made after so many exchanges more, or after this time.
-_FEW, _GROWTH, _REFIT_NS = 50, 1.1, NS_PER_S
+_FEW, _GROWTH, _REFIT_NS = 10, 1.1, 5 * NS_PER_S
 
 
 class Exchange(NamedTuple):

@@ -1,8 +1,9 @@
 """The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
 
-All cameras of a recording share one session. The centre asks each node for its state ten times a second, more
-often in the first 30 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
-waits in a queue with a limit; a dropped frame is missing, so the node sends it again.
+All cameras of a recording share one session. The centre asks each node for its state ten times a second, and
+more often in the first 30 s if there are few nodes. It asks for frames that did not arrive with the lowest
+priority. Everything that arrives waits in a queue with a limit; a dropped frame is missing, so the node sends
+it again.
 """
 
 from __future__ import annotations
@@ -39,20 +40,29 @@ _MOST_WAITING_BYTES = 64 << 20
 # The period of the exchanges up to a number of them: the first ones together find offset and drift.
 _TURNS_S = ((500, 0.02), (1000, 0.04))
 _TURN_S = 0.1
+# More exchanges with all nodes together need the time of the thread that computes the positions.
+_MOST_EXCHANGES_PER_S = 150
 _FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S
 _ANSWER_S, _FRAMES_S = 3.0, 20.0
 
 
-def exchange_period_s(exchanges: int) -> float:
+def exchange_period_s(exchanges: int, nodes: int = 1) -> float:
     """Return the period of the exchanges of times with a node after a number of them, in s.
+
+    Parameters
+    ----------
+    nodes : all nodes of the centre; more nodes have a longer period at first.
 
     Examples
     --------
-    >>> exchange_period_s(0), exchange_period_s(100_000)
-    (0.02, 0.1)
+    >>> exchange_period_s(0), exchange_period_s(0, nodes=6), exchange_period_s(0, nodes=24)
+    (0.02, 0.04, 0.1)
+    >>> exchange_period_s(100_000)
+    0.1
     """
-    return next((period_s for count, period_s in _TURNS_S if exchanges < count), _TURN_S)
+    period_s = next((period_s for count, period_s in _TURNS_S if exchanges < count), _TURN_S)
+    return min(max(period_s, nodes / _MOST_EXCHANGES_PER_S), _TURN_S)
 
 
 def is_of_node(camera: RigCamera) -> bool:
@@ -135,7 +145,8 @@ class Centre:
         link = self._links.get(camera.name)
         if link is None:
             stream = NodeStream(camera, self._version)
-            link = _Link(self._session, camera, self._nodes[camera.name], stream, clock)
+            period_s = partial(exchange_period_s, nodes=len(self._nodes))
+            link = _Link(self._session, camera, self._nodes[camera.name], stream, clock, period_s)
             link.await_node(self._network, say, self._is_stopped)
             self._links[camera.name] = link
             say(f"camera {camera.name}: its node answers; {stream.describe_clock()}")
@@ -164,9 +175,17 @@ def _directly(receive: Callable[[Any], None]) -> Any:
 class _Link:
     """The connection to one node: its subscription, its requests, and the queue of arrivals."""
 
-    def __init__(self, session: Any, camera: RigCamera, node: str, stream: NodeStream, clock: Clock) -> None:
+    def __init__(
+        self,
+        session: Any,
+        camera: RigCamera,
+        node: str,
+        stream: NodeStream,
+        clock: Clock,
+        period_s: Callable[[int], float],
+    ) -> None:
         self.heard_ns = clock.now_ns()
-        self._session, self._camera, self._node = session, camera, node
+        self._session, self._camera, self._node, self._period_s = session, camera, node, period_s
         self._stream, self._clock = stream, clock
         self._arrived = threading.Condition()
         self._waiting: deque[_Arrival] = deque()
@@ -231,7 +250,7 @@ class _Link:
     def _until_request_s(self) -> float:
         """Return the time until the next request for the state."""
         since_s = (self._clock.now_ns() - self._state_asked_ns) / NS_PER_S
-        return max(exchange_period_s(self._exchanges) - since_s, 0.0)
+        return max(self._period_s(self._exchanges) - since_s, 0.0)
 
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
         with self._arrived:

@@ -29,7 +29,7 @@ _MS = NS_PER_S // 1000
 _LEAST_MS, _JITTER_MS, _WORK_NS, _MOST_OFFSET_NS = 0.1, 20, _MS // 10, 3600 * NS_PER_S
 
 
-def _errors_ms(seed: int) -> Iterator[tuple[float, float]]:
+def _errors_ms(seed: int, nodes: int) -> Iterator[tuple[float, float]]:
     """Yield the time of each exchange in s, and the error of a frame at this instant in ms."""
     rng, history, at_s = random.Random(seed), ClockHistory(), 0.0
     offset_ns, drift = rng.randint(-_MOST_OFFSET_NS, _MOST_OFFSET_NS), rng.uniform(-100e-6, 100e-6)
@@ -46,15 +46,15 @@ def _errors_ms(seed: int) -> Iterator[tuple[float, float]]:
         received_ns = sent_ns + there_ns
         replied_ns = received_ns + _WORK_NS
         history.add(Exchange(sent_ns, by_node(received_ns), by_node(replied_ns), replied_ns + back_ns))
-        at_s += exchange_period_s(number + 1)
+        at_s += exchange_period_s(number + 1, nodes)
         if at_s > _TIMES_S[-1]:
             return
 
 
-def _greatest_ms(seed: int) -> list[float]:
+def _greatest_ms(seed: int, nodes: int) -> list[float]:
     """Return the greatest error between two times of the table, for each row."""
     greatest = [0.0] * len(_TIMES_S)
-    for at_s, error_ms in _errors_ms(seed):
+    for at_s, error_ms in _errors_ms(seed, nodes):
         row = next(row for row, end_s in enumerate(_TIMES_S) if at_s <= end_s)
         greatest[row] = max(greatest[row], error_ms)
     return greatest
@@ -63,7 +63,9 @@ def _greatest_ms(seed: int) -> list[float]:
 def measure(options: argparse.Namespace) -> Report:
     """Simulate the clocks."""
     report = Report("node_clock")
-    clocks = [_greatest_ms(seed) for seed in range(3 if options.smoke else options.clocks)]
+    clocks = [
+        _greatest_ms(seed, options.clock_nodes) for seed in range(3 if options.smoke else options.clocks)
+    ]
     for row, end_s in enumerate(_TIMES_S):
         errors_ms = tuple(greatest[row] for greatest in clocks)
         report.rows.append(Row(f"greatest error until {end_s:g} s", errors_ms, "ms"))
@@ -72,6 +74,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--clocks", type=int, default=1000, help="the number of simulated clocks")
+    parser.add_argument("--clock-nodes", type=int, default=1, help="the nodes of the centre")
 
 
 if __name__ == "__main__":

@@ -3,13 +3,15 @@
     python benchmarks/node_players.py markers.mcap 127.0.0.1:7449 a1,a2,a3
 
 The process prints ``asked`` when the centre has asked all nodes. Then it reads a start time in ns of UTC, and
-sends each message of markers at its time after this start. At the end, it prints ``played``, waits until
-the centre has all frames, and prints the number of frames of each camera and of frames that it still has.
+sends each message of markers at its time after this start, with the lowest priority. At the end, it prints
+``played``, waits until the centre has all frames, and prints the number of frames of each camera and of
+frames that it still has.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from contextlib import ExitStack
@@ -85,5 +87,6 @@ def _send(messages: list[Message], nodes: dict[str, Node], clock: Clock, later_n
 
 
 if __name__ == "__main__":
+    os.nice(19)
     host, _, port = sys.argv[2].rpartition(":")
     play(Path(sys.argv[1]), NodeNetwork(host, int(port)), sys.argv[3].split(","))

@@ -23,7 +23,8 @@ from ipsys_log.messages.channels import RUN_EVENTS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
-from tests.capture.streams import encode, free_port, serve
+from tests.capture.streams import encode, serve
+from tests.ports import free_port
 from tests.tiers import first_fast
 
 H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")

@@ -20,8 +20,9 @@ from ipsys_log.messages import CompressedImage, Message, image_topic
 from ipsys_log.messages.channels import EVENTS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
-from tests.capture.streams import encode, free_port, make_jpegs, serve
+from tests.capture.streams import encode, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
+from tests.ports import free_port
 from tests.tiers import first_fast
 
 NAMES = ("red", "white", "black")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
-__all__ = ["encode", "ffmpeg", "free_port", "make_jpegs", "serve", "serve_rtsp"]
+__all__ = ["encode", "ffmpeg", "make_jpegs", "serve", "serve_rtsp"]
 
 
 def ffmpeg() -> str:
@@ -27,12 +27,6 @@ def ffmpeg() -> str:
     if found is None:
         pytest.skip("no ffmpeg; on Debian: sudo apt-get install ffmpeg")
     return found
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def make_jpegs(folder: Path, count: int, width: int = 320, height: int = 240) -> list[bytes]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import threading
-import time
 from collections.abc import Generator, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -131,12 +130,15 @@ def test_events_pass_beside_the_frames_after_their_write(log: Noted) -> None:
 
 
 def test_oldest_frames_are_skipped_with_an_event(log: Noted) -> None:
+    recorded = threading.Event()
+
     def source() -> Generator[Message | None, None, None]:
         yield from (frame(number) for number in range(10))
         yield from (frame(number, "white") for number in range(10, 12))
+        recorded.set()
 
     with backlog(source(), log) as frames:
-        time.sleep(0.2)
+        assert recorded.wait(WAIT_LIMIT_S)
         seen = [message for message in frames if message is not TICK]
     assert [message.payload.timestamp for message in seen] == [7, 8, 9, 10, 11]
     events = [m.payload for m in log.noted if isinstance(m.payload, Event)]

@@ -15,8 +15,9 @@ from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigNodes
 from ipsys_log.rig.file import load_rig, rig_toml
-from tests.capture.nodes.lab_of_nodes import free_port, make_certificates
+from tests.capture.nodes.lab_of_nodes import make_certificates
 from tests.conftest import Ipsys
+from tests.ports import free_port
 
 PATIENCE_S = 600
 RIG = """name = "lab"

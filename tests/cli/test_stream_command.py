@@ -28,6 +28,7 @@ from ipsys_log.messages import Rig, RigMarker, RigStream
 from ipsys_log.messages.channels import RIG, TRACKS
 from ipsys_log.rig.file import load_rig, rig_toml
 from tests.conftest import Ipsys
+from tests.ports import free_port
 from tests.sinks.open_sockets import exposed, open_sockets
 from tests.sinks.streaming import RIG as LAB
 from tests.sinks.streaming import START_NS, STEP_NS, write_tracks
@@ -57,11 +58,6 @@ def port_of(sock: socket.socket) -> int:
 def started(*arguments: object, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "ipsys_log", *map(str, arguments)]
     return subprocess.Popen(command, stdin=stdin, stderr=subprocess.PIPE, text=True)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return port_of(free)
 
 
 def stop(program: subprocess.Popen[str]) -> str:

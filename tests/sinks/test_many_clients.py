@@ -30,7 +30,7 @@ from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
 from ipsys_log.units import NS_PER_S
 from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
-from tests.sinks.test_ros2_stream import free_port
+from tests.ports import free_port
 from tests.sinks.test_vrpn_stream import Reader
 from tests.sinks.zenoh_listener import ZenohListener, wait_for
 

@@ -24,12 +24,12 @@ from ipsys_log.messages import RigCamera, RigNodes
 from tests.capture.nodes.lab_of_nodes import (
     Received,
     ShiftedClock,
-    free_port,
     make_certificates,
     receiving,
     sending,
 )
 from tests.capture.nodes.tcp_relay import Relay
+from tests.ports import free_port
 
 HOUR_NS = 3600 * 1_000_000_000
 

@@ -90,7 +90,7 @@ def test_password_of_a_network_camera_is_only_in_the_rig_file(
         browser.wait("document.querySelector('#add-camera')")
         type_address(browser, "camera on the wall")
         says(browser, "#address-fault", "the address has a space")
-        assert browser.run("document.activeElement.id") == "address"
+        browser.wait("document.activeElement.id === 'address'")
         type_address(browser, address, "admin", "guess")
         says(browser, "#password-fault", "the password is missing or not accepted")
         browser.wait("document.activeElement.id === 'password'")

@@ -31,6 +31,8 @@ X265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=10:bf
 
 # A limit far above any duration on a busy machine.
 LIMIT_S = 240.0
+# An RTSP sender reports its clock once in some seconds; the tests take less than three.
+MOST_REPORTS = 3
 
 
 def take(source: str, count: int, said: list[str] | None = None) -> list[Frame]:
@@ -97,7 +99,8 @@ def count_pictures(name: str, frames: list[Frame]) -> int:
 
 
 @pytest.mark.slow
-def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
+def test_rtsp_stamps_are_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.capture.network._OLDEST_NS", round(LIMIT_S * NS_PER_S))
     make_jpegs(tmp_path, 30)
     video = encode(tmp_path, "v.mp4", *X264)
     said: list[str] = []
@@ -112,10 +115,10 @@ def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
     assert all({7, 8} <= set(units(frames[n].data, "h264")) for n in keys)
     stamps = [frame.time_ns for frame in frames if frame.time_ns is not None]
     assert len(stamps) > 30
-    # Times are near the present, and one frame apart.
+    # Times are near the present, and one frame apart. A report of a busy sender shifts all later ones.
     assert start_ns < stamps[0] < stamps[-1] < end_ns
-    steps = [after - before for before, after in pairwise(stamps)]
-    assert all(abs(step - NS_PER_S / 30) < 2e6 for step in steps)
+    shifts = sorted(abs(after - before - NS_PER_S / 30) for before, after in pairwise(stamps))
+    assert max(shifts[:-MOST_REPORTS]) < 2e6
     assert len(said) == 1
     assert "the stamps of the camera (RTCP)" in said[0]
 

@@ -17,7 +17,7 @@ from tests.sinks.test_ros2_stream import stamp_ns
 from tests.sinks.test_vrpn_stream import Reader
 from tests.sinks.zenoh_listener import ZenohListener, wait_for
 
-_LIMIT_S = 60.0
+_LIMIT_S = 240.0
 _LATE, _EARLY = 25, 5  # numbers of poses
 
 

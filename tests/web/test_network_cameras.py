@@ -152,7 +152,10 @@ def test_faults_of_network_cameras_are_those_of_the_command_line(folder: Path) -
         server.shutdown()
 
 
-def test_camera_of_a_node_is_added_with_its_picture(folder: Path, tmp_path: Path) -> None:
+def test_camera_of_a_node_is_added_with_its_picture(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(centre, "_FIRST_ANSWER_S", WAIT_LIMIT_S)
     network = NodeNetwork("127.0.0.1", free_port())
     (folder / "lab.toml").write_text(f'{RIG}[nodes]\ncentre = "{network}"\n')
     with sending(tmp_path, network, "ceiling") as feed, page_of(folder) as page:

@@ -156,7 +156,7 @@ def foreign_session(network: NodeNetwork, name: str | None) -> zenoh.Config:
         "mode": "peer",
         "listen/endpoints": [],
         "connect/endpoints": [network.endpoint],
-        "connect/timeout_ms": 2000,
+        "connect/timeout_ms": 2000 if name is None else 240_000,
         "connect/exit_on_failure": True,
         "scouting/gossip/enabled": False,
         "scouting/multicast/enabled": False,
@@ -191,8 +191,7 @@ def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path)
         sending(tmp_path, network),
         receiving(centre) as received,
     ):
-        received.wait_for(lambda now: now.errors)
-        assert "two nodes send as camera red" in str(received.errors[0])
+        received.wait_for(lambda now: any("two nodes send as camera red" in str(e) for e in now.errors))
 
 
 @pytest.mark.slow

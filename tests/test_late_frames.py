@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.log.dataset import Session
@@ -22,35 +21,35 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.runs.options import Request
 from ipsys_log.stages.detect import Detect
+from ipsys_log.units import NS_PER_S
 from tests.live_recordings import RATE_HZ, again, go_live, lenses, sent, slow
-from tests.playing import cameras, playing
+from tests.playing import SteppedClock, cameras, playing
 
 
-class Jumping(Clock):
-    """A clock that jumps, as of a recorder that was suspended."""
+class Jumping(SteppedClock):
+    """A clock that jumps once by 2 s, as of a recorder that was suspended; before the given frame."""
 
-    ahead_ns = 0
-
-    def now_ns(self) -> int:
-        return super().now_ns() + self.ahead_ns
+    def jump(self, camera: str, number: int) -> None:
+        self.before(camera, number)
+        if (camera, number) == (min(self._names), 10):
+            with self._changed:
+                self._start_ns += 2 * NS_PER_S
+                self._now_ns += 2 * NS_PER_S
 
 
 @pytest.fixture(scope="session")
 def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record cameras without stamps, with a program that pauses for 2 s after their tenth frame."""
-    target, clock = tmp_path_factory.mktemp("stalled") / "live.mcap", Jumping()
+    target = tmp_path_factory.mktemp("stalled") / "live.mcap"
     frames = {name: [*found[:10], *found[9:0:-1], *found[:10]] for name, found in sent(lab_log).items()}
-
-    def stand_still(camera: str, number: int) -> None:
-        if (camera, number) == (min(frames), 10):
-            clock.ahead_ns = 2_000_000_000
-
+    clock = Jumping(list(frames), RATE_HZ)
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
-    attached = LiveCameras(cameras(*frames), playing(frames, RATE_HZ, False, stand_still), clock)
+    attached = LiveCameras(cameras(*frames), playing(frames, inf, False, clock.jump), clock)
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration))
+        request = Request(model_from=calibration)
+        pipeline.live(attached, settings, target, request, consumers=[clock.watch])
     return target
 
 

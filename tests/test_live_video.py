@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import pytest
@@ -23,12 +23,14 @@ from ipsys_log.messages.channels import RUN_EVENTS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
-from tests.capture.streams import encode, free_port, serve
+from tests.capture.streams import encode, serve
+from tests.playing import WAIT_LIMIT_S
+from tests.ports import free_port
 from tests.tiers import first_fast
 
 H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")
 H265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=20:bframes=0:log-level=none")
-SECONDS = 3.5
+FRAMES = 105
 
 
 @contextmanager
@@ -44,38 +46,54 @@ def streamed(lab: Path, folder: Path, *options: str) -> Iterator[str]:
         yield address
 
 
-def go_live(lab: Path, address: str, target: Path) -> None:
-    """Record some seconds, up to the markers."""
+def wait_for_frames(attached: LiveCameras, count: int) -> None:
+    """Wait until a camera has sent a number of frames, or is stopped."""
+    end_s = time.monotonic() + WAIT_LIMIT_S
+    while attached.states["red"].frames < count and not attached.is_stopped:
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
+Machine = Callable[[pytest.MonkeyPatch, LiveCameras], None]
+
+
+def go_live(lab: Path, address: str, target: Path, machine: Machine) -> None:
+    """Record some frames with a slow machine, up to the markers."""
     attached = LiveCameras([RigCamera("red", source=address)], open_network, Clock())
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
         lens = session.payloads([session.calibrations["red"]])[0]
-    with attached:
+
+    def stop() -> None:
+        wait_for_frames(attached, FRAMES)
+        attached.stop()
+
+    with attached, pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as stopper:
+        machine(patch, attached)
         settings = first_messages(rig, {"red": lens}, attached.now_ns)
-        timer = Timer(SECONDS, attached.stop)
-        timer.start()
+        stopped = stopper.submit(stop)
         pipeline.live(attached, settings, target, Request(), "detect")
-        timer.join()
+        stopped.result()
 
 
-def slow_search(patch: pytest.MonkeyPatch) -> None:
-    """A machine that decodes in time, but does not search in time."""
+def slow_search(patch: pytest.MonkeyPatch, attached: LiveCameras) -> None:
+    """A machine that decodes in time; while it searches one frame, six others arrive."""
     step: Callable[..., Any] = Detect.__call__
 
     def slower(self: Detect, message: Message) -> Any:
         if isinstance(message.payload, CompressedVideo):
-            time.sleep(0.2)
+            wait_for_frames(attached, attached.states["red"].frames + 6)
         return step(self, message)
 
     patch.setattr(Detect, "__call__", slower)
 
 
-def slow_decoding(patch: pytest.MonkeyPatch) -> None:
-    """A machine that does not decode in time."""
+def slow_decoding(patch: pytest.MonkeyPatch, attached: LiveCameras) -> None:
+    """A machine that does not decode in time: while it decodes one frame, three others arrive."""
     step = Video._next
 
     def slower(self: Video, frame: CompressedVideo) -> Any:
-        time.sleep(0.1)
+        wait_for_frames(attached, attached.states["red"].frames + 3)
         return step(self, frame)
 
     patch.setattr(Video, "_next", slower)
@@ -88,15 +106,13 @@ def slow_decoding(patch: pytest.MonkeyPatch) -> None:
 )
 def test_skipped_video_frames_are_equal_in_a_replay(
     codec: tuple[str, ...],
-    machine: Callable[[pytest.MonkeyPatch], None],
+    machine: Machine,
     lab_log: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     target = tmp_path / "live.mcap"
-    with monkeypatch.context() as patch, streamed(lab_log, tmp_path, *codec) as address:
-        machine(patch)
-        go_live(lab_log, address, target)
+    with streamed(lab_log, tmp_path, *codec) as address:
+        go_live(lab_log, address, target, machine)
     with Session([target]) as session:
         events = session.payloads(["/events"])
         skipped = {e.timestamp for e in events if e.kind == FRAME_SKIPPED}

@@ -20,8 +20,9 @@ from ipsys_log.messages import CompressedImage, Message, image_topic
 from ipsys_log.messages.channels import EVENTS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
-from tests.capture.streams import encode, free_port, make_jpegs, serve
+from tests.capture.streams import encode, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
+from tests.ports import free_port
 from tests.tiers import first_fast
 
 NAMES = ("red", "white", "black")
@@ -90,14 +91,15 @@ def test_frames_are_recorded_as_they_came_for_so_many_seconds(
 ) -> None:
     video, jpegs = pictures
     with streams(video, tmp_path) as rig:
+        start_s = time.monotonic()
         done = ipsys("record", "--rig", rig, "-o", tmp_path / "a.mcap", "--seconds", "2")
+        assert time.monotonic() - start_s >= 2
     assert done.code == 0, done.err
     assert "recording into" in done.err
     found = frames(tmp_path / "a.mcap")
     assert sorted(found) == sorted(NAMES)
     for name in NAMES:
         assert f"camera {name}: {len(found[name])} frames" in done.out
-        assert 40 < len(found[name]) < 90
         first = jpegs.index(found[name][0])
         assert found[name] == [jpegs[(first + n) % 30] for n in range(len(found[name]))]
     with Session([tmp_path / "a.mcap"]) as session:
@@ -164,7 +166,7 @@ def test_simulation_ends_cleanly_on_request(
         out, err = program.communicate(timeout=LIMIT_S)
     assert program.returncode == 0, err
     assert f"{log} written" in out
-    assert all(len(found) > 10 for found in frames(log).values())
+    assert all(frames(log)[name] for name in NAMES)
 
 
 HANGING = """
@@ -294,15 +296,14 @@ def test_a_signal_may_come_at_any_moment() -> None:
 
 
 @pytest.mark.slow
-def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
+def test_log_of_a_recorder_that_is_killed_is_repaired(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
+    """At most one second is lost: tests/capture/test_recorder.py has the exact test."""
     log = tmp_path / "a.mcap"
     with streams(pictures[0], tmp_path) as rig:
         program = started("record", "--rig", rig, "-o", log)
-        wait_for(log, 1)
-        time.sleep(4)
-        killed_ns = time.time_ns()
+        wait_for(log, 1_000_000)
         program.kill()
         program.communicate(timeout=LIMIT_S)
     done = ipsys("info", log)
@@ -310,9 +311,9 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     assert f"Run: ipsys repair {log}" in done.err
     assert ipsys("repair", log).code == 0
     with Session([log]) as session:
-        ends_ns = [session.last([topic])[0] for topic in session.images.values()]
-    assert len(ends_ns) == 3
-    assert min(ends_ns) > killed_ns - 1_300_000_000  # one second, and the time to kill it
+        counts = {name: session.count(topic) for name, topic in session.images.items()}
+    assert counts.keys() == set(NAMES)
+    assert all(counts.values())
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from ipsys_log.batch.execution import MOST_ENDED_WORKERS
 from ipsys_log.batch.tasks import replay_log
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.soundness.finding import BROKEN
-from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, wait_for
+from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, read_json, wait_for
 from tests.conftest import ROOT, small_disk
 
 pytestmark = pytest.mark.slow
@@ -205,9 +205,7 @@ def cluster(folder: Path, **environment: str) -> Iterator[Cluster]:
             **environment,
         ),
     ):
-        wait_for(state)
-        address = json.loads(state.read_text())["address"]
-        yield Cluster(address, options, scheduler)
+        yield Cluster(read_json(state)["address"], options, scheduler)
 
 
 def test_workers_of_a_scheduler_with_certificates_are_used(tmp_path: Path, replayed: bytes) -> None:

@@ -30,6 +30,18 @@ def wait_for(path: Path) -> None:
         time.sleep(0.05)
 
 
+def read_json(path: Path) -> Any:
+    """Wait until another program has written a complete JSON file; return its content."""
+    end_s = time.monotonic() + PATIENCE_S
+    while True:
+        wait_for(path)
+        try:
+            return json.loads(path.read_text())
+        except ValueError:  # the other program still writes
+            assert time.monotonic() < end_s, f"{path} is not complete"
+            time.sleep(0.05)
+
+
 @contextmanager
 def one_worker_killed(notes: Path) -> Iterator[None]:
     """Kill the worker that notes its process, by its id, while the block runs."""

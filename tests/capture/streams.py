@@ -10,7 +10,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,12 @@ import numpy as np
 import pytest
 import simplejpeg
 
-__all__ = ["encode", "ffmpeg", "free_port", "make_jpegs", "serve", "serve_rtsp"]
+__all__ = ["encode", "ffmpeg", "make_jpegs", "serve", "serve_rtsp"]
+
+# A limit far above any duration on a busy machine.
+_LIMIT_S = 240.0
+# Of Linux: a buffer above the limit of the system, for root.
+_SO_RCVBUFFORCE = 33
 
 
 def ffmpeg() -> str:
@@ -27,12 +32,6 @@ def ffmpeg() -> str:
     if found is None:
         pytest.skip("no ffmpeg; on Debian: sudo apt-get install ffmpeg")
     return found
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def make_jpegs(folder: Path, count: int, width: int = 320, height: int = 240) -> list[bytes]:
@@ -61,21 +60,22 @@ def serve(*options: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
     """Run FFmpeg, listening on a loopback port for one client."""
     program = subprocess.Popen([ffmpeg(), "-v", "quiet", "-nostdin", *options], stderr=subprocess.DEVNULL)
     try:
-        _await_listening(port)
+        _await_listening(port, program)
         yield program
     finally:
         program.kill()
         program.wait()
 
 
-def _await_listening(port: int) -> None:
+def _await_listening(port: int, program: subprocess.Popen[bytes]) -> None:
     """Check the port without a connection, because FFmpeg accepts only one client."""
     local = f"0100007F:{port:04X}"
-    until = time.monotonic() + 240
+    until = time.monotonic() + _LIMIT_S
     while time.monotonic() < until:
         rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
         if any(row[1] == local and row[3] == "0A" for row in rows):  # 0A means that it listens
             return
+        assert program.poll() is None, f"FFmpeg has ended before it listens at port {port}"
         time.sleep(0.02)
     raise TimeoutError(f"nothing listens at port {port}")
 
@@ -95,7 +95,10 @@ def serve_rtsp(video: Path, clock_shift_s: float = 0.0) -> Iterator[str]:
         command = [ffmpeg(), "-v", "quiet", "-nostdin", *loop, "-f", "rtp", "-sdp_file", str(sdp), target]
         program = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            while not (sdp.exists() and "m=" in sdp.read_text()):
+            until = time.monotonic() + _LIMIT_S
+            while not (sdp.exists() and sdp.read_text().endswith("\n") and "m=" in sdp.read_text()):
+                assert time.monotonic() < until, "FFmpeg describes no stream"
+                assert program.poll() is None, "FFmpeg has ended"
                 time.sleep(0.02)
             server = _RtspServer(("127.0.0.1", 0), _RtspClient)
             server.sdp = sdp.read_text().replace(f"m=video {ports[0]}", "m=video 0")
@@ -115,6 +118,8 @@ def _bound() -> Iterator[socket.socket]:
     with socket.socket(type=socket.SOCK_DGRAM) as made:
         made.bind(("127.0.0.1", 0))
         made.settimeout(0.1)
+        with suppress(PermissionError):  # packets wait here while the relay gets no time
+            made.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 1 << 25)
         yield made
 
 

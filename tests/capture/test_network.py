@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from itertools import islice, pairwise
+from itertools import count, islice, pairwise
 from pathlib import Path
 
 import av
@@ -20,12 +20,19 @@ from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.capture.network import open_network
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
-from tests.capture.streams import encode, free_port, make_jpegs, serve, serve_rtsp
+from tests.capture.streams import encode, make_jpegs, serve, serve_rtsp
+from tests.ports import free_port
 from tests.tiers import first_fast
 
 MJPEG = ("-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=ffmpeg", "-listen", "1")
 X264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "10", "-bf", "0", "-pix_fmt", "yuv420p")
 X265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=10:bframes=0:log-level=none")
+
+
+# A limit far above any duration on a busy machine.
+LIMIT_S = 240.0
+# An RTSP sender reports its clock once in some seconds; the tests take less than three.
+MOST_REPORTS = 3
 
 
 def take(source: str, count: int, said: list[str] | None = None) -> list[Frame]:
@@ -92,12 +99,13 @@ def count_pictures(name: str, frames: list[Frame]) -> int:
 
 
 @pytest.mark.slow
-def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
+def test_rtsp_stamps_are_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.capture.network._OLDEST_NS", round(LIMIT_S * NS_PER_S))
     make_jpegs(tmp_path, 30)
     video = encode(tmp_path, "v.mp4", *X264)
     said: list[str] = []
+    start_ns = time.time_ns()
     with serve_rtsp(video) as address:
-        start_ns = time.time_ns()
         frames = take(address, 60, said)
         end_ns = time.time_ns()
     assert {frame.format for frame in frames} == {"h264"}
@@ -107,10 +115,10 @@ def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
     assert all({7, 8} <= set(units(frames[n].data, "h264")) for n in keys)
     stamps = [frame.time_ns for frame in frames if frame.time_ns is not None]
     assert len(stamps) > 30
-    # Times are near the present, and one frame apart.
-    assert start_ns - NS_PER_S // 2 < stamps[0] < stamps[-1] < end_ns
-    steps = [after - before for before, after in pairwise(stamps)]
-    assert all(abs(step - NS_PER_S / 30) < 2e6 for step in steps)
+    # Times are near the present, and one frame apart. A report of a busy sender shifts all later ones.
+    assert start_ns < stamps[0] < stamps[-1] < end_ns
+    shifts = sorted(abs(after - before - NS_PER_S / 30) for before, after in pairwise(stamps))
+    assert max(shifts[:-MOST_REPORTS]) < 2e6
     assert len(said) == 1
     assert "the stamps of the camera (RTCP)" in said[0]
 
@@ -184,21 +192,33 @@ def test_name_that_leads_nowhere_says_why(code: int, said: str, monkeypatch: pyt
         take("rtsp://camera.lab/live", 1)
 
 
-def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path) -> None:
+def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", LIMIT_S)
     make_jpegs(tmp_path, 3)
     port = free_port()
     address = f"http://127.0.0.1:{port}/live"
-    still = ("-re", "-f", "image2", "-loop", "1", "-framerate", "0.2", "-i", str(tmp_path / "%03d.jpg"))
+    still = ("-re", "-f", "image2", "-loop", "1", "-framerate", "0.001", "-i", str(tmp_path / "%03d.jpg"))
     with serve(*still, "-c", "copy", *MJPEG, address, port=port):
-        start = time.monotonic()
-        with open_network(RigCamera("red", source=address), Clock(), lambda _: None) as frames:
-            # The source reports twice per second that no frame arrived.
+        with open_network(RigCamera("silent", source=address), Clock(), lambda _: None) as frames:
+            # The source reports regularly that no frame arrived.
             assert [next(frames) for _ in range(3)].count(None) >= 2
-        assert time.monotonic() - start < 2.5
+        # The thread still reads: the caller has not waited for it.
+        assert "silent" in {thread.name for thread in threading.enumerate()}
+
+
+class SecondsClock(Clock):
+    """A clock that advances by a second with each reading."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seconds = count()
+
+    def now_ns(self) -> int:
+        return next(self._seconds) * NS_PER_S
 
 
 def test_stream_of_empty_parts_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", 1.0)
+    monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", LIMIT_S)
     pictures = make_jpegs(tmp_path, 3)
     left = threading.Event()
 
@@ -211,25 +231,25 @@ def test_stream_of_empty_parts_is_lost(tmp_path: Path, monkeypatch: pytest.Monke
             self.send_header("Content-Type", "multipart/x-mixed-replace;boundary=ffmpeg")
             self.end_headers()
             with suppress(OSError):
-                for number in range(500):
+                for number in count():
                     data = pictures[number % 3] if number < 20 else b""
                     head = b"--ffmpeg\r\nContent-type: image/jpeg\r\nContent-length: %d\r\n\r\n" % len(data)
                     self.wfile.write(head + data + b"\r\n")
-                    time.sleep(0.02)
+                    time.sleep(0.002)
             left.set()
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Camera) as server:
         threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
         source = RigCamera("red", source=f"http://127.0.0.1:{server.server_address[1]}/live")
-        start_s = time.monotonic()
+        found: list[Frame] = []
         with (
             pytest.raises(SourceError, match="sends only empty frames"),
-            open_network(source, Clock(), lambda _: None) as frames,
+            open_network(source, SecondsClock(), lambda _: None) as frames,
         ):
-            assert sum(frame is not None for frame in frames) > 5
-        assert time.monotonic() - start_s < 6
+            found.extend(frame for frame in frames if frame is not None)
+        assert len(found) > 5
         # The connection is closed too.
-        assert left.wait(2)
+        assert left.wait(LIMIT_S)
         server.shutdown()
 
 
@@ -248,7 +268,8 @@ def test_a_stream_that_ends(tmp_path: Path) -> None:
     assert found[-1].data == pictures[-1]
 
 
-def test_a_program_that_is_killed_ends_the_stream(tmp_path: Path) -> None:
+def test_a_program_that_is_killed_ends_the_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", LIMIT_S)
     make_jpegs(tmp_path, 3)
     port = free_port()
     address = f"http://127.0.0.1:{port}/live"
@@ -259,7 +280,8 @@ def test_a_program_that_is_killed_ends_the_stream(tmp_path: Path) -> None:
     ):
         assert isinstance(next(frame for frame in frames if frame), Frame)
         program.kill()
-        start = time.monotonic()
-        with suppress(SourceError):
+        try:
             list(frames)
-        assert time.monotonic() - start < 2
+        except SourceError as error:
+            # The end of the connection ends the stream, not its silence.
+            assert "no data for" not in str(error)  # noqa: PT017

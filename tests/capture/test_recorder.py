@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import threading
-import time
 from collections.abc import Generator, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +15,7 @@ from ipsys_log.capture.recorder import Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import Disk
+from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
@@ -32,6 +32,7 @@ from ipsys_log.messages import (
     Rig,
     image_topic,
 )
+from ipsys_log.units import NS_PER_S
 from tests.playing import WAIT_LIMIT_S
 
 
@@ -131,12 +132,15 @@ def test_events_pass_beside_the_frames_after_their_write(log: Noted) -> None:
 
 
 def test_oldest_frames_are_skipped_with_an_event(log: Noted) -> None:
+    recorded = threading.Event()
+
     def source() -> Generator[Message | None, None, None]:
         yield from (frame(number) for number in range(10))
         yield from (frame(number, "white") for number in range(10, 12))
+        recorded.set()
 
     with backlog(source(), log) as frames:
-        time.sleep(0.2)
+        assert recorded.wait(WAIT_LIMIT_S)
         seen = [message for message in frames if message is not TICK]
     assert [message.payload.timestamp for message in seen] == [7, 8, 9, 10, 11]
     events = [m.payload for m in log.noted if isinstance(m.payload, Event)]
@@ -166,6 +170,33 @@ def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None
     with Session([killed]) as session:
         assert session.payloads([RIG_TOPIC]) == [rig]
         assert session.count("/runs/poly/model") == 1
+
+
+def test_killed_recorder_has_lost_at_most_a_second(tmp_path: Path) -> None:
+    """The file is copied at any message; that is the file of a recorder that is killed then."""
+    path, killed = tmp_path / "a.mcap", tmp_path / "killed.mcap"
+    topics = [image_topic(camera) for camera in ("red", "white")]
+
+    def source() -> Generator[Message | None, None, None]:
+        for number in range(45):
+            for camera in ("red", "white"):
+                image = CompressedImage(number, camera, bytes(5_000), "jpeg")
+                yield Message(image_topic(camera), number * NS_PER_S // 10, number, image, camera)
+        yield None
+
+    with open_recording(path) as log:
+        for number, message in enumerate(write_each(Sent(source()), log)):
+            if message is not None:
+                newest_ns, allowed_ns = message.log_time_ns, NS_PER_S
+            else:  # no message comes: everything is written
+                allowed_ns = 0
+            if message is None or number % 9 == 8:
+                killed.write_bytes(path.read_bytes())
+                repair(killed)
+                with LogReader(killed) as reader:
+                    last_ns = max((m.log_time_ns for m in reader.messages(topics)), default=0)
+                assert newest_ns - last_ns <= allowed_ns
+    assert allowed_ns == 0
 
 
 class FullDisk(Disk):

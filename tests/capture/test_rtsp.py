@@ -19,6 +19,7 @@ from ipsys_log.capture.network import open_network
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs
+from tests.capture.test_network import LIMIT_S, MOST_REPORTS
 from tests.tiers import first_fast
 
 SERVER = Path(__file__).with_name("rtsp_server.py")
@@ -79,7 +80,10 @@ def decoded(name: str, frames: list[bytes]) -> list[NDArray[np.uint8]]:
     ("name", "protocol"),
     first_fast(1, [("h264", "tcp"), ("h264", "udp"), ("h265", "tcp"), ("jpeg", "tcp"), ("jpeg", "udp")]),
 )
-def test_every_frame_comes_with_the_cameras_stamp(videos: dict[str, Path], name: str, protocol: str) -> None:
+def test_every_frame_comes_with_the_cameras_stamp(
+    videos: dict[str, Path], name: str, protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ipsys_log.capture.network._OLDEST_NS", round(LIMIT_S * NS_PER_S))
     said: list[str] = []
     with served(videos[name], protocol) as address:
         clock = Clock()
@@ -96,10 +100,9 @@ def test_every_frame_comes_with_the_cameras_stamp(videos: dict[str, Path], name:
     stamps = [frame.time_ns for frame in frames if frame.time_ns is not None]
     assert len(stamps) > 5
     assert start_ns < stamps[0] < stamps[-1] <= end_ns
-    # Frames are one period apart; a report of a busy server shifts all later ones by some ms.
+    # Frames are one period apart; a report of a busy server shifts all later ones.
     steps = np.array([after - before for before, after in pairwise(stamps)]) - NS_PER_S / 30
-    assert np.median(np.abs(steps)) < 1e5
-    assert np.abs(steps).max() < 25e6
+    assert np.sort(np.abs(steps))[:-MOST_REPORTS].max() < 1e6
     assert len(said) == 1
     assert "the stamps of the camera (RTCP)" in said[0]
 

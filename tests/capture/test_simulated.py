@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
+import threading
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from ipsys_log.calibration.board import parse_board
 from ipsys_log.calibration.calibrate import CalibrationResult, calibrate_cameras
 from ipsys_log.calibration.images import find_sources
 from ipsys_log.calibration.lens_models import find_lens_model
+from ipsys_log.capture import simulated
 from ipsys_log.capture.frames import Clock, Frame
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.errors import IpsysError
@@ -26,6 +27,7 @@ from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.live_lab import board_film, image_index, lab_film, plan_live_lab
 from ipsys_log.stages.detect import decode_grey, detect_markers
 from ipsys_log.units import NS_PER_S
+from tests.playing import WAIT_LIMIT_S
 
 SMALL = {"width": 960, "height": 540, "rate_hz": 20.0}
 # The images are in one direction; shown back and forth, they repeat after 38 frames.
@@ -98,12 +100,24 @@ def test_a_stamp_is_of_the_instant_that_the_rig_says() -> None:
     assert (frames["end"].time_ns or 0) % step_ns == 10_000_000 + 539 * 50_000
 
 
-def test_simulated_camera_can_be_closed_while_it_draws() -> None:
-    start = time.monotonic()
-    camera = RigCamera("red", source="sim:red", width=1920, height=1080)
+def test_simulated_camera_can_be_closed_while_it_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[simulated._Images] = []
+    stop = simulated._Images.stop
+
+    def note_and_stop(images: simulated._Images) -> None:
+        stopped.append(images)
+        stop(images)
+
+    monkeypatch.setattr(simulated._Images, "stop", note_and_stop)
+    camera = RigCamera("closed", source="sim:red", width=1920, height=1080)
     with open_simulated(camera, Clock(), lambda _: None) as frames:
-        assert next(frames) is None
-    assert time.monotonic() - start < 1
+        next(frames)
+    for thread in threading.enumerate():
+        if thread.name == "draws closed":
+            thread.join(WAIT_LIMIT_S)
+            assert not thread.is_alive()
+    (images,) = stopped
+    assert images._film is None or len(images._drawn) < images._film.count
 
 
 def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from ipsys_log.capture import multiplexer
 from ipsys_log.capture.disk import SYNC_EVERY_S, Syncer
 from ipsys_log.capture.frames import Clock, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
@@ -24,6 +25,12 @@ from tests.capture.test_recorder import Sent, frame
 from tests.playing import cameras, playing
 
 LIMIT_S = 240.0
+
+
+@pytest.fixture(autouse=True)
+def _patient_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a page wait for the disk as long as the test does."""
+    monkeypatch.setattr(multiplexer, "_SAVED_S", LIMIT_S)
 
 
 class Slow:
@@ -98,7 +105,7 @@ def test_recording_syncs_while_it_is_open(tmp_path: Path) -> None:
 
 def test_point_is_saved_when_it_is_on_the_disk(tmp_path: Path) -> None:
     disk = Slow()
-    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 100_000}, 100.0), Clock())
     with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
         log = Recording(writer, lambda: None)
         with attached, log.syncer:
@@ -115,7 +122,7 @@ def test_point_is_saved_when_it_is_on_the_disk(tmp_path: Path) -> None:
 
 
 def test_point_that_comes_last_is_confirmed_at_the_end(tmp_path: Path) -> None:
-    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 100_000}, 100.0), Clock())
     disk = Slow()
     with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
         log = Recording(writer, lambda: None)
@@ -161,7 +168,7 @@ def test_sync_error_is_reported_once_and_at_the_end(tmp_path: Path) -> None:
 
 def test_point_on_a_failing_disk_is_not_called_saved(tmp_path: Path) -> None:
     disk = Slow(errno.EIO)
-    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 100_000}, 100.0), Clock())
     with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
         log = Recording(writer, lambda: None)
         with attached, log.syncer:

@@ -11,12 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.capture import camera_thread
+from ipsys_log.capture.nodes import centre
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigNodes
 from ipsys_log.rig.file import load_rig, rig_toml
-from tests.capture.nodes.lab_of_nodes import free_port, make_certificates
+from tests.capture.nodes.lab_of_nodes import make_certificates
 from tests.conftest import Ipsys
+from tests.ports import free_port
 
 PATIENCE_S = 600
 RIG = """name = "lab"
@@ -63,6 +66,13 @@ def frames(log: Path) -> dict[int, tuple[str, bytes]]:
         return {m.publish_time_ns: (m.payload.format, m.payload.data) for m in messages}
 
 
+@pytest.fixture(autouse=True)
+def _patient_centre(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the centre wait for its node as long as the test does."""
+    monkeypatch.setattr(centre, "_FIRST_ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr(camera_thread, "_DRAW_S", PATIENCE_S)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("with_certificates", [False, True])
 def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool, ipsys: Ipsys) -> None:
@@ -73,10 +83,10 @@ def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool,
     write_rigs(tmp_path, "sim:red?stations=0", more)
     with node_of(tmp_path) as node:
         rig = ("--rig", tmp_path / "centre.toml")
-        centre = ipsys("record", *rig, "-o", tmp_path / "centre.mcap", "--seconds", 3)
+        recorded = ipsys("record", *rig, "-o", tmp_path / "centre.mcap", "--seconds", 3)
         node.terminate()
         said, _ = node.communicate(timeout=PATIENCE_S)
-    assert (centre.code, node.returncode) == (0, 0), centre.err + said
+    assert (recorded.code, node.returncode) == (0, 0), recorded.err + said
     assert "receives the frames of camera red" in said
     at_node, at_centre = frames(tmp_path / "red.mcap"), frames(tmp_path / "centre.mcap")
     assert at_centre
@@ -144,11 +154,11 @@ def test_live_from_markers_of_nodes_is_verified(
     assert again.code == 0, again.err
     made, repeated = (markers_at_node(tmp_path / "red.mcap", run) for run in ("edges", "again"))
     assert repeated == made
-    with Session([tmp_path / "centre.mcap"]) as centre:
-        assert centre.images == {}
-        arrived = centre.payloads(["/runs/nodes/cameras/red/markers"])
-        assert centre.payloads(["/runs/poly/tracks"])
-        sessions = {estimate.session for estimate in centre.payloads(["/cameras/red/clock"])}
+    with Session([tmp_path / "centre.mcap"]) as session:
+        assert session.images == {}
+        arrived = session.payloads(["/runs/nodes/cameras/red/markers"])
+        assert session.payloads(["/runs/poly/tracks"])
+        sessions = {estimate.session for estimate in session.payloads(["/cameras/red/clock"])}
     assert arrived
     assert {markers.node_session for markers in arrived} == sessions
     numbers = [markers.node_frame for markers in arrived]

@@ -19,8 +19,8 @@ from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import example
+from tests.ports import free_port
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
-from tests.sinks.test_ros2_stream import free_port
 from tests.sinks.zenoh_listener import wait_for
 
 receivers: Any = example("ros2_positions")

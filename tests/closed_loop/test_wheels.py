@@ -19,7 +19,7 @@ from ipsys_log.errors import IpsysError
 def robot() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
-        sock.settimeout(60)
+        sock.settimeout(240)
         yield sock
 
 

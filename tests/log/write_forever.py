@@ -11,6 +11,9 @@ from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import IMAGE, POINT, append
 from tests.log.test_together import FIRST, PER_SESSION, session
 
+# A chunk spans a second at most: after so many tenths of a second, one is on the disk.
+_WRITTEN = 25
+
 
 def append_forever(path: Path) -> None:
     with LogReader(path) as reader:
@@ -29,6 +32,8 @@ def record_forever(path: Path) -> None:
         for number in itertools.count():
             writer.write("/image/a", number * 10**8, number, bytes([1 + number % 255]) * 300_000)
             writer.write("/points", number * 10**8, number, b"point")
+            if number == _WRITTEN:
+                print("written", flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +53,18 @@ def write_tracks(path: Path, count: int = 50, first: int = 0, rig: Rig = RIG) ->
 
     write_log(path, messages())
     return path
+
+
+def in_order(recorded: Sequence[Tracks]) -> list[Track]:
+    """Return the poses that are not older than an earlier one of their robot: streams send no others."""
+    newest_ns: dict[str, int] = {}
+    poses = []
+    for row in recorded:
+        for one in row.tracks:
+            if row.timestamp >= newest_ns.get(one.robot, 0):
+                newest_ns[one.robot] = row.timestamp
+                poses.append(one)
+    return poses
 
 
 class WaitingClock(Clock):

@@ -40,7 +40,7 @@ from tests.sinks.streaming import RIG, START_NS, STEP_NS, TOPIC, tracks
 from tests.sinks.zenoh_listener import wait_for
 
 SECRET = "the-secret"
-_LIMIT_S = 60.0
+_LIMIT_S = 240.0
 
 
 @contextmanager

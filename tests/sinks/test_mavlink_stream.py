@@ -19,7 +19,7 @@ from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
 
-_LIMIT_S = 60.0
+_LIMIT_S = 240.0
 NOW_NS = START_NS + 7
 
 

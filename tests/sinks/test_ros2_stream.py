@@ -24,6 +24,7 @@ from ipsys_log.sinks.streams.rmw_zenoh import Entity, Qos, attachment, gid, topi
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.sinks.streams.ros2_types import type_hash
 from ipsys_log.units import NS_PER_S
+from tests.ports import free_port
 from tests.sinks.open_sockets import exposed
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
 from tests.sinks.zenoh_listener import ZenohListener, open_node, wait_for
@@ -42,12 +43,6 @@ HASHES = {
     "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     STRING: STRING_HASH,
 }
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port: int = free.getsockname()[1]
-        return port
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from math import cos, sin
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
 
-_LIMIT_S = 60.0
+_LIMIT_S = 240.0
 COOKIE = b"vrpn: ver. 07.38  0".ljust(24, b"\0")
 
 
@@ -243,9 +243,9 @@ def test_client_of_something_else_is_disconnected(data: bytes, text: str) -> Non
         with socket.create_connection(("127.0.0.1", served.server.port), _LIMIT_S) as sock:
             sock.sendall(data)
             until(lambda: len(served.events) == 1)
-            sock.settimeout(_LIMIT_S)
-            while sock.recv(4096):
-                pass
+            with suppress(ConnectionResetError):  # the server has not read everything
+                while sock.recv(4096):
+                    pass
         assert text in served.events[0]
         assert served.events[0].startswith("stream_client: VRPN port")
 

@@ -12,7 +12,7 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh import ext
 
-_LIMIT_S = 60.0
+_LIMIT_S = 240.0
 _TURN_S = 0.02
 STORE = get_typestore(Stores.LATEST)
 

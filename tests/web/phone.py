@@ -6,6 +6,7 @@ import base64
 import fcntl
 import json
 import os
+import select
 import subprocess
 import time
 from collections.abc import Iterator
@@ -16,9 +17,33 @@ from typing import Any
 from tests.report.browser import chromium
 
 _WIDTH, _HEIGHT = 390, 844
-_PATIENCE_S = 120.0
+_PATIENCE_S = 240.0
 # Two taps at one point within this time are a double tap.
 _DOUBLE_TAP_S = 0.35
+# A tap without a click in this time is lost: the button was just disabled, or the tap was a long press.
+_CLICK_S = 10.0
+
+# Scroll to an element, and wait until it does not move. Return the point of a tap, and whether the element is
+# uncovered; or null if the page has replaced or disabled the element. `window.tap` notes the next click.
+_AIM = """(async () => {
+  const selector = SELECTOR, e = document.querySelector(selector);
+  if (!e) return null;
+  e.scrollIntoView({block: "center"});
+  let b = {}, still = 0;
+  while (still < 6) {
+    await new Promise(requestAnimationFrame);
+    const now = e.getBoundingClientRect();
+    still = now.x === b.x && now.y === b.y ? still + 1 : 0;
+    b = now;
+  }
+  if (!e.isConnected || e.disabled) return null;
+  const x = b.x + b.width / 2, y = b.y + b.height / 2, there = document.elementFromPoint(x, y);
+  const tap = window.tap = {number: NUMBER, hits: null};
+  document.addEventListener("click", ({target}) => {
+    tap.hits ??= target === there || e.contains(target) || target.closest(selector) !== null;
+  }, {capture: true, once: true});
+  return [x, y, there === e || e.contains(there) || there.contains(e)];
+})()"""
 
 
 class Phone:
@@ -28,6 +53,7 @@ class Phone:
         self._read, self._write, self.process = read, write, process
         self._rest = b""
         self._number = 0
+        self._answers: dict[int, dict[str, Any]] = {}
         self._session: str | None = None
         self.console: list[str] = []
         self._tapped_s = 0.0
@@ -40,18 +66,26 @@ class Phone:
         return result
 
     def _answer(self, method: str, given: dict[str, Any]) -> dict[str, Any]:
+        return self._await(self._post(method, given))
+
+    def _post(self, method: str, given: dict[str, Any]) -> int:
+        """Send a command without waiting for its answer; return its number."""
         self._number += 1
         message: dict[str, Any] = {"id": self._number, "method": method, "params": given}
         if self._session is not None:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
-        while True:
-            answer = self._receive()
-            if answer.get("id") == self._number:
-                return answer
+        return self._number
 
-    def _receive(self) -> dict[str, Any]:
+    def _await(self, number: int) -> dict[str, Any]:
+        while number not in self._answers:
+            self._receive()
+        return self._answers.pop(number)
+
+    def _receive(self) -> None:
+        """Receive one message of the browser: an answer, or an event."""
         while b"\0" not in self._rest:
+            assert select.select([self._read], [], [], _PATIENCE_S)[0], "the browser does not answer"
             data = os.read(self._read, 1 << 16)
             assert data, "the browser has gone"
             self._rest += data
@@ -59,7 +93,8 @@ class Phone:
         answer: dict[str, Any] = json.loads(one)
         if answer.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown"):
             self.console.append(json.dumps(answer["params"]))
-        return answer
+        if "id" in answer:
+            self._answers[answer["id"]] = answer
 
     def open(self, url: str, size_px: tuple[int, int] = (_WIDTH, _HEIGHT), scheme: str = "light") -> None:
         """Open a page in a window of this size, in a colour scheme that the user prefers."""
@@ -85,12 +120,7 @@ class Phone:
         """Load the page again, and wait until its document is complete."""
         self.run("window.isOld = true")
         self.send("Page.reload")
-        end = time.monotonic() + _PATIENCE_S
-        given = {"expression": "!window.isOld && document.readyState === 'complete'", "returnByValue": True}
-        # In between there is no document, and an expression has no context.
-        while not self._answer("Runtime.evaluate", given).get("result", {}).get("result", {}).get("value"):
-            assert time.monotonic() < end, "the page is not complete"
-            time.sleep(0.05)
+        self.wait("!window.isOld && document.readyState === 'complete'")
 
     def prefer(self, scheme: str) -> None:
         """Change the colour scheme that the user prefers; colours change at once."""
@@ -106,30 +136,63 @@ class Phone:
 
     def wait(self, script: str) -> None:
         """Wait until an expression is true in the page."""
-        script = f"Boolean({script})"
         end = time.monotonic() + _PATIENCE_S
-        while not self.run(script):
+        while not self.holds(script):
             assert time.monotonic() < end, f"{script}: never, but {self.state()}"
             time.sleep(0.05)
 
-    def tap(self, selector: str) -> None:
-        """Tap the centre of an element, which must not be covered."""
-        found = json.dumps(selector)
-        time.sleep(max(self._tapped_s + _DOUBLE_TAP_S - time.monotonic(), 0.0))
-        x, y, hit = self.run(
-            f"(async () => {{ const e = document.querySelector({found});"
-            "e.scrollIntoView({block: 'center'});"
-            # The tap waits until the element stops moving.
-            "let b = {}, still = 0; while (still < 6) { await new Promise(requestAnimationFrame);"
-            "const now = e.getBoundingClientRect(); still = now.x === b.x && now.y === b.y ? still + 1 : 0;"
-            "b = now; } const x = b.x + b.width / 2, y = b.y + b.height / 2;"
-            "const there = document.elementFromPoint(x, y);"
-            "return [x, y, there === e || e.contains(there) || there.contains(e)]; })()"
+    def holds(self, script: str) -> bool:
+        """Return whether an expression is true now.
+
+        It is not true without a document between two pages, and without an element that it reads.
+        """
+        given = {"expression": f"Boolean({script})", "returnByValue": True, "awaitPromise": True}
+        return (
+            self._answer("Runtime.evaluate", given).get("result", {}).get("result", {}).get("value") is True
         )
-        assert hit, f"{selector} is covered"
+
+    def tap(self, selector: str) -> None:
+        """Tap the centre of an element as soon as it is shown and enabled; it must not be covered.
+
+        A page that is redrawn in between may move or replace the element: then the tap is repeated.
+        """
+        end = time.monotonic() + _PATIENCE_S
+        while not self._tap_once(selector):
+            assert time.monotonic() < end, f"{selector}: no tap reaches it, but {self.state()}"
+
+    def _tap_once(self, selector: str) -> bool:
+        """Tap an element; return whether the page got the click."""
+        found = json.dumps(selector)
+        self.wait(f"(e => !e.disabled && e.checkVisibility())(document.querySelector({found}))")
+        time.sleep(max(self._tapped_s + _DOUBLE_TAP_S - time.monotonic(), 0.0))
+        aim = _AIM.replace("SELECTOR", found).replace("NUMBER", str(number := self._number))
+        if (place := self.run(aim)) is None:
+            return False
+        x, y, is_uncovered = place
+        assert is_uncovered, f"{selector} is covered"
         self._tapped_s = time.monotonic()
-        self.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
-        self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        # Both parts are sent at once: a pause between them would make it a long press.
+        points: list[Any] = [[{"x": x, "y": y}], []]
+        sent = [
+            self._post("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+            for kind, touches in zip(("touchStart", "touchEnd"), points, strict=True)
+        ]
+        for one in sent:
+            answer = self._await(one)
+            assert "error" not in answer, answer
+        return self._is_clicked(number)
+
+    def _is_clicked(self, number: int) -> bool:
+        """Wait for the click of a tap; return whether it was on the element."""
+        end = time.monotonic() + _CLICK_S
+        while time.monotonic() < end:
+            # A click that opens another page leaves no note.
+            if self.holds(f"window.tap?.number !== {number} || tap.hits"):
+                return True
+            if self.holds("tap.hits === false"):
+                return False
+            time.sleep(0.02)
+        return False
 
     def type(self, selector: str, text: str) -> None:
         """Type a text key by key into a tapped field."""

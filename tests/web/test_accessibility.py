@@ -122,7 +122,7 @@ def test_last_steps_of_the_setup_need_only_the_keyboard(browser: Phone, folder: 
         wait_until(lambda: setup.session.jobs.present is not None and setup.session.jobs.present.ended)
         says(browser, "#operation", "This device operates")
         # The end of the job leaves the keyboard in the panel.
-        assert browser.run("document.querySelector('#panel').contains(document.activeElement)")
+        browser.wait("document.querySelector('#panel').contains(document.activeElement)")
         browser.reload()  # the page is not drawn again while the keyboard moves
         browser.wait("document.querySelector('#onward')")
         focus(browser, "#onward")

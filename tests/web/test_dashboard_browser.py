@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.messages import CameraModel, Model
+from tests.ports import free_port
 from tests.web.contrast import low_contrasts
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
 from tests.web.phone import Phone, phone
@@ -76,12 +77,12 @@ def test_page_shows_robots_images_and_states(browser: Phone, lab: LiveLab) -> No
     with page_of(lab.dashboard) as page, opened(browser, page.url, DESKTOP):
         says(browser, "#state", "live")
         browser.wait(f"{COUNT.format('figure image')} === 2")
-        assert browser.run(COUNT.format("figure polygon")) == 2
-        assert browser.run(COUNT.format("#floor .robot")) == 1
-        assert browser.run(COUNT.format("#floor .other")) == 1
-        assert browser.run(COUNT.format("#floor .view")) == 1
+        browser.wait(f"{COUNT.format('figure polygon')} === 2")
+        browser.wait(f"{COUNT.format('#floor .robot')} === 1")
+        browser.wait(f"{COUNT.format('#floor .other')} === 1")
+        browser.wait(f"{COUNT.format('#floor .view')} === 1")
         # The trail has the points from before the page was opened, and the map is true to scale.
-        assert browser.run("document.querySelector('.trail').points.length") >= 50
+        browser.wait("document.querySelector('.trail').points.length >= 50")
         width, height = browser.run(
             "(b => [b.width, b.height])(document.querySelector('#floor .ground').getBoundingClientRect())"
         )
@@ -104,7 +105,7 @@ def test_page_shows_robots_images_and_states(browser: Phone, lab: LiveLab) -> No
             "#overlap": "No robot is in the view of two cameras",
         }.items():
             says(browser, selector, text)
-        assert browser.run("document.querySelector('#events .error b').innerText") == "error"
+        browser.wait("document.querySelector('#events .error b').innerText === 'error'")
         lab.run(0.1)
         lab.feed(tracks(lab.time_ns, robot(1, 3.0, 2.0)))
         browser.wait(f"{COUNT.format('#floor .robot')} === 2")
@@ -138,7 +139,7 @@ def test_operator_needs_only_the_keyboard(browser: Phone, lab: LiveLab) -> None:
         says(browser, "#operation", "This device operates")
         lab.operator.seat.claim(True)
         says(browser, "#operation", "Another device operates")
-        assert not browser.run("document.querySelector('#mark').checkVisibility()")
+        browser.wait("!document.querySelector('#mark').checkVisibility()")
         browser.tap("#take")
         says(browser, "#operation", "This device operates")
         lab.operator.seat.claim(True)
@@ -157,11 +158,11 @@ def test_two_pages_show_the_same_and_one_operates(browser: Phone, lab: LiveLab, 
         browser.tap("#take")
         says(browser, "#operation", "This device operates")
         says(other, "#operation", "Another device operates")
-        assert not other.run("document.querySelector('#mark').checkVisibility()")
+        other.wait("!document.querySelector('#mark').checkVisibility()")
         other.tap("#take")
         says(other, "#operation", "This device operates")
         says(browser, "#operation", "Another device operates")
-        assert not browser.run("document.querySelector('#mark').checkVisibility()")
+        browser.wait("!document.querySelector('#mark').checkVisibility()")
         other.type("#mark", "robot pushed")
         press(other, "Enter", "\r")
         for one in (browser, other):
@@ -173,13 +174,13 @@ def test_viewer_has_no_buttons(browser: Phone, lab: LiveLab) -> None:
         assert page.view_url is not None
         with opened(browser, page.view_url, PHONE):
             says(browser, "#state", "live")
-            assert browser.run("document.querySelector('#operate-panel').hidden")
+            browser.wait("document.querySelector('#operate-panel').hidden")
             assert browser.run("location.search") == ""
 
 
 def test_page_says_when_data_stop_and_goes_on_by_itself(browser: Phone, lab: LiveLab) -> None:
-    with page_of(lab.dashboard) as page:
-        port = int(page.url.rpartition(":")[2].strip("/"))
+    port = free_port()
+    with page_of(lab.dashboard, port=port) as page:
         browser.open(page.url, PHONE)
         says(browser, "#state", "live")
     says(browser, "#state", "no data for")

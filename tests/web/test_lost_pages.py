@@ -18,6 +18,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.capture.nodes.tcp_relay import Relay
+from tests.ports import free_port
 from tests.web.phone import Phone, phone
 from tests.web.test_connections import wait_until
 from tests.web.test_measuring_page import says
@@ -176,7 +177,7 @@ def test_page_shows_the_present_state_after_a_lost_network(
         relay.cut(closes)
         says(browser, "#state", "ipsys does not answer")
         says(browser, "#operation", "the buttons wait")
-        assert browser.run("document.querySelector('#save').disabled")
+        browser.wait("document.querySelector('#save').disabled")
         # Meanwhile another device uses the simulated lab.
         page.operate()
         assert page.ask("/api/simulate", {}) == (200, {})
@@ -192,12 +193,13 @@ def test_page_shows_the_present_state_after_a_lost_network(
 
 
 def test_page_goes_on_when_the_command_is_started_again(browser: Phone, folder: Path) -> None:
-    with setup_page(folder) as page:
+    port = free_port()
+    with setup_page(folder, port) as page:
         browser.open(page.parts.geturl(), DESKTOP)
         Visitor(browser).tap("#simulate")
         says(browser, "#state", "3 of 7")
     says(browser, "#state", "ipsys does not answer")
-    with setup_page(folder, page.parts.port or 0):
+    with setup_page(folder, port):
         says(browser, "#state", "3 of 7")
         # The new server has no operator: this device operates by its next change.
         browser.run("document.querySelector('#name').value = 'hall'")
@@ -227,7 +229,7 @@ def test_two_pages_show_the_same_and_one_operates(browser: Phone, folder: Path, 
         other.tap("#align")
         # The first page sees the job, and has no button to stop it.
         says(browser, "#job-text", "the alignment")
-        assert not browser.run("document.querySelector('#stop').checkVisibility()")
+        browser.wait("!document.querySelector('#stop').checkVisibility()")
         says(other, "#state", "4 of 7")
         says(browser, "#state", "4 of 7")
         other.tap("#take")

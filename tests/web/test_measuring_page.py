@@ -73,13 +73,13 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
         says(hand, "#sight", "is stationary, seen by")
-        assert hand.run("document.querySelector('#sight').className") == "chip still"
+        hand.wait("document.querySelector('#sight').className === 'chip still'")
         hand.wait("document.querySelector('#cameras .still polygon.chosen')")
         hand.wait(f"{FETCHED}.filter(name => name.includes('/picture/')).length === 3")
 
         fill(hand, a, "1.234", side, height)
         says(hand, "#fault-d_B", "1.234 cm looks like metres")
-        assert hand.run("document.querySelector('#save').disabled")
+        hand.wait("document.querySelector('#save').disabled")
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", "0.5")
         says(hand, "#verdict", "do not meet, because")
@@ -87,17 +87,17 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", b)
         says(hand, "#verdict", "inside the floor")
-        assert hand.run("document.querySelectorAll('#floor .place').length") == 1
+        hand.wait("document.querySelectorAll('#floor .place').length === 1")
         save(hand, "p001")
         says(hand, "#notice", "p001 is in the log")
         assert [(row.id, row.withdraws) for row in foreign_read(log)] == [("p001", "")]
         says(hand, "#stop", "interval 2/")
-        assert hand.run("[...document.querySelectorAll('.cm input')].every(e => e.value === '')")
+        hand.wait("[...document.querySelectorAll('.cm input')].every(e => e.value === '')")
 
         hand.tap("#places button")
         says(hand, "#notice", "p001 is withdrawn")
         assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
-        assert hand.run("document.querySelectorAll('#places .gone').length") == 1
+        hand.wait("document.querySelectorAll('#places .gone').length === 1")
         hand.tap("#before")
         says(hand, "#stop", "not measured")
         # The page is not wider than the phone, and the browser reports no error.
@@ -130,7 +130,7 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
         hand.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
         says(hand, "#verdict", "Difference from the present model")
         hand.wait("document.querySelector('#save').innerText === 'Save p001'")
-        assert hand.run("document.querySelectorAll('#floor path.predicted').length") > 0
+        hand.wait("document.querySelectorAll('#floor path.predicted').length > 0")
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
         fill(hand, "170", "190", "left", "10")
         hand.wait("document.querySelector('#verdict .point')")
         says(hand, "#save", "Wait: the marker must not move")
-        assert hand.run("document.querySelector('#save').disabled")
+        hand.wait("document.querySelector('#save').disabled")
         scene.seen = False
         says(hand, "#sight", "No camera sees a marker")
         scene.speed_m, scene.seen = 0.0, True
@@ -306,7 +306,7 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
     with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 is stationary, seen by red")
-        assert hand.run("document.querySelector('#sides').hidden")
+        hand.wait("document.querySelector('#sides').hidden")
         for selector, text in (("#d-A", "170"), ("#d-C", "348"), ("#height", "10")):
             hand.type(selector, text)
         says(hand, "#sides", "Seen from A towards C")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.server
 import json
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,10 +17,11 @@ from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.rig.file import load_rig
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
-from tests.capture.nodes.lab_of_nodes import free_port, sending
+from tests.capture.nodes.lab_of_nodes import sending
 from tests.capture.streams import encode, make_jpegs
 from tests.capture.test_rtsp import CODECS, HAS_SERVER, served
 from tests.playing import WAIT_LIMIT_S
+from tests.ports import free_port
 from tests.web.phone import Phone, phone
 from tests.web.test_connections import wait_until
 from tests.web.test_measuring_page import says
@@ -90,7 +90,7 @@ def test_password_of_a_network_camera_is_only_in_the_rig_file(
         browser.wait("document.querySelector('#add-camera')")
         type_address(browser, "camera on the wall")
         says(browser, "#address-fault", "the address has a space")
-        assert browser.run("document.activeElement.id") == "address"
+        browser.wait("document.activeElement.id === 'address'")
         type_address(browser, address, "admin", "guess")
         says(browser, "#password-fault", "the password is missing or not accepted")
         browser.wait("document.activeElement.id === 'password'")
@@ -134,8 +134,7 @@ def test_faults_of_network_cameras_are_those_of_the_command_line(folder: Path) -
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), NoVideo) as server, page_of(folder) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{server.server_port}/"
-        with socket.create_server(("127.0.0.1", 0)) as closed:
-            refusing = f"rtsp://127.0.0.1:{closed.getsockname()[1]}/live"
+        refusing = f"rtsp://127.0.0.1:{free_port()}/live"
         for typed, field, text in (
             (refusing, "address", "refuses the connection; check that the camera is on"),
             (address, "address", "is not video; give the address of the stream"),
@@ -153,7 +152,10 @@ def test_faults_of_network_cameras_are_those_of_the_command_line(folder: Path) -
         server.shutdown()
 
 
-def test_camera_of_a_node_is_added_with_its_picture(folder: Path, tmp_path: Path) -> None:
+def test_camera_of_a_node_is_added_with_its_picture(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(centre, "_FIRST_ANSWER_S", WAIT_LIMIT_S)
     network = NodeNetwork("127.0.0.1", free_port())
     (folder / "lab.toml").write_text(f'{RIG}[nodes]\ncentre = "{network}"\n')
     with sending(tmp_path, network, "ceiling") as feed, page_of(folder) as page:

@@ -156,7 +156,7 @@ def test_browser_shows_rate_and_pause(recorded: Path, tmp_path: Path) -> None:
         says(browser, "#recording", "× 0.5")
         browser.wait("document.querySelectorAll('#floor .other, #floor .robot').length > 0")
         browser.wait("document.querySelectorAll('figure image').length > 0")
-        assert browser.run("document.querySelector('#operate-panel').hidden")
+        browser.wait("document.querySelector('#operate-panel').hidden")
         player.loop = False
         player.rate = FAST
         says(browser, "#state", "playback ended")

@@ -39,7 +39,7 @@ class Visitor:
 
     def wait(self, script: str) -> None:
         end = time.monotonic() + 2 * WAIT_LIMIT_S
-        while not self.browser.run(f"Boolean({script})"):
+        while not self.browser.holds(script):
             assert time.monotonic() < end, f"{script}: never, but {self.browser.state()}"
             time.sleep(0.1)
 
@@ -120,7 +120,7 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: 
         visitor.tap("#onward")
         says(browser, "h2", "4. Alignment")
         visitor.run_job("#align")
-        assert browser.run("document.querySelectorAll('.shaft').length") >= 3
+        browser.wait("document.querySelectorAll('.shaft').length >= 3")
         visitor.tap("#onward")
         leave(browser)
     # Restarted in the middle, another server continues with the same state.
@@ -195,10 +195,10 @@ def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, folder: Pa
         browser.run("document.querySelector('#marker_length_m').value = '20'")
         browser.tap("#save")
         says(browser, "#marker_length_m-fault", "0.2 if it is in cm")
-        assert browser.run("document.activeElement.id") == "marker_length_m"
+        browser.wait("document.activeElement.id === 'marker_length_m'")
         # The typed value survives the polling of the state.
         assert browser.run("document.querySelector('#marker_length_m').value") == "20"
-        assert browser.run("document.querySelector('#marker_length_m').ariaInvalid") == "true"
+        browser.wait("document.querySelector('#marker_length_m').ariaInvalid === 'true'")
         browser.tap("#simulate")
         browser.wait("document.querySelector('#onward')")
         for size in (PHONE, DESKTOP, WALL):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,18 +19,13 @@ from ipsys_log.capture.nodes.node import Node
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ClockEstimate, CompressedImage, Event, Message, RigCamera, image_topic
 from ipsys_log.runs.output import write_message
+from tests.ports import free_port
 
-__all__ = ["Feed", "Received", "ShiftedClock", "free_port", "make_certificates", "receiving", "sending"]
+__all__ = ["Feed", "Received", "ShiftedClock", "make_certificates", "receiving", "sending"]
 
 # A limit for an event on a busy machine.
 PATIENCE_S = 300.0
 GUIDE = Path(__file__).resolve().parents[3] / "docs" / "nodes.md"
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port: int = free.getsockname()[1]
-        return port
 
 
 def make_certificates(folder: Path, address: str, *cameras: str) -> Path:

@@ -24,12 +24,12 @@ from ipsys_log.messages import RigCamera, RigNodes
 from tests.capture.nodes.lab_of_nodes import (
     Received,
     ShiftedClock,
-    free_port,
     make_certificates,
     receiving,
     sending,
 )
 from tests.capture.nodes.tcp_relay import Relay
+from tests.ports import free_port
 
 HOUR_NS = 3600 * 1_000_000_000
 
@@ -156,7 +156,7 @@ def foreign_session(network: NodeNetwork, name: str | None) -> zenoh.Config:
         "mode": "peer",
         "listen/endpoints": [],
         "connect/endpoints": [network.endpoint],
-        "connect/timeout_ms": 2000,
+        "connect/timeout_ms": 2000 if name is None else 240_000,
         "connect/exit_on_failure": True,
         "scouting/gossip/enabled": False,
         "scouting/multicast/enabled": False,
@@ -191,8 +191,7 @@ def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path)
         sending(tmp_path, network),
         receiving(centre) as received,
     ):
-        received.wait_for(lambda now: now.errors)
-        assert "two nodes send as camera red" in str(received.errors[0])
+        received.wait_for(lambda now: any("two nodes send as camera red" in str(e) for e in now.errors))
 
 
 @pytest.mark.slow

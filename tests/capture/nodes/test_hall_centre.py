@@ -26,8 +26,9 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import MARKERS_RUN, geometric_rig, simulate_session
 from ipsys_log.simulation.hall import hall_settings
-from tests.capture.nodes.lab_of_nodes import PATIENCE_S, free_port
+from tests.capture.nodes.lab_of_nodes import PATIENCE_S
 from tests.conftest import Ipsys
+from tests.ports import free_port
 
 ROBOTS, SECONDS, RATE_HZ = 12, 2.0, 30.0
 HALL = hall_settings(6, 4, markers=ROBOTS, rate_hz=RATE_HZ, drive_s=0.0, frames_per_station=2)

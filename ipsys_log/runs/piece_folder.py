@@ -151,7 +151,7 @@ class StoredPieces:
             result = _first_complete(attempts[key], interim)
             if result is None:
                 raise missing([n])
-            self.merged += 1  # nobody asks for more results after the last one
+            self.merged += 1  # before the yield: the iteration can end with the last result
             yield result
 
 

@@ -1,8 +1,8 @@
 """The centre: the sources ``zenoh:NODE``, whose frames nodes send over Zenoh.
 
 All cameras of a recording share one session. The centre asks each node for its state ten times a second, more
-often in the first 30 s, and for frames that did not arrive, with the lowest priority. Everything that arrives
-waits in a queue with a limit; a dropped frame is missing, so the node sends it again.
+often in the first 30 s. It asks for frames that did not arrive, with the lowest priority. All arrivals wait
+in a queue with a limit; a dropped frame is missing, so the node sends it again.
 """
 
 from __future__ import annotations

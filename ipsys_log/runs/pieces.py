@@ -30,7 +30,6 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import ANNOTATIONS, RIG
 from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.stage import Pieces
-from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.inputs import given_settings, left_out_frames
 from ipsys_log.runs.provenance import read_channels
 from ipsys_log.runs.stream import WiredStage, derive
@@ -48,7 +47,6 @@ __all__ = [
     "PieceRun",
     "PieceWorkers",
     "compute_piece",
-    "compute_piece_of_logs",
     "merge_pieces",
     "order_frames",
     "plan_pieces",
@@ -218,18 +216,6 @@ def split_frames(frames: PieceFrames, resets: Resets) -> list[Piece]:
             firsts.append((int(indices[row]), piece))
             row = int(np.searchsorted(times_ns, piece.end_ns))
     return [piece for _, piece in sorted(firsts)]
-
-
-def compute_piece_of_logs(run: PieceRun, piece: Piece) -> PieceResult:
-    """Open the logs of a run, and compute one piece.
-
-    Raises
-    ------
-    IpsysError
-        A log cannot be opened.
-    """
-    with Session(run.paths) as session, one_blas_thread():
-        return compute_piece(session, run, piece)
 
 
 def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:

@@ -71,8 +71,9 @@ def test_each_camera_has_a_proposed_name_of_its_own(tmp_path: Path) -> None:
 
 
 def test_picture_of_a_camera_is_its_first_image() -> None:
-    """A node may send markers only, and waits come between frames."""
-    frames = [None, Frame(b"markers", "markers", None), Frame(b"image", "jpeg", None)]
+    """A node may send markers only, whose bytes may look like a keyframe; waits come between frames."""
+    markers = Frame(bytes.fromhex("00000001 65 88"), "markers", None)
+    frames = [None, markers, Frame(b"image", "jpeg", None)]
 
     @contextmanager
     def open_frames(_camera: RigCamera, _clock: Clock, _say: Say) -> Iterator[Iterator[Frame | None]]:

@@ -2,7 +2,7 @@
 
     python benchmarks/hall.py                      # 3, 6, 12 and 24 cameras
     python benchmarks/hall.py --hall-labs 3        # with three seeds
-    python benchmarks/hall.py --hall-floor-mm 1.5    # an uneven floor
+    python benchmarks/hall.py --hall-floor-mm 1.5  # an uneven floor
 
 Each hall has one robot for two cameras; all drive at the same time. Clocks of the cameras have offsets of up
 to 25 ms, and intrinsics have the errors of a chessboard calibration. There are no images: markers have the
@@ -29,8 +29,9 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, summarize
 from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.start import place_cameras
-from ipsys_log.simulation.geometric_lab import GeometricSettings
+from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.start import PlacedCamera, place_cameras
+from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings
 from ipsys_log.simulation.hall import hall_settings
 
 __all__ = ["measure"]
@@ -124,31 +125,35 @@ def calibrate_hall(grid: tuple[int, int], seed: int, drive_s: float, floor_mm: f
     with threadpool_limits(1):
         session = make_session(scene, seed)
         observations, steps = observe_session(session), []
-        begin = time.process_time()
+        begin_s = time.process_time()
         placed = place_cameras(observations)
-        after_start = time.process_time()
+        placed_s = time.process_time()
         fit = fit_jointly(observations, progress=lambda step, cost: steps.append(step))
-        fit_s = time.process_time() - after_start
+        fit_s = time.process_time() - placed_s
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB
         nodes = [_some(seen) for seen in nodes_of(session.lab)]
         error = summarize(compute_errors(nodes, joint_locator(fit, session)), session.measured_m)
-    origins_m = {camera.name: camera.origin_m for camera in session.lab.cameras}
-    misses_m = [
-        np.linalg.norm(view.origin_m - origins_m[camera.name])
-        for view, camera in zip(placed, observations.cameras, strict=True)
-    ]
     return Figures(
         len(observations.cameras),
         sum(map(len, observations.sightings)),
         sum(not (sightings.point >= 0).any() for sightings in observations.sightings),
-        after_start - begin,
+        placed_s - begin_s,
         fit_s,
         len(steps),
         memory_mb,
-        _MM * float(np.max(misses_m)),
+        _MM * _largest_miss_m(session.lab, observations, placed),
         _MM * error.mean_m,
         _MM * error.p95_m,
         _MM * error.aligned_mean_m,
+    )
+
+
+def _largest_miss_m(lab: GeometricLab, observations: Observations, placed: list[PlacedCamera]) -> float:
+    """Return the largest error of the origin of a camera."""
+    origins_m = {camera.name: camera.origin_m for camera in lab.cameras}
+    return max(
+        float(np.linalg.norm(view.origin_m - origins_m[camera.name]))
+        for view, camera in zip(placed, observations.cameras, strict=True)
     )
 
 

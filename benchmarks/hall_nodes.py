@@ -53,6 +53,7 @@ from ipsys_log.runs.stream import run
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import MARKERS_RUN, simulate_session
 from ipsys_log.simulation.hall import hall_settings, parse_grid
+from ipsys_log.units import NS_PER_S
 
 __all__ = ["measure"]
 
@@ -64,7 +65,7 @@ _PER_PROCESS = 6
 _AHEAD_S, _WARM_S = 1.0, 5.0
 # The last part of a run, with rows of its own.
 _LAST_S = 10.0
-_NS_PER_S, _MS = 1_000_000_000, 1000.0
+_MS = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +147,7 @@ class _Run:
 
     def last(self, seconds: float) -> list[Latency]:
         """Return the latencies of the markers that arrived in the last part of the measurement."""
-        return [e for e in self.latencies if e.received >= (self.end.time_s - seconds) * _NS_PER_S]
+        return [e for e in self.latencies if e.received >= (self.end.time_s - seconds) * NS_PER_S]
 
 
 def run_centre(
@@ -215,7 +216,7 @@ def _follow(
     """Start all players at one time; return the usage of the centre after the warm-up and at the end."""
     for player in players:
         _read_line(player, "asked")
-    start_ns = time.time_ns() + round(_AHEAD_S * _NS_PER_S)
+    start_ns = time.time_ns() + round(_AHEAD_S * NS_PER_S)
     for player in players:
         assert player.stdin is not None
         player.stdin.write(f"{start_ns}\n")
@@ -241,7 +242,7 @@ def _read(log: Path, model: str, begin: _Usage, end: _Usage, reports: list[dict[
         recorded = sum(session.count(topic) for topic in session.topics(MARKERS, NODES_RUN))
         tracks: list[Tracks] = session.payloads(session.topics(TRACKS, model))
     return _Run(
-        [entry for entry in recorded_latencies([log]) if entry.received >= begin.time_s * _NS_PER_S],
+        [entry for entry in recorded_latencies([log]) if entry.received >= begin.time_s * NS_PER_S],
         begin,
         end,
         sum(sum(report["sent"].values()) for report in reports),
@@ -329,7 +330,7 @@ def measure(options: argparse.Namespace) -> Report:
     """Measure the centre of a hall, with cameras that take turns and with cameras in step."""
     report = Report("hall_nodes")
     if find_spec("zenoh") is None:
-        report.remarks.append("no Zenoh for the nodes: pip install 'ipsys_log[ros2]'")
+        report.remarks.append("no Zenoh for the nodes: pip install 'ipsys_log[nodes]'")
         return report
     grid, seconds = ("2x1", 7.0) if options.smoke else (options.hall_cameras, options.hall_seconds + _WARM_S)
     with tempfile.TemporaryDirectory() as name:

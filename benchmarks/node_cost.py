@@ -5,7 +5,8 @@
 FFmpeg serves JPEGs of the simulated lab, 1920 x 1080 at 30/s and about 300 kB, from loopback as HTTP MJPEG.
 ``ipsys record`` records them; then ``ipsys node`` records them and sends them to ``ipsys record`` at the
 centre. Each program runs twice, for 25 s and for longer. The difference, divided by that of the frames, is
-the time for a frame, without the start of the program and without the frequent exchanges of times at first.
+the time for a frame. It contains neither the start of the program nor the frequent exchanges of times at
+first.
 """
 
 from __future__ import annotations

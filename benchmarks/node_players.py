@@ -4,8 +4,8 @@
 
 The process prints ``asked`` when the centre has asked all nodes. Then it reads a start time in ns of UTC, and
 sends each message of markers at its time after this start, with the lowest priority. At the end, it prints
-``played``, waits until the centre has all frames, and prints the number of frames of each camera and of
-frames that it still has.
+``played``, and waits until the centre has all frames. Then it prints the number of frames of each camera, and
+of frames that it still has.
 """
 
 from __future__ import annotations

@@ -29,9 +29,8 @@ from the log to the stages, as long as the stages keep up (``backlog``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -43,26 +42,22 @@ from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
 from ipsys_log.capture.recorder import CameraSource, Recording, Source, open_recording, write_each
-from ipsys_log.errors import FitError, IpsysError, LogError
+from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
-from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
-from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel, channel_of
-from ipsys_log.messages.stage import Stage
-from ipsys_log.models.table import reads_corners
+from ipsys_log.messages.channels import EVALUATION, channel_of
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_inputs
-from ipsys_log.runs.execute import compute_messages, run_stage, sign
-from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
-from ipsys_log.runs.model_checks import check_fits
+from ipsys_log.runs.execute import sign
+from ipsys_log.runs.graph import stages_until
 from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.pieces import PieceWorkers
-from ipsys_log.runs.preload import preload
 from ipsys_log.runs.provenance import Outcome
+from ipsys_log.runs.replay import Replay
 from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
 from ipsys_log.runs.workers import LocalWorkers
@@ -107,66 +102,14 @@ def replay(
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)
-    outcomes: list[Outcome] = []
-    unchecked = list(models) if len(models) > 1 else []
-    fits = any(MODEL in stage.writes for stage in stages)
-
-    local, one_pass = LocalWorkers(jobs), OnePass(request, stages[-1])
-
-    def make(
-        task: Task, session: Session, name: str, following: Sequence[Stage], model: str
-    ) -> Iterator[Message]:
-        """Compute a run. Before the first fit, check that all models can be fitted."""
-        waiting = one_pass.results(session, task, name, progress)
-        if waiting is not None:
-            yield from waiting
-            return
-        with one_blas_thread():
-            if MODEL in task.stage.writes and task.foreign == () and unchecked:
-                check_fits(session, request, task.inputs, unchecked)
-                unchecked.clear()
-            messages = compute_messages(task, session, name, progress, workers or local)
-            if task.stage.in_threads and fits and request.model_from is None:
-                messages = preload(messages, models)
-            yield from one_pass.follow(messages, session, task, name, following, model)
-
-    with open_target(paths, output) as (logs, target), local, one_pass:
-
-        def do(
-            stage: Stage, following: Sequence[Stage], inputs: dict[Channel, str], model: str | None
-        ) -> None:
-            """Run a stage, or find its result; note its run as the run of the channels that it writes."""
-            with Session(logs) as session:
-                if MODEL in stage.writes and request.model_from is not None:
-                    task: Task | str = copy_model(request, str(model))[0]
-                else:
-                    options = request.options(model)
-                    task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
-                if isinstance(task, Task):
-                    compute = partial(make, following=following, model=model or models[0])
-                    outcomes.append(run_stage(session, target, task, request, stages[-1], compute, say))
-                    task = outcomes[-1].run
-            inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
-
-        def do_all(parts: Sequence[Stage], inputs: dict[Channel, str], model: str | None = None) -> None:
-            for number, stage in enumerate(parts, 1):
-                following = (*parts[number:], *(of_model if model is None and is_copied else ()))
-                do(stage, following, inputs, model)
-
-        shared: dict[Channel, str] = {}
-        of_model = [stage for stage in stages if is_of_model(stage)]
-        # A copied model is known before its turn: its stages can follow the first ones.
-        is_copied = request.model_from is not None and len(models) == 1
-        do_all([stage for stage in stages if stage not in of_model], shared)
-        for model in models:
-            try:
-                do_all(of_model, dict(shared), model)
-            except FitError as error:
-                # The checks before cannot know if corners determine all cameras.
-                if model in request.models or not reads_corners(model):
-                    raise
-                say(f"{model} is left out: {error}")
-    return outcomes
+    with (
+        open_target(paths, output) as (logs, target),
+        LocalWorkers(jobs) as local,
+        OnePass(request, stages[-1]) as one_pass,
+    ):
+        work = Replay(request, stages, models, logs, target, workers or local, one_pass, progress, say)
+        work.compute()
+    return work.outcomes
 
 
 def record(

@@ -1,8 +1,9 @@
 """Clocks of nodes against the joint calibration of the same log: two independent estimates of one offset.
 
 The times of a node's frames are converted by its clock estimates, so the joint calibration should find no
-clock offset. An offset beyond the bound of the estimates and its own uncertainty shows a delay of the network
-that differs between both directions, or a latency of the camera that the rig does not give.
+clock offset. An offset beyond the bound of the estimates and its own uncertainty has one of two causes:
+delays of the network that differ between both directions, or a latency of the camera that the rig does not
+give.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def export_log(
 ) -> LogResult:
     """Export a log to a file of its name, as :meth:`ipsys_log.opened_log.Log.export` does.
 
-    A file that is newer than its log is up to date. A store that tells no times has all its logs exported.
+    A file that is newer than its log is up to date. A log in a store that gives no times is always exported.
     """
     from ipsys_log import api
 

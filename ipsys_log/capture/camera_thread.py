@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage, mid_exposure_ns
+from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import frame_payload
@@ -128,7 +129,7 @@ class CameraReader:
         self._late = LateFrameDetector(shared.heartbeat, camera.rate_hz)
         # Zenoh's threads are daemons if their caller is one. Python ends a daemon within a call of Zenoh,
         # and the program aborts. The thread of a device is a daemon, because a driver can block for ever.
-        is_daemon = not str(camera.source).startswith("zenoh:")
+        is_daemon = not is_of_node(camera)
         self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=is_daemon)
 
     def wait_for_first_frame(self) -> None:

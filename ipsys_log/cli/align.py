@@ -29,7 +29,7 @@ __all__ = ["add_commands"]
 
 NoLogs = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    file_log_argument(help="Logs, read as one session. The last log gets the results.", metavar="LOG"),
+    file_log_argument(help="Logs, read as one session. The last log gets the results."),
 ]
 Plot = Annotated[
     Path | None,

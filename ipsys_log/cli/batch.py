@@ -276,10 +276,13 @@ def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     for text in calibration:
         if "=" not in text:
             raise IpsysError(f"--calibration {text}: has no camera name; in a batch, write camera=file.yaml")
+    settings = replay_options(**options)
+    if settings["model_from"] is not None:
+        check_present([settings["model_from"]])
     return {
         "rig": None if rig is None else load_rig(rig),
         "calibrations": load_calibrations(calibration, tuple),
-        **replay_options(**options),
+        **settings,
     }
 
 

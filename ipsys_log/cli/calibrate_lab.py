@@ -64,7 +64,6 @@ Sources = Annotated[
     file_log_argument(
         help="Logs, read as one session. The last log gets the results. Without LOG: use the cameras of "
         "--rig now.",
-        metavar="LOG",
     ),
 ]
 Seconds = Annotated[

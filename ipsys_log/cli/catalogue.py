@@ -71,10 +71,10 @@ def catalogue(
     check_file(output, "-o", [])
     if model_from is not None and baseline is None:
         raise IpsysError("--model-from: has an effect only with --baseline; give the log before all moves")
-    given = [
-        _log(name, text) for name, text in (("--baseline", baseline), ("--model-from", model_from)) if text
-    ]
-    since = Baseline(given[0], given[-1]) if given else None
+    since = None
+    if baseline is not None:
+        log = _log("--baseline", baseline)
+        since = Baseline(log, log if model_from is None else _log("--model-from", model_from))
     place = parse_location(folder)
     with progress_bar(()) as progress:
         update = update_catalogue(place, output, since, lambda done, total: progress("logs", done, total))

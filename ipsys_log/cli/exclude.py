@@ -21,7 +21,7 @@ def add_commands(app: typer.Typer) -> None:
 def exclude(
     log: Annotated[
         Path,
-        file_log_argument(metavar="LOG", help="A finished log with measurements, which gets the change."),
+        file_log_argument(help="A finished log with measurements, which gets the change."),
     ],
     points: Annotated[
         list[str],

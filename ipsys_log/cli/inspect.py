@@ -97,7 +97,7 @@ def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
 
 
 def repair(
-    log: Annotated[Path, file_log_argument(metavar="LOG", help="A damaged or incomplete log.")],
+    log: Annotated[Path, file_log_argument(help="A damaged or incomplete log.")],
 ) -> None:
     """Repair a log in place: keep all complete records, report the losses, and complete its runs.
 

@@ -38,7 +38,6 @@ __all__ = ["add_commands", "serve_page"]
 Log = Annotated[
     Optional[Path],  # noqa: UP045
     file_log_argument(
-        metavar="LOG",
         help="A finished log, which gets the measurements. Without LOG: use the cameras of --rig now.",
     ),
 ]

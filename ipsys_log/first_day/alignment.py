@@ -9,6 +9,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import Alignment
+from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Rig
@@ -63,9 +64,12 @@ def read_result(session: Session, run: str) -> AlignmentResult:
     Raises
     ------
     IpsysError
-        The log cannot be read.
+        The log cannot be read, or has no rig.
     """
-    rig = session.payloads(session.topics(RIG))[-1]
+    rigs = session.payloads(session.topics(RIG))
+    if not rigs:
+        raise IpsysError(f"{session.paths[-1]}: has no rig; measure the alignment again")
+    rig = rigs[-1]
     lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
     lab = read_alignment(session, run, rig, lenses)
     cameras = tuple(

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 from ipsys_log.capture.devices import check_sources
 from ipsys_log.capture.nodes.centre import is_of_node, node_of
@@ -93,7 +93,7 @@ def _user_fault(address: str, user: str, password: str) -> Fault | None:
         return Fault("user", "the user is empty; a password needs a user")
     if "://" not in address:
         return Fault("user", f"{address} has no user; only an address with :// has one")
-    if "@" in urlsplit(address).netloc:
+    if "@" in re.split("[/?#]", address.partition("://")[2], maxsplit=1)[0]:
         return Fault("user", "the address has a user already; remove it there, or here")
     return None
 

@@ -13,6 +13,7 @@ import cv2
 
 from ipsys_log.capture.devices import check_devices, check_sources
 from ipsys_log.capture.frames import Clock, Frame, Open, Say
+from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.simulated import parse_source
 from ipsys_log.capture.usb_bus import UsbCamera, find_cameras
 from ipsys_log.errors import FrameError, IpsysError
@@ -201,7 +202,7 @@ def take_picture(camera: RigCamera, opener: Open, say: Say, is_stopped: Callable
 def _picture(frame: Frame) -> bytes | None:
     if frame.format in ("jpeg", "png"):
         return frame.data
-    if frame.format == "markers":  # from a node that sends no images
+    if frame.format == MARKERS_FORMAT:  # from a node that sends no images
         return None
     video = CompressedVideo(0, "", frame.data, frame.format)
     if not is_keyframe(video):

@@ -22,8 +22,10 @@ from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
 
-__all__ = ["FitFacts", "LabFolder", "LogFacts"]
+__all__ = ["ALIGNMENT_LOG", "FitFacts", "LabFolder", "LogFacts"]
 
+# The names of logs of an alignment begin with this.
+ALIGNMENT_LOG = "alignment"
 _SUFFIX = ".mcap"
 _MOST_LOGS = 200
 _Stamp = tuple[tuple[str, int, int], ...]
@@ -160,11 +162,15 @@ def _read_facts(path: Path) -> LogFacts:
             # Only a live recording has latencies; the run of a replay does not count.
             run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
             tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
-            aligned_run = None if points or tracked else newest_run(session, CAMERA_POINTS)
-            alignment = None if aligned_run is None else read_result(session, aligned_run)
+            alignment = None if points or tracked else _read_alignment(session, path)
             return LogFacts(path, session.start_ns, points, tracked, alignment)
     except (IpsysError, OSError) as error:
         return LogFacts(path, fault=str(error))
+
+
+def _read_alignment(session: Session, path: Path) -> AlignmentResult | None:
+    run = newest_run(session, CAMERA_POINTS) if path.stem.startswith(ALIGNMENT_LOG) else None
+    return None if run is None else read_result(session, run)
 
 
 def _read_fit(paths: Sequence[Path]) -> FitFacts | None:

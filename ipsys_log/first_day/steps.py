@@ -91,7 +91,7 @@ def read_progress(folder: LabFolder) -> SetupProgress:
     cameras = tuple(camera for camera in rig.cameras if camera.source) if rig else ()
     intrinsics = tuple(_intrinsics_of(camera, folder.path) for camera in cameras)
     logs = tuple(folder.logs())
-    aligned = [log for log in logs if log.alignment and log.path.stem.startswith("alignment")]
+    aligned = [log for log in logs if log.alignment]
     alignment, fit = aligned[-1] if aligned else None, folder.fit()
     camera_fault = _camera_fault(cameras)
     # Each step needs the cameras, and the steps from the alignment on also need all intrinsics.

@@ -26,7 +26,7 @@ from ipsys_log.first_day.board_entry import BoardEntry
 from ipsys_log.first_day.board_search import BoardSearch
 from ipsys_log.first_day.camera_choice import set_calibration
 from ipsys_log.first_day.jobs import Job
-from ipsys_log.first_day.lab_folder import LabFolder
+from ipsys_log.first_day.lab_folder import ALIGNMENT_LOG, LabFolder
 from ipsys_log.messages import (
     CameraCalibration,
     CompressedImage,
@@ -96,7 +96,7 @@ def align(folder: LabFolder, job: Job) -> None:
     IpsysError
         The rig or a camera has a fault.
     """
-    with _new_log(folder, "alignment") as log:
+    with _new_log(folder, ALIGNMENT_LOG) as log:
         _record(folder, job, log, _ALIGN_S)
         if not job.is_stopped():
             api.replay(log, until=_LAST_STAGE, method="pose", progress=job.progress, say=job.say)

@@ -37,7 +37,7 @@ def anchor(problem: Problem, state: State) -> State:
     middle_m = state.positions_m[:, :2].mean(axis=0)
 
     def residuals(motion: Array) -> Array:
-        found = problem.points.residuals(_moved(problem, state, motion, middle_m), problem.layout)
+        found = problem.points.residuals(_move(problem, state, motion, middle_m), problem.layout)
         return np.concatenate([found.distances, found.places.ravel()])
 
     if not len(residuals(np.zeros(3))):
@@ -46,10 +46,10 @@ def anchor(problem: Problem, state: State) -> State:
     reach_m = float(np.linalg.norm(state.positions_m[:, :2] - middle_m, axis=1).max())
     scales = [1 / max(reach_m, 1.0), 1.0, 1.0]
     best = least_squares(residuals, np.zeros(3), loss="cauchy", f_scale=_USUAL, x_scale=scales)
-    return _moved(problem, state, best.x, middle_m)
+    return _move(problem, state, best.x, middle_m)
 
 
-def _moved(problem: Problem, state: State, motion: Array, middle_m: Array) -> State:
+def _move(problem: Problem, state: State, motion: Array, middle_m: Array) -> State:
     """Return the state turned by ``motion[0]`` about a point, and shifted by ``motion[1:]``."""
     cos, sin = np.cos(motion[0]), np.sin(motion[0])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -135,9 +135,8 @@ def check_parquet_name(path: Path, option: str) -> None:
         The name has another end.
     """
     if path.suffix != ".parquet":
-        raise IpsysError(
-            f"{option} {path}: the name must end in .parquet; use {path.with_suffix('.parquet')}"
-        )
+        name = path.with_suffix(".parquet") if path.name else "FILE.parquet"
+        raise IpsysError(f"{option} {path}: the name must end in .parquet; use {name}")
 
 
 def check_figure_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedVideo, Message, SkippedVideo
+from ipsys_log.messages import (
+    RIG_TOPIC,
+    CameraCalibration,
+    CompressedVideo,
+    Message,
+    Rig,
+    SkippedVideo,
+    calibration_topic,
+)
 from ipsys_log.messages.channels import EVENTS, RIG
-from ipsys_log.runs.graph import Task
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.pieces import given_settings
 from ipsys_log.stages.detect import skipped_frames
 
-__all__ = ["first_settings", "inputs", "leaves_out_frames"]
+if TYPE_CHECKING:
+    from ipsys_log.runs.graph import Task
+
+__all__ = ["first_settings", "given_settings", "inputs", "leaves_out_frames", "left_out_frames"]
 
 
 def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
@@ -21,7 +31,7 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     yield from first_settings(session, task, task.topics)
     total = sum(session.count(topic) for topic in task.topics)
     progress(task.stage.name, 0, total)
-    skipped = skipped_frames(session.payloads(session.topics(EVENTS))) if leaves_out_frames(task) else set()
+    skipped = left_out_frames(session, task)
     for done, message in enumerate(session.messages(task.topics), 1):
         if message.log_time_ns not in skipped:
             yield message
@@ -41,6 +51,22 @@ def first_settings(session: Session, task: Task, topics: Collection[str]) -> Ite
     for topic in sorted(topics):
         if topic in (*session.topics(RIG), *session.calibrations.values()):
             yield next(session.messages([topic]))
+
+
+def given_settings(
+    session: Session, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
+) -> Iterator[Message]:
+    """Yield the rig and the intrinsics that replace those of the logs, from the start on."""
+    start_ns = session.start_ns
+    if rig is not None:
+        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
+    for camera, lens in lenses.items():
+        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
+
+
+def left_out_frames(session: Session, task: Task) -> set[int]:
+    """Return the log times in ns of the frames that a run leaves out."""
+    return skipped_frames(session.payloads(session.topics(EVENTS))) if leaves_out_frames(task) else set()
 
 
 def leaves_out_frames(task: Task) -> bool:

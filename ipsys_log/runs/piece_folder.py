@@ -151,7 +151,7 @@ class StoredPieces:
             result = _first_complete(attempts[key], interim)
             if result is None:
                 raise missing([n])
-            self.merged += 1  # nobody asks for more results after the last one
+            self.merged += 1  # before the yield: the iteration can end with the last result
             yield result
 
 
@@ -194,10 +194,14 @@ def _keys(plan: PiecePlan, software: Mapping[str, str]) -> list[str]:
 
 
 def _first_complete(files: list[Path], interim: tuple[type, ...]) -> PieceResult | None:
-    """Return the first undamaged result of some attempts; delete the damaged ones."""
+    """Return the first undamaged result of some attempts; delete the damaged ones.
+
+    Another process that merges the same log may delete all of them meanwhile.
+    """
     for file in files:
-        result = from_bytes(file.read_bytes(), interim)
-        if result is not None:
-            return result
-        file.unlink()
+        with suppress(FileNotFoundError):
+            result = from_bytes(file.read_bytes(), interim)
+            if result is not None:
+                return result
+            file.unlink()
     return None

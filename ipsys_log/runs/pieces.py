@@ -21,22 +21,19 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import (
-    RIG_TOPIC,
     CameraCalibration,
     CompressedVideo,
     Encoded,
     Message,
     Rig,
-    calibration_topic,
 )
-from ipsys_log.messages.channels import ANNOTATIONS, EVENTS, RIG
+from ipsys_log.messages.channels import ANNOTATIONS, RIG
 from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.stage import Pieces
-from ipsys_log.runs.blas import one_blas_thread
+from ipsys_log.runs.inputs import given_settings, left_out_frames
 from ipsys_log.runs.provenance import read_channels
 from ipsys_log.runs.stream import WiredStage, derive
 from ipsys_log.stages import load_stage
-from ipsys_log.stages.detect import skipped_frames
 
 if TYPE_CHECKING:
     from ipsys_log.runs.graph import Task
@@ -50,8 +47,6 @@ __all__ = [
     "PieceRun",
     "PieceWorkers",
     "compute_piece",
-    "compute_piece_of_logs",
-    "given_settings",
     "merge_pieces",
     "order_frames",
     "plan_pieces",
@@ -89,8 +84,6 @@ class PieceRun:
     @classmethod
     def of_task(cls, task: Task, session: Session) -> PieceRun:
         """Return what the pieces of a task need."""
-        is_as_live = "as_live" in task.parameters
-        events = session.payloads(session.topics(EVENTS)) if is_as_live else []
         # A new log for the results, which has no topics yet, exists only in this process.
         topics = set(task.topics)
         readers = [reader for reader in session.readers if reader.channels.keys() & topics]
@@ -101,7 +94,7 @@ class PieceRun:
             topics=task.topics,
             rig=task.rig,
             lenses=dict(task.lenses),
-            skipped=frozenset(skipped_frames(events)),
+            skipped=frozenset(left_out_frames(session, task)),
             versions=tuple(reader.view.identity()[1] for reader in readers),
         )
 
@@ -225,18 +218,6 @@ def split_frames(frames: PieceFrames, resets: Resets) -> list[Piece]:
     return [piece for _, piece in sorted(firsts)]
 
 
-def compute_piece_of_logs(run: PieceRun, piece: Piece) -> PieceResult:
-    """Open the logs of a run, and compute one piece.
-
-    Raises
-    ------
-    IpsysError
-        A log cannot be opened.
-    """
-    with Session(run.paths) as session, one_blas_thread():
-        return compute_piece(session, run, piece)
-
-
 def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:
     """Compute one piece from the open logs of a run; an error of the input is a part of the result."""
     step = run.load().step()
@@ -257,17 +238,6 @@ def _encode_drawing(payload: Any) -> Any:
     """Encode what only viewers read: its many small parts would go to another process one by one."""
     kind = type(payload)
     return Encoded(kind, encode(payload)) if kind in ANNOTATIONS.payloads else payload
-
-
-def given_settings(
-    session: Session, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
-) -> Iterator[Message]:
-    """Yield the rig and the intrinsics that replace those of the logs, from the start on."""
-    start_ns = session.start_ns
-    if rig is not None:
-        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
-    for camera, lens in lenses.items():
-        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
 
 
 def _messages(session: Session, run: PieceRun, piece: Piece) -> Iterator[Message]:

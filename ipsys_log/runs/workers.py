@@ -211,11 +211,26 @@ def _serve(receiver: Connection, sender: Connection) -> None:
             for answer in _answers(run, receiver):
                 if sent is not None:
                     sent.result()
-                sent = thread.submit(sender.send, answer)
+                sent = thread.submit(_send, sender, answer)
     except (EOFError, ConnectionError):
         raise
     except Exception as error:
-        sender.send(_Failure(_portable(error), traceback.format_exc()))
+        sender.send(_failure(error))
+
+
+def _send(sender: Connection, answer: PieceResult) -> None:
+    """Send an answer, or the error that prevents it: the other process waits for one of them."""
+    try:
+        sender.send(answer)
+    except ConnectionError:
+        raise
+    except Exception as error:
+        sender.send(_failure(error))
+
+
+def _failure(error: Exception) -> _Failure:
+    trace = "".join(traceback.format_exception(error))
+    return _Failure(_portable(error), trace)
 
 
 def _answers(run: PieceRun, receiver: Connection) -> Iterator[PieceResult]:

@@ -58,7 +58,7 @@ class Record(NamedTuple):
 class History:
     """The records of one robot, for as long as a late sighting can change them.
 
-    ``times_ns`` are the times of the records, ``rows_ns`` the instants of the poses that were given out, and
+    ``times_ns`` are the times of the records, and ``rows_ns`` the instants of the poses that were given out.
     ``began_ns`` is the time of the first record. ``last_ns`` has the time of the last sighting by each camera
     with each flag. A ``complete`` history keeps the ``older`` sightings without their states, for processing
     after the recording.

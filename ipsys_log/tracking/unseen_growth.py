@@ -24,7 +24,7 @@ class UnseenGrowth:
 
     The state 0.4 s ago predicts the position of now. The squared error of the prediction, in units of the
     growth of its variance, is one comparison. The scale is the mean of all comparisons, old ones with less
-    weight, and of the usual motion, which counts like about 3 s of driving.
+    weight, and of the usual motion. The usual motion counts like about 3 s of driving.
 
     Attributes
     ----------

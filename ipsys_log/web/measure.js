@@ -245,8 +245,9 @@ function nextOpen() {
 // The number of points, and how many of them each camera has seen.
 function count() {
   const points = history.places.filter((place) => place.counts).length;
-  const by = Object.entries(view.measured ?? {}).map(([camera, seen]) => `${camera} ${seen}`);
-  $("count").textContent = points ? `: ${points} ${points === 1 ? "point" : "points"}${Object.values(view.measured ?? {}).some(Boolean) ? ` (${by.join(", ")})` : ""}` : "";
+  const cameras = Object.entries(view.measured ?? {});
+  const seen = cameras.some(([, number]) => number) ? ` (${cameras.map(([camera, number]) => `${camera} ${number}`).join(", ")})` : "";
+  $("count").textContent = points ? `: ${points} ${points === 1 ? "point" : "points"}${seen}` : "";
 }
 
 function list() {

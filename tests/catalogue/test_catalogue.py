@@ -180,8 +180,11 @@ def test_file_of_another_kind_is_not_overwritten(folder: Path, tmp_path: Path, i
     done = ipsys("catalogue", folder, "-o", target)
     assert (done.code, "is not a catalogue" in done.err) == (1, True)
     assert pd.read_parquet(target)["robot"].tolist() == ["ada"]
-    done = ipsys("catalogue", folder, "-o", tmp_path / "c.csv")
-    assert (done.code, "the name must end in .parquet; use" in done.err) == (1, True)
+    for wrong, right in ((tmp_path / "c.csv", tmp_path / "c.parquet"), (".", "FILE.parquet")):
+        done = ipsys("catalogue", folder, "-o", wrong)
+        assert (done.code, done.err.endswith(f"the name must end in .parquet; use {right}\n")) == (1, True)
+    done = ipsys("catalogue", folder, "-o", tmp_path / "c.parquet", "--baseline", "")
+    assert (done.code, "--baseline .: is not a file; name a log" in done.err) == (1, True)
     with pytest.raises(IpsysError, match="is not a folder"):
         update_catalogue(GOLDEN, tmp_path / "c.parquet")
 

@@ -48,6 +48,7 @@ def parsed(**typed: str) -> RigCamera | Fault:
         ({"address": "rtsp:/10.0.0.8"}, "address", "'rtsp:/10.0.0.8' is not the address of a camera"),
         ({"address": "rtsp:///live"}, "address", "'rtsp:///live' has no host; write it as"),
         ({"address": "http://10.0.0.8/a b"}, "address", "the address has a space"),
+        ({"address": "rtsp://[::1", "user": "x"}, "address", "has no host; write it as"),
         ({"address": "file:/etc/passwd"}, "address", "a page cannot name a file"),
         ({"address": "usb:/dev/video0"}, "address", "a page cannot name a device"),
         ({"address": "usb:999"}, "address", "device '/dev/video999' does not exist"),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from ipsys_log.capture.frames import Clock, Frame, Say
 from ipsys_log.capture.usb_bus import UsbCamera
-from ipsys_log.first_day.camera_choice import list_options, propose_names
+from ipsys_log.first_day.camera_choice import list_options, propose_names, take_picture
 from ipsys_log.messages import Rig, RigCamera
 
 
@@ -65,3 +68,20 @@ def test_each_camera_has_a_proposed_name_of_its_own(tmp_path: Path) -> None:
         "sim:red": "red",
         "sim:white": "camera_3",
     }
+
+
+def test_picture_of_a_camera_is_its_first_image() -> None:
+    """A node may send markers only, whose bytes may look like a keyframe; waits come between frames."""
+    markers = Frame(bytes.fromhex("00000001 65 88"), "markers", None)
+    frames = [None, markers, Frame(b"image", "jpeg", None)]
+
+    @contextmanager
+    def open_frames(_camera: RigCamera, _clock: Clock, _say: Say) -> Iterator[Iterator[Frame | None]]:
+        yield iter(frames)
+
+    def take() -> bytes | None:
+        return take_picture(RigCamera("red"), open_frames, lambda text: None, lambda: False)
+
+    assert take() == b"image"
+    del frames[2]
+    assert take() is None

@@ -15,6 +15,10 @@ from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.first_day.rig_entry import save_rig_entry
 from ipsys_log.first_day.steps import Status, read_progress
 from ipsys_log.runs.options import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import simulate_session
+from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.survey.checks import withdrawal_of
 from ipsys_log.survey.from_log import open_finished_log
 from tests.test_record import lens_yaml
@@ -130,6 +134,20 @@ def test_damaged_log_is_named_and_others_count(folder: LabFolder, lab_log: Path)
     progress = read_progress(folder)
     assert progress.step("points").status is D
     assert ["ipsys repair" in log.fault for log in progress.logs if log.fault] == [True]
+
+
+def test_log_without_a_rig_is_no_alignment(folder: LabFolder) -> None:
+    """The rig of an imported log may be that of an option."""
+    settings = LabSettings(rate_hz=5.0, drive_s=1.0, markers=1)
+    lab = build_lab(GeometricSettings(lab=settings, points=0))
+    rig, *messages = simulate_session(lab)
+    path = folder.path / "imported.mcap"
+    write_log(path, messages)
+    api.replay(path, rig=rig.payload, until="camera-frame")
+    assert [(log.alignment, log.fault) for log in folder.logs()] == [(None, "")]
+    path.rename(folder.path / "alignment.mcap")
+    (log,) = folder.logs()
+    assert log.fault.endswith("alignment.mcap: has no rig; measure the alignment again")
 
 
 def test_few_points_are_not_enough(folder: LabFolder) -> None:

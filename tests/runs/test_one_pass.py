@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log import pipeline
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
@@ -21,6 +20,7 @@ from ipsys_log.messages import Marker, Markers, Message, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, channel_of
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import execute
+from ipsys_log.runs import replay as stages_in_order
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, plan_stage, writer_of
 from ipsys_log.runs.one_pass import OnePass
@@ -57,7 +57,7 @@ def test_model_of_another_log_lets_all_stages_follow(
         computed.append(task.stage.name)
         return compute_messages(task, *rest)
 
-    monkeypatch.setattr(pipeline, "compute_messages", watched)
+    monkeypatch.setattr(stages_in_order, "compute_messages", watched)
     request = Request(models=("rigid",), model_from=other)
     fresh = [outcome.stage for outcome in replay([lab], request) if outcome.fresh]
     assert fresh == ["detect", "camera-frame", "fit", "evaluate", "locate", "fuse"]
@@ -120,7 +120,7 @@ def test_results_are_computed_again_after_a_change(
             append_messages(target, [longer])
         return outcome
 
-    monkeypatch.setattr(pipeline, "run_stage", run_and_append)
+    monkeypatch.setattr(stages_in_order, "run_stage", run_and_append)
     replay([lab], Request(), STAGES[1])
     monkeypatch.setattr(OnePass, "follow", lambda self, messages, *_: messages)
     replay([alone], Request(), STAGES[1])

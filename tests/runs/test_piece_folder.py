@@ -168,6 +168,24 @@ def test_pieces_that_are_stored_are_not_asked_for_again(log: Path, tmp_path: Pat
     assert output.read_bytes() == alone.read_bytes()
 
 
+@pytest.mark.slow
+def test_piece_that_another_merge_deletes_is_missing(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tasks = missing(log)
+    for task in tasks:
+        store_piece(task)
+    attempts = PieceFolder.attempts
+
+    def list_and_delete(folder: PieceFolder) -> dict[str, list[Path]]:
+        found = attempts(folder)
+        found[tasks[1].key][0].unlink()
+        return found
+
+    monkeypatch.setattr(PieceFolder, "attempts", list_and_delete)
+    before = log.read_bytes()
+    assert [task.key for task in missing(log)] == [tasks[1].key]
+    assert log.read_bytes() == before
+
+
 def test_log_that_changed_after_the_division_is_refused(log: Path) -> None:
     (task, *_) = missing(log)
     with LogWriter.append(log) as writer:

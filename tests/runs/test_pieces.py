@@ -18,13 +18,16 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.messages.resets import Resets
+from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, plan_stage, writer_of
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.pieces import (
+    Piece,
     PieceFrames,
+    PieceResult,
+    PieceRun,
     compute_piece,
-    compute_piece_of_logs,
     merge_pieces,
     order_frames,
     plan_pieces,
@@ -123,9 +126,15 @@ def test_pieces_in_any_order_give_the_bytes_of_one_process(corners: str, part: P
     assert len(plan.pieces) > (4 if corners == "edges" else 1)  # stock has the usual period
     # As workers do it: pickled, each with the log opened anew, and the last piece first.
     sent = pickle.loads(pickle.dumps((plan.run, plan.pieces[::-1])))
-    results = [pickle.loads(pickle.dumps(compute_piece_of_logs(sent[0], piece))) for piece in sent[1]]
+    results = [pickle.loads(pickle.dumps(compute(sent[0], piece))) for piece in sent[1]]
     assert _rows(merge_pieces(wired, plan, results[::-1])) == alone
     assert any(topic.endswith("/events") for topic, *_ in alone)
+
+
+def compute(run: PieceRun, piece: Piece) -> PieceResult:
+    """Compute a piece as a worker does: with logs of its own."""
+    with Session(run.paths) as session, one_blas_thread():
+        return compute_piece(session, run, piece)
 
 
 def test_piece_does_not_depend_on_the_frames_before_it(part: Path, tmp_path: Path) -> None:
@@ -138,7 +147,7 @@ def test_piece_does_not_depend_on_the_frames_before_it(part: Path, tmp_path: Pat
         lenses = list(session.messages(session.calibrations.values()))
         whole = compute_piece(session, run, piece)
     write_log(tmp_path / "cut.mcap", [*lenses, *kept])
-    alone = compute_piece_of_logs(replace(run, paths=(tmp_path / "cut.mcap",)), piece)
+    alone = compute(replace(run, paths=(tmp_path / "cut.mcap",)), piece)
     assert whole.frames
     assert [[encode(one) for one in frame.payloads] for frame in alone.frames] == [
         [encode(one) for one in frame.payloads] for frame in whole.frames

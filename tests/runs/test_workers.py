@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import multiprocessing.connection
 import shutil
+import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +163,57 @@ def test_busy_worker_has_its_next_piece(monkeypatch: pytest.MonkeyPatch) -> None
         next(results)
         # Before the first result is used, each worker has a piece in work and another one.
         assert [list(worker.pieces) for worker in local._workers] == [[2, 4], [1, 3]]
+
+
+def test_worker_computes_while_its_result_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The result is larger than the pipe: without a thread of its own, its sending stops the worker."""
+    computed = threading.Event()
+
+    def answers(_run: Any, receiver: Connection) -> Iterator[Any]:
+        yield bytes(1 << 24)
+        computed.set()
+        yield receiver.recv()
+
+    with _served(monkeypatch, answers) as ours:
+        assert computed.wait(PATIENCE_S)
+        assert len(ours.recv()) == 1 << 24
+
+
+def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that waits for the last result of a worker must get an answer."""
+
+    def answers(_run: Any, receiver: Connection) -> Iterator[Any]:
+        yield threading.Lock()
+        yield receiver.recv()
+
+    with _served(monkeypatch, answers) as ours:
+        assert ours.poll(PATIENCE_S)
+        failure = ours.recv()
+        assert "cannot pickle" in str(failure.error)
+        assert "Traceback" in failure.trace
+
+
+@contextmanager
+def _served(
+    monkeypatch: pytest.MonkeyPatch, answers: Callable[[Any, Connection], Iterator[Any]]
+) -> Iterator[Connection]:
+    """Serve answers in a thread; yield the end of the pipe that has no place for a large one."""
+    monkeypatch.setattr(workers, "_answers", answers)
+    ours, theirs = multiprocessing.Pipe()
+
+    def serve() -> None:
+        with suppress(EOFError, ConnectionError):
+            workers._serve(theirs, theirs)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        ours.send("the run")
+        yield ours
+    finally:
+        ours.close()
+        thread.join()
+        theirs.close()
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, sent: list[int]) -> None:

@@ -7,7 +7,7 @@ import re
 import runpy
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import LATENCY_TOPIC, CompressedImage, Latency, Message, image_topic
+from ipsys_log.runs.output import write_log
+from ipsys_log.simulation.hall import grid_names
 from ipsys_log.sinks.foxglove_layout import make_layout
 from tests.conftest import ROOT, Ipsys
 
@@ -96,6 +99,40 @@ def test_every_panel_is_shown_once(layout: dict[str, Any], scored_layout: dict[s
     images = [name for name in shown if name.startswith("Image!")]
     assert shown == [*images, "3D!floor", "Plot!position", "Plot!latency"]
     assert list(panels(scored_layout["layout"])) == ["3D!floor", "Plot!position", "Plot!error"]
+
+
+def areas(tree: Any, width: float = 1.0, height: float = 1.0) -> Iterator[tuple[str, float, float]]:
+    """Yield the panels of a layout with their shares of its width and height."""
+    if isinstance(tree, str):
+        yield tree, width, height
+        return
+    share = tree["splitPercentage"] / 100
+    for part, own in (("first", share), ("second", 1 - share)):
+        is_row = tree["direction"] == "row"
+        yield from areas(tree[part], width * (own if is_row else 1), height * (1 if is_row else own))
+
+
+def test_images_of_a_hall_are_a_grid_and_latencies_one_line(tmp_path: Path) -> None:
+    log = tmp_path / "hall.mcap"
+    write_log(log, hall_messages(grid_names(6, 4)))
+    with Session([log]) as session:
+        layout = make_layout(session)
+    sizes = {name: (width, height) for name, width, height in areas(layout["layout"])}
+    assert sorted(sizes) == sorted(layout["configById"])
+    images = [size for name, size in sizes.items() if name.startswith("Image!")]
+    assert len(images) == 24
+    assert min(height for _, height in images) > 0.15
+    assert min(width for width, _ in images) > 0.06
+    (path,) = layout["configById"]["Plot!latency"]["paths"]
+    assert path["label"] == "all cameras"
+
+
+def hall_messages(names: Sequence[str]) -> Iterator[Message]:
+    for number, name in enumerate(names, 1):
+        frame = CompressedImage(number, name, b"\xff\xd8\xff", "jpeg")
+        yield Message(image_topic(name), number, number, frame, name)
+    latency = Latency(1, names[0], 1, 2, 3, 4, 5)
+    yield Message(LATENCY_TOPIC, len(names) + 1, 1, latency)
 
 
 def test_images_have_their_markers_and_calibration(layout: dict[str, Any], recorded: Path) -> None:

@@ -92,6 +92,7 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         says(hand, "#notice", "p001 is in the log")
         assert [(row.id, row.withdraws) for row in foreign_read(log)] == [("p001", "")]
         says(hand, "#stop", "interval 2/")
+        says(hand, "#so-far", "Measured so far: 1 point")
         hand.wait("[...document.querySelectorAll('.cm input')].every(e => e.value === '')")
 
         hand.tap("#places button")
@@ -203,7 +204,8 @@ class Recording:
             return [CameraView("red", 10**9)]
         path = [CameraPoint(0, n * self.speed_m, 0.1, 2.0) for n in range(9)]
         rows = tuple(CameraPoints(10**9 + n, (point,)) for n, point in enumerate(path))
-        return [CameraView("red", rows[-1].timestamp, points=rows)]
+        measured = tuple((one.id, 0, np.array([0.0, 0.1, 2.0])) for one in self.done)
+        return [CameraView("red", rows[-1].timestamp, points=rows, measured=measured)]
 
     def history(self) -> list[Measurement]:
         return self.done
@@ -229,6 +231,7 @@ def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
         says(hand, "#sight", "Marker 0 is stationary, seen by red")
         save(hand, "p001")
         says(hand, "#places", "p001 marker 0")
+        says(hand, "#so-far", "Measured so far: 1 point (red 1)")
     (saved,) = scene.done
     assert saved.still is not None
     assert (saved.marker_id, saved.side, saved.still.end - saved.still.start) == (0, "left", 8)

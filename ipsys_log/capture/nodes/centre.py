@@ -2,8 +2,7 @@
 
 All cameras of a recording share one session. The centre asks each node for its state ten times a second, and
 more often in the first 30 s if there are few nodes. It asks for frames that did not arrive with the lowest
-priority. Everything that arrives waits in a queue with a limit; a dropped frame is missing, so the node sends
-it again.
+priority. All arrivals wait in a queue with a limit; a dropped frame is missing, so the node sends it again.
 """
 
 from __future__ import annotations

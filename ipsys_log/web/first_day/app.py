@@ -44,23 +44,27 @@ _FILES = {
 
 
 class _Embedded:
-    """A page below a path of the server, as long as its job works; without one, the path leads back."""
+    """A page below a path of the server, as long as its job works; without one, the path leads back.
+
+    ``scene`` is that of a measuring page.
+    """
 
     def __init__(self) -> None:
         self.app: ASGIApp | None = None
+        self.scene: LiveScene | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         app: ASGIApp = RedirectResponse("/", 303) if self.app is None else self.app
         await app(scope, receive, send)
 
     @contextmanager
-    def show(self, app: ASGIApp) -> Iterator[None]:
+    def show(self, app: ASGIApp, scene: LiveScene | None = None) -> Iterator[None]:
         """Show a page until the end of the block."""
-        self.app = app
+        self.app, self.scene = app, scene
         try:
             yield
         finally:
-            self.app = None
+            self.app = self.scene = None
 
 
 class SetupApp:
@@ -75,7 +79,6 @@ class SetupApp:
     def __init__(self, folder: LabFolder) -> None:
         self._measuring, self._dashboard = _Embedded(), _Embedded()
         self._seat = OperatorSeat()
-        self._measured: LiveScene | None = None
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
@@ -93,12 +96,8 @@ class SetupApp:
 
     @contextmanager
     def _show_measuring(self, scene: LiveScene) -> Iterator[None]:
-        self._measured = scene
-        try:
-            with self._measuring.show(build_app(scene, setup="../#points")):
-                yield
-        finally:
-            self._measured = None
+        with self._measuring.show(build_app(scene, setup="../#points"), scene):
+            yield
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
@@ -121,7 +120,7 @@ class SetupApp:
         state = await asyncio.to_thread(self.session.describe)
         pages = {"measure": self._measuring.app is not None, "live": self._dashboard.app is not None}
         may = request.scope.get(MAY_WRITE, True)
-        scene = self._measured
+        scene = self._measuring.scene
         count = None if scene is None else len(active_measurements(scene.history()))
         return JSONResponse(
             {

@@ -1,0 +1,133 @@
+"""The stages of a replay in order: those that all models share, and then those of each model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from ipsys_log.errors import FitError
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
+from ipsys_log.messages import Message
+from ipsys_log.messages.channels import MODEL, RUN_EVENTS, Channel
+from ipsys_log.messages.stage import Stage
+from ipsys_log.models.table import reads_corners
+from ipsys_log.runs.blas import one_blas_thread
+from ipsys_log.runs.execute import compute_messages, run_stage
+from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
+from ipsys_log.runs.model_checks import check_fits
+from ipsys_log.runs.one_pass import OnePass
+from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.pieces import PieceWorkers
+from ipsys_log.runs.preload import preload
+from ipsys_log.runs.provenance import Outcome
+
+__all__ = ["Replay"]
+
+
+@dataclass(slots=True)
+class Replay:
+    """The work of one replay.
+
+    Attributes
+    ----------
+    request : the options of the stages.
+    stages, models : those to compute, in order.
+    logs, target : the logs to read as one, and the log that gets the results.
+    workers : they compute the pieces of a long log.
+    one_pass : the stages that follow another one.
+    progress, say : called with the state of the work, and with remarks.
+    unchecked : several models of which it is not known yet if all can be fitted.
+    outcomes : one for each stage so far.
+    """
+
+    request: Request
+    stages: Sequence[Stage]
+    models: Sequence[str]
+    logs: Sequence[LogLocation]
+    target: Path
+    workers: PieceWorkers
+    one_pass: OnePass
+    progress: Progress
+    say: Callable[[str], None]
+    unchecked: list[str] = field(init=False)
+    outcomes: list[Outcome] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        self.unchecked = list(self.models) if len(self.models) > 1 else []
+
+    def compute(self) -> None:
+        """Run the stages that all models share, and then those of each model.
+
+        Raises
+        ------
+        IpsysError
+            The input has a fault that the user must correct.
+        """
+        of_model = [stage for stage in self.stages if is_of_model(stage)]
+        # A copied model is known before its turn: its stages can follow the first ones.
+        is_copied = self.request.model_from is not None and len(self.models) == 1
+        shared: dict[Channel, str] = {}
+        first = [stage for stage in self.stages if stage not in of_model]
+        self._run_stages(first, shared, None, of_model if is_copied else [])
+        for model in self.models:
+            try:
+                self._run_stages(of_model, dict(shared), model)
+            except FitError as error:
+                # The checks before cannot know if corners determine all cameras.
+                if model in self.request.models or not reads_corners(model):
+                    raise
+                self.say(f"{model} is left out: {error}")
+
+    def _run_stages(
+        self,
+        stages: Sequence[Stage],
+        inputs: dict[Channel, str],
+        model: str | None,
+        later: Sequence[Stage] = (),
+    ) -> None:
+        """Run some stages in order, and note the runs of their channels.
+
+        The ``later`` stages can follow them in the same pass.
+        """
+        for number, stage in enumerate(stages, 1):
+            run = self._run_stage(stage, (*stages[number:], *later), inputs, model)
+            inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
+
+    def _run_stage(
+        self, stage: Stage, following: Sequence[Stage], inputs: Mapping[Channel, str], model: str | None
+    ) -> str:
+        """Run a stage, or find its result; return its run."""
+        request = self.request
+        with Session(self.logs) as session:
+            if MODEL in stage.writes and request.model_from is not None:
+                task: Task | str = copy_model(request, str(model))[0]
+            else:
+                options = request.options(model)
+                task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
+            if isinstance(task, str):
+                return task
+            compute = partial(self._messages, following=following, model=model or self.models[0])
+            outcome = run_stage(session, self.target, task, request, self.stages[-1], compute, self.say)
+        self.outcomes.append(outcome)
+        return outcome.run
+
+    def _messages(
+        self, task: Task, session: Session, name: str, following: Sequence[Stage], model: str
+    ) -> Iterator[Message]:
+        """Compute a run. Before the first fit, check that all models can be fitted."""
+        waiting = self.one_pass.results(session, task, name, self.progress)
+        if waiting is not None:
+            yield from waiting
+            return
+        with one_blas_thread():
+            if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
+                check_fits(session, self.request, task.inputs, self.unchecked)
+                self.unchecked.clear()
+            messages = compute_messages(task, session, name, self.progress, self.workers)
+            fits = any(MODEL in stage.writes for stage in self.stages)
+            if task.stage.in_threads and fits and self.request.model_from is None:
+                messages = preload(messages, self.models)
+            yield from self.one_pass.follow(messages, session, task, name, following, model)

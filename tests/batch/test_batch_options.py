@@ -1,0 +1,133 @@
+"""The options of a batch: settings, paths, names of files, and the number of workers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ipsys_log.batch.exports import check_exports
+from ipsys_log.batch.settings import WorkerSettings
+from ipsys_log.batch.tasks import BatchTask, LogResult
+from ipsys_log.batch.workers import most_tasks, open_workers
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation, LogUrl
+from ipsys_log.log.log_files import expand_folders
+from tests.conftest import Ipsys
+
+distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        (WorkerSettings("tcp://10.0.0.1:8786"), "can run code on its workers; use tls:// with certificates"),
+        (WorkerSettings("10.0.0.1:8786"), "is not encrypted"),
+        (WorkerSettings("tls://head:1", workers=2), "--workers: the scheduler has its own workers"),
+        (WorkerSettings("tls://head:1", tls_ca=Path("none.pem")), "--tls-ca none.pem: is not a file"),
+        (WorkerSettings(insecure=True), "--insecure: has an effect only with --scheduler"),
+        (WorkerSettings(tls_key=Path("key.pem")), "--tls-key: has an effect only with --scheduler"),
+    ],
+)
+def test_settings_without_effect_or_protection_are_refused(settings: WorkerSettings, text: str) -> None:
+    with pytest.raises(IpsysError) as caught:
+        settings.check()
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["logs", "--model", "bst"], "model 'bst' is not known; use one of rigid, poly"),
+        (["logs", "--memory-limit", "much"], "--memory-limit much: is not a size"),
+        (["logs", "--memory-limit", "10MB"], "--memory-limit 10MB: a worker needs 256 MB or more"),
+        (["logs", "--table", "rows.csv"], "--table rows.csv: the name must end in .parquet"),
+        (["lgs"], "lgs does not exist"),
+        (["logs", "--model-from", "none.mcap"], "none.mcap does not exist"),
+    ],
+)
+def test_wrong_options_are_refused_before_a_worker_starts(
+    options: list[str], text: str, tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("logs").mkdir()
+    Path("logs/a.mcap").write_bytes(b"")
+
+    def start(**_: object) -> None:
+        raise AssertionError("a worker is started")
+
+    monkeypatch.setattr(distributed, "LocalCluster", start)
+    done = ipsys("batch", "replay", *options)
+    assert (done.code, done.out) == (1, "")
+    assert done.err.startswith(f"ipsys: {text}")
+    assert done.err.count("\n") == 1
+
+
+def test_workers_of_a_scheduler_get_absolute_paths(
+    tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They have other working directories; a URL is the same everywhere."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.mcap", "model.mcap"):
+        Path(name).write_bytes(b"")
+    given: list[tuple[BatchTask, list[LogLocation]]] = []
+
+    def collect(task: BatchTask, paths: list[LogLocation], _settings: WorkerSettings) -> list[LogResult]:
+        given.append((task, paths))
+        return [LogResult(str(path), "computed") for path in paths]
+
+    monkeypatch.setattr("ipsys_log.cli.batch._collect", collect)
+    for model in ("model.mcap", "http://127.0.0.1:1/model.mcap"):
+        logs = ("a.mcap", "http://127.0.0.1:1/b.mcap")
+        done = ipsys("batch", "replay", *logs, "--model-from", model, "--scheduler", "tls://127.0.0.1:1")
+        assert done.code == 0, done.err
+        assert given[-1][1] == [tmp_path / "a.mcap", LogUrl("http://127.0.0.1:1/b.mcap")]
+    assert [task.options["model_from"] for task, _ in given] == [tmp_path / "model.mcap", LogUrl(model)]
+    assert all(task.options["folder"] == tmp_path for task, _ in given)
+
+
+def test_long_log_has_all_workers_and_a_short_one_has_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[int] = []
+
+    def start(n_workers: int, **_: object) -> None:
+        started.append(n_workers)
+        raise IpsysError("no worker in this test")
+
+    monkeypatch.setattr(distributed, "LocalCluster", start)
+    short, long = tmp_path / "short.mcap", tmp_path / "long.mcap"
+    short.write_bytes(b"")
+    with long.open("wb") as file:
+        file.truncate(100 << 20)
+    for logs in ([short], [short, short], [long], [LogUrl("s3://lab/a.mcap")]):
+        with (
+            pytest.raises(IpsysError, match="no worker"),
+            open_workers(WorkerSettings(workers=5), most_tasks(logs)),
+        ):
+            pass
+    assert started == [1, 2, 5, 5]
+
+
+def test_logs_are_named_once_and_folders_searched(tmp_path: Path) -> None:
+    (tmp_path / "week" / "monday").mkdir(parents=True)
+    for name in ("b.mcap", "week/monday/a.mcap", "week/c.mcap", "week/notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "b.mcap")
+    given_names = ("b.mcap", "week", "link.mcap", "none.mcap")
+    found = expand_folders(tmp_path / name for name in given_names)
+    assert [path.name for path in found] == ["b.mcap", "c.mcap", "a.mcap", "none.mcap"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(IpsysError, match="has no file that ends in"):
+        expand_folders([tmp_path / "empty"])
+
+
+def test_exports_that_would_have_one_file_are_refused(tmp_path: Path) -> None:
+    wishes: dict[str, Any] = {"table": "tracks", "run": None, "robot": None}
+    logs = [Path("a/monday.mcap"), Path("b/monday.mcap")]
+    with pytest.raises(IpsysError, match=r"a/monday.mcap and b/monday.mcap have the same name"):
+        check_exports(logs, tmp_path, format="csv", **wishes)
+    assert check_exports(logs[:1], tmp_path, format="tum", **wishes) == ".tum"
+    with pytest.raises(IpsysError, match="--format xlsx: is not known"):
+        check_exports(logs, tmp_path, format="xlsx", **wishes)

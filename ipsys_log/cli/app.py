@@ -160,7 +160,7 @@ ipsys check *.mcap --json                # also notes, for programs
 ipsys du monday.mcap
 """,
     "cat": """
-ipsys cat monday.mcap --topics /events,/measurements
+ipsys cat monday.mcap --topics /events,/latency
 ipsys cat monday.mcap --start-offset 10 --end-offset 12 | less
 ipsys cat monday.mcap --topics /runs/poly/tracks --json > tracks.ndjson
 """,

@@ -118,9 +118,10 @@ def calibrate(
 ) -> None:
     """Calibrate camera intrinsics from images of a chessboard or a ChArUco board.
 
-    Writes one file for each camera that saw the board, with the name of the camera. If a camera has no
-    result, the files of the others are written, and the exit code is 1. Sharp, different images are
-    selected automatically; two dozen with the board in all parts of the image are enough."""
+    The command writes one file for each camera that saw the board, with the name of the camera. If a camera
+    has no result, the files of the others are written, and the exit code is 1. Sharp, different images are
+    selected automatically; two dozen with the board in all parts of the image are enough.
+    """
     from ipsys_log import api
     from ipsys_log.calibration.board import parse_board
     from ipsys_log.calibration.calibrate import CalibrationResult

@@ -275,8 +275,8 @@ def _with_one_reading(command: Callable[..., Any]) -> Callable[..., Any]:
 
 app = typer.Typer(
     name="ipsys",
-    help="Find the positions of robots indoors, with cheap cameras and ArUco markers. An MCAP log has all data: "
-    "replay the log, compare models, view the results.",
+    help="Find the positions of robots indoors, with cheap cameras and ArUco markers. An MCAP log has all "
+    "data: replay the log, compare models, view the results.",
     epilog="The help of a command ends with examples: ipsys record --help. To try all commands without a "
     "camera: ipsys init lab.toml --simulated. docs/glossary.md explains the terms.",
     no_args_is_help=True,

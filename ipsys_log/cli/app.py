@@ -43,7 +43,7 @@ from ipsys_log.stages import ENTRIES
 
 __all__ = ["EXAMPLES", "arrange", "panels"]
 
-_STAGES = "Single stages of replay"
+_STAGES = "Single stages"
 # The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
 _PLACED: dict[str, tuple[str, ...]] = {
     "First day, in this order": (
@@ -100,7 +100,7 @@ ipsys align monday.mcap --plot alignment.png   # of a log, with a figure
 """,
     "record": """
 ipsys record -o monday.mcap                      # the cameras of lab.toml
-ipsys record -o calibration.mcap --measure       # and enter tape readings
+ipsys record -o calibration.mcap --measure       # with tape readings
 ipsys record -o calibration.mcap --measure --host 0.0.0.0    # on a phone
 ipsys record -o short.mcap --camera red --seconds 10
 """,
@@ -160,7 +160,7 @@ ipsys check *.mcap --json                # also notes, for programs
 ipsys du monday.mcap
 """,
     "cat": """
-ipsys cat monday.mcap --topics /events,/measurements
+ipsys cat monday.mcap --topics /events,/latency
 ipsys cat monday.mcap --start-offset 10 --end-offset 12 | less
 ipsys cat monday.mcap --topics /runs/poly/tracks --json > tracks.ndjson
 """,
@@ -250,6 +250,9 @@ def arrange(app: typer.Typer) -> None:
     app.registered_commands.sort(key=lambda command: order.index(str(command.name)))
     for group in app.registered_groups:
         group.rich_help_panel = panel_of[str(group.name)]
+        for command in group.typer_instance.registered_commands if group.typer_instance else ():
+            assert command.callback is not None
+            command.help = _unwrapped(command.help or command.callback.__doc__ or "")
 
 
 def _unwrapped(text: str) -> str:
@@ -272,8 +275,8 @@ def _with_one_reading(command: Callable[..., Any]) -> Callable[..., Any]:
 
 app = typer.Typer(
     name="ipsys",
-    help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
-    "replay it, compare models on it, view it.",
+    help="Find the positions of robots indoors, with cheap cameras and ArUco markers. An MCAP log has all "
+    "data: replay the log, compare models, view the results.",
     epilog="The help of a command ends with examples: ipsys record --help. To try all commands without a "
     "camera: ipsys init lab.toml --simulated. docs/glossary.md explains the terms.",
     no_args_is_help=True,

@@ -161,32 +161,31 @@ _EXPORT: dict[str, tuple[Any, Any]] = {
         False,
     ),
 }
-_MORE = (
-    "\n\nThe command does only what is missing; after a failure or an interrupt, repeat it. A log that fails "
-    "does not affect the others. The exit code is 1 if a log failed."
-)
+_MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
+_REPEAT = " After a failure or an interrupt, repeat the command: it computes only what is missing."
 
 
 def add_commands(app: typer.Typer) -> None:
     """Add the group with its commands: the single commands on many logs."""
     group = typer.Typer(
-        help="Do a command on many logs, with many processes or the workers of a Dask scheduler.",
+        help="Run a command on many logs, with many processes or the workers of a Dask scheduler.",
         no_args_is_help=True,
     )
 
     def add(name: str, text: str, work: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> None:
         options = {"logs": _LOGS, **options, **_WORKERS}
-        group.command(name, help=text + _MORE)(build_command(options, work))
+        group.command(name, help=text)(build_command(options, work))
 
-    text = "Run the missing stages of each log, and append their results to it."
+    text = "Run the missing stages of each log, and append their results to it." + _MORE + _REPEAT
     add("replay", text, _replay, {**_stage_options(None), "output": _FOLDER, "outdated": _OUTDATED})
     text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
+    text += _MORE + _REPEAT
     add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _FOLDER})
-    add(
-        "verify", "Compute every run of each log again, and compare it byte for byte.", _verify, {"run": _RUN}
-    )
-    add("check", "Read each log completely and check it.", _check, {})
-    add("export", "Export each log to a file of its name in a folder.", _export, _EXPORT)
+    text = "Compute every run of each log again, and compare it byte for byte." + _MORE
+    add("verify", text, _verify, {"run": _RUN})
+    add("check", "Read each log completely and check it." + _MORE, _check, {})
+    text = "Export each log to a file of its name in a folder." + _MORE + _REPEAT
+    add("export", text, _export, _EXPORT)
     app.add_typer(group, name="batch")
 
 

@@ -22,7 +22,7 @@ __all__ = ["add_commands"]
 
 Sources = Annotated[
     Optional[list[Path]],  # noqa: UP045
-    file_log_argument(help="Logs, folders of pictures, pictures or videos.", metavar="SOURCE"),
+    file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE"),
 ]
 RigNow = Annotated[
     Path | None,
@@ -63,7 +63,7 @@ Cameras = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
         metavar="CAMERA",
-        help="Use only this camera of the log or rig; repeat it for several. With pictures or a video: the "
+        help="Use only this camera of the log or rig; repeat it for several. With images or a video: the "
         "name of the camera.",
     ),
 ]
@@ -88,8 +88,8 @@ Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Override four checks: no file is overwritten; the board in the pictures is not larger than "
-        "--board; the RMS is at most 2 px, from 5 pictures or more; all pictures are of one camera.",
+        help="Write a result that a check refuses: the file exists; most images show a larger board than "
+        "--board; RMS above 2 px; fewer than 5 images; images of two cameras.",
     ),
 ]
 
@@ -116,11 +116,12 @@ def calibrate(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate camera intrinsics from pictures of a chessboard or a ChArUco board.
+    """Calibrate camera intrinsics from images of a chessboard or a ChArUco board.
 
-    Writes one file for each camera that saw the board, with the name of the camera. If a camera has no
-    result, the files of the others are written, and the exit code is 1. Sharp, different pictures are
-    selected automatically; two dozen with the board in all parts of the image are enough."""
+    The command writes one file for each camera that saw the board, with the name of the camera. If a camera
+    has no result, the files of the others are written, and the exit code is 1. Sharp, different images are
+    selected automatically; two dozen with the board in all parts of the image are enough.
+    """
     from ipsys_log import api
     from ipsys_log.calibration.board import parse_board
     from ipsys_log.calibration.calibrate import CalibrationResult
@@ -213,7 +214,7 @@ def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
 
     if rig is None:
         raise IpsysError(
-            "no source is given; name pictures, a video or a log of a board, or give --rig lab.toml to use "
+            "no source is given; name images, a video or a log of a board, or give --rig lab.toml to use "
             "its cameras now"
         )
     lab = prepare_lab(rig, only, None, with_lenses=False)

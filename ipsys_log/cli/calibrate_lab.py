@@ -102,11 +102,11 @@ def calibrate_lab(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate all cameras of a lab together, from drives of robots and a few taped points.
+    """Calibrate all cameras of a lab together, from drives of robots and a few measured points.
 
     The command fits the model joint, prints the expected error over the floor, and says whether it is enough.
-    If it is not, the command names points to tape and a part of the floor to drive through. Without a tape:
-    lay a marker on each of two reference points, and enter 0 as its distance.
+    If it is not, the command names points to measure and a part of the floor to drive through. Without a
+    tape: lay a marker on each of two reference points, and enter 0 as its distance.
 
     Without LOG, the command records the cameras of --rig into -o until Ctrl-C. Meanwhile it prints the
     expected error, and takes the measured points on a page.

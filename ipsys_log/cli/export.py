@@ -27,8 +27,8 @@ def export(
             "--output",
             "-o",
             metavar="FILE",
-            help="The file to write: .csv or .parquet for a table, .tum or .kitti for a trajectory, "
-            ".mcap for a ROS 2 bag, .mp4 for a video; a new folder for --format coco.",
+            help="The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
+            "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
         ),
     ],
     format_: Annotated[
@@ -68,7 +68,7 @@ def export(
 
     A table has one row for each robot and instant; units are in the names of the columns, times are in UTC. A
     ROS 2 bag has images, intrinsics, poses, odometry and transforms. A video shows the cameras with their
-    markers, and the robots on the floor. A COCO data set has the pictures and the corners of their markers.
+    markers, and the robots on the floor. A COCO data set has the images and the corners of their markers.
     """
     from ipsys_log import api
     from ipsys_log.log_export import find_format, parse_size

@@ -49,19 +49,19 @@ def imsel(
 
 def images(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder with one sub-folder of pictures per camera.")
+        Path, typer.Argument(metavar="FOLDER", help="A folder with one sub-folder of images per camera.")
     ],
     output: NewLog,
     rig: RigFile = None,
     calibration: Calibrations = None,
     rate: Annotated[
-        float, typer.Option(metavar="HZ", help="Pictures per second, if they have no times.")
+        float, typer.Option(metavar="HZ", help="Images per second, if they have no times.")
     ] = 1.0,
     times: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|names",
-            help="Times of the pictures: a CSV file with the columns file (red/0001.jpg) and time, or names "
+            help="Times of the images: a CSV file with the columns file (red/0001.jpg) and time, or names "
             "if the file names are times. A time is in s, ms, us or ns since 1970, or like "
             "2024-05-31T12:30:00.25Z.",
         ),
@@ -80,10 +80,10 @@ def images(
     write_log(output, read_images(pictures, lab, lenses, rate, taken_ns))
     if not times and len({len(paths) for paths in pictures.values()}) > 1:
         remarks.print(
-            "the cameras have different numbers of pictures: pictures with the same number get the same time"
+            "the cameras have different numbers of images: images with the same number get the same time"
         )
     counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
-    console.print(f"{output} written: pictures: {counts}")
+    console.print(f"{output} written: images: {counts}")
 
 
 def videos(

@@ -82,8 +82,9 @@ def info(logs: ReadLogs, as_json: AsJson = False) -> None:
 def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
     """Show the runs of a log: stage, inputs, parameters, version of ipsys, and state.
 
-    The state is: current; out of date, with the reason (replay computes it again as a new run); not
-    repeatable (its inputs are not in the log); unfinished (its writer was stopped).
+    A run is current, out of date, not repeatable or unfinished. If it is out of date, the reason follows, and
+    ipsys replay makes a new run. Inputs of a run that is not repeatable are not in the log. The writer of an
+    unfinished run was stopped.
     """
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.contents import runs_table, states_json

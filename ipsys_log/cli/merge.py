@@ -42,8 +42,8 @@ def merge(
 ) -> None:
     """Merge the logs of several recorders of one session, with different cameras, into a new log.
 
-    Each recorder has its own clock. Without --offset, the offset of a log is estimated from markers that its
-    cameras and those of an earlier log saw moving; the logs need markers then (ipsys detect). Rigs and
+    Each recorder has its own clock. Without --offset, the command estimates the offset of a log from moving
+    markers that its cameras and those of an earlier log saw. Run ipsys detect on both logs first. Rigs and
     intrinsics must not contradict each other. The new log has the record of the merge with all offsets.
     """
     from ipsys_log.runs.merge import merge as merge_logs

@@ -110,7 +110,7 @@ def add_commands(app: typer.Typer) -> None:
     as_json = everything.pop("as_json")
     app.command(
         "replay",
-        help="Run the missing stages from detect to smooth, append their results, and print the accuracy.",
+        help="Run the missing stages from detect to fuse, append their results, and print the accuracy.",
     )(build_command({**everything, **_PRINTS, "as_json": as_json}, partial(_derive, None)))
     for number, entry in enumerate(ENTRIES):
         options = {**options_until(entry.name), **{name: _PRINTS[name] for name in entry.prints}}

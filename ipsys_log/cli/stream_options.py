@@ -77,7 +77,7 @@ Ros2 = Annotated[
     ),
 ]
 Ros2Port = _port_option(
-    "--ros2-port", "Use the Zenoh router on this port instead of 7447; if none answers, be it."
+    "--ros2-port", "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router."
 )
 Ros2Domain = Annotated[
     Optional[int],  # noqa: UP045

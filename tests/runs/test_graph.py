@@ -153,7 +153,7 @@ def test_rows_have_the_names_of_their_entries() -> None:
 
 def test_added_stage_is_a_command_in_the_help() -> None:
     *_, stage_panel, _ = ipsys_with_damping("--help").split("\n╭─ ")
-    assert stage_panel.startswith("Single stages of replay")
+    assert stage_panel.startswith("Single stages")
     assert "Damp the tracks." in stage_panel.splitlines()[-2]
     text = ipsys_with_damping("damp", "--help")
     assert all(option in text for option in ("--weight", "--model", "--method", "--corners", "--json"))

@@ -22,7 +22,7 @@ __all__ = ["encode", "ffmpeg", "make_jpegs", "serve", "serve_rtsp"]
 
 # A limit far above any duration on a busy machine.
 _LIMIT_S = 240.0
-# Of Linux: a buffer above the limit of the system, for root.
+# The option of Linux for a buffer above the limit of the system; only root may set it.
 _SO_RCVBUFFORCE = 33
 
 

@@ -53,7 +53,7 @@ from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel, 
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
-from ipsys_log.runs.checks import check_inputs
+from ipsys_log.runs.checks import check_earlier_runs, check_inputs
 from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
 from ipsys_log.runs.model_checks import check_fits
@@ -137,6 +137,7 @@ def replay(
         ) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""
             with Session(logs) as session:
+                check_earlier_runs(session, inputs.values())
                 if MODEL in stage.writes and request.model_from is not None:
                     task: Task | str = copy_model(request, str(model))[0]
                 else:

@@ -223,10 +223,11 @@ def _answers(run: PieceRun, receiver: Connection) -> Iterator[PieceResult]:
 
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.blas import one_blas_thread
-    from ipsys_log.runs.pieces import compute_piece
+    from ipsys_log.runs.pieces import check_versions, compute_piece
 
     cv2.setNumThreads(1)
     with Session(run.paths) as session, one_blas_thread():
+        check_versions(session, run)
         while True:
             yield compute_piece(session, run, receiver.recv())
 

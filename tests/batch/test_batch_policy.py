@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,6 +30,7 @@ from ipsys_log.batch.tasks import (
 from ipsys_log.batch.workers import Workers
 from ipsys_log.errors import IpsysError, WriteError
 from ipsys_log.log.log_files import expand_folders
+from ipsys_log.report.batch import write_results
 from ipsys_log.runs.piece_folder import PieceTask
 from ipsys_log.runs.pieces import Piece, PieceRun
 from tests.conftest import Ipsys
@@ -322,12 +324,29 @@ def test_logs_are_named_once_and_folders_searched(tmp_path: Path) -> None:
     for name in ("b.mcap", "week/monday/a.mcap", "week/c.mcap", "week/notes.txt"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "link.mcap").symlink_to(tmp_path / "b.mcap")
-    given_names = ("b.mcap", "week", "link.mcap", "none.mcap")
+    (tmp_path / "hard.mcap").hardlink_to(tmp_path / "b.mcap")
+    given_names = ("b.mcap", "week", "link.mcap", "hard.mcap", "none.mcap")
     found = expand_folders(tmp_path / name for name in given_names)
     assert [path.name for path in found] == ["b.mcap", "c.mcap", "a.mcap", "none.mcap"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(IpsysError, match="has no file that ends in"):
         expand_folders([tmp_path / "empty"])
+
+
+def test_links_that_lead_nowhere_are_not_left_out(tmp_path: Path) -> None:
+    """A log on a disk that is not mounted must not be missing without a word."""
+    (tmp_path / "gone.mcap").symlink_to("nowhere")
+    (tmp_path / "loop.mcap").symlink_to("loop.mcap")
+    (tmp_path / "folder.mcap").mkdir()
+    links = [tmp_path / "gone.mcap", tmp_path / "loop.mcap"]
+    assert expand_folders([tmp_path, *links]) == links
+
+
+def test_table_names_files_that_are_not_utf_8(tmp_path: Path) -> None:
+    name = os.fsdecode(b"red\xff.mcap")
+    write_results(tmp_path / "rows.parquet", [LogResult(name, "failed", False, f"run: ipsys repair {name}")])
+    (row,) = pd.read_parquet(tmp_path / "rows.parquet").to_dict("records")
+    assert (row["log"], row["text"]) == ("red\\udcff.mcap", "run: ipsys repair red\\udcff.mcap")
 
 
 def test_exports_that_would_have_one_file_are_refused(tmp_path: Path) -> None:

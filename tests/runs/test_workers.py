@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.reader import LogReader
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import pieces, workers
 from ipsys_log.runs.options import Request
@@ -119,6 +120,15 @@ def test_log_that_disappears_is_an_error_of_one_line(lab: Path) -> None:
         list(local.compute(_plan(run, Piece("red", 0, 1))))
 
 
+def test_log_that_is_replaced_is_an_error_of_one_line(lab_log: Path, tmp_path: Path) -> None:
+    """The results of another log would come into a run that names the first one as its input."""
+    log = Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
+    run = _run(log)
+    Path(shutil.copy(lab_log, tmp_path / "other.mcap")).rename(log)
+    with LocalWorkers(2) as local, pytest.raises(IpsysError, match=r"lab\.mcap changed while it was read"):
+        list(local.compute(_plan(run, Piece("red", 0, 1))))
+
+
 def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
     worker = workers._Worker()
     worker.begin(_run(lab_log))
@@ -129,7 +139,14 @@ def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
 
 
 def _run(log: Path) -> PieceRun:
-    return PieceRun(paths=(log,), stage="detect", parameters={"corners": "stock"}, topics=(), lenses={})
+    parameters = {"corners": "stock"}
+    versions: tuple[object, ...] = ()
+    if log.exists():
+        with LogReader(log) as reader:
+            versions = (reader.view.identity()[1],)
+    return PieceRun(
+        paths=(log,), stage="detect", parameters=parameters, topics=(), lenses={}, versions=versions
+    )
 
 
 def _plan(run: PieceRun, *pieces: Piece) -> PiecePlan:

@@ -86,7 +86,8 @@ def _is_broken_link(path: Path) -> bool:
 def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogState | None]]:
     """Yield the logs below a folder, or those of a URL with a pattern: name below the folder, log and state.
 
-    The state is None for a file that does not exist any more, and for a link without a file. The lists of an object store have the states, so an unchanged object needs no request of its own.
+    The state is None for a file that does not exist any more, and for a link without a file. The lists of an
+    object store have the states, so an unchanged object needs no request of its own.
 
     Raises
     ------

@@ -147,8 +147,8 @@ class PendingAppend:
             is_same = False
         if not is_same or status.st_size != self.size:
             raise LogError(
-                f"{self.path}: another program has replaced or changed the log in the meantime, so nothing was "
-                "written to it; run the command again"
+                f"{self.path}: another program has replaced or changed the log in the meantime, so nothing "
+                "was written to it; run the command again"
             )
 
     def _settle(self, error: OSError, tail: bytes) -> None:

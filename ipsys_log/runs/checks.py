@@ -163,7 +163,7 @@ def _check_request(paths: Sequence[LogLocation], request: Request, models: Seque
 
 
 def check_earlier_runs(session: Session, runs: Collection[str]) -> None:
-    """Check that a log has the runs of the stages before: another program can replace the file between stages.
+    """Check that a log has the runs of earlier stages: another program can replace it between stages.
 
     Raises
     ------
@@ -172,8 +172,8 @@ def check_earlier_runs(session: Session, runs: Collection[str]) -> None:
     """
     if missing := set(filter(None, runs)) - session.run_names():
         raise LogError(
-            f"{session}: another program has replaced the log in the meantime (run {min(missing)} is missing); "
-            "run the command again"
+            f"{session}: another program has replaced the log in the meantime (run {min(missing)} is "
+            "missing); run the command again"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections import Counter
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from ipsys_log.batch.tasks import (
     perform_or_divide,
 )
 from ipsys_log.batch.workers import Workers
+from ipsys_log.cli import batch as batch_command
 from ipsys_log.errors import IpsysError, WriteError
 from ipsys_log.log.log_files import expand_folders
 from ipsys_log.report.batch import write_results
@@ -340,6 +342,29 @@ def test_links_that_lead_nowhere_are_not_left_out(tmp_path: Path) -> None:
     (tmp_path / "folder.mcap").mkdir()
     links = [tmp_path / "gone.mcap", tmp_path / "loop.mcap"]
     assert expand_folders([tmp_path, *links]) == links
+
+
+@pytest.mark.parametrize("command", [("check",), ("export", "-o", "out")])
+def test_link_without_a_file_fails_alone(
+    command: tuple[str, ...], tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("logs").mkdir()
+    Path("logs/gone.mcap").symlink_to("nowhere")
+    Path("logs/text.mcap").write_text("no log")
+
+    def perform_here(task: BatchTask, paths: list[Path], _: WorkerSettings) -> list[LogResult]:
+        return [perform(task, path) for path in paths]  # type: ignore[misc]
+
+    monkeypatch.setattr(batch_command, "_collect", perform_here)
+    done = ipsys("batch", command[0], "logs", *command[1:], "--json")
+    texts = {row["log"]: row["text"] for row in json.loads(done.out)["results"]}
+    assert texts["logs/gone.mcap"] == "does not exist"
+    assert "is not an MCAP file" in texts["logs/text.mcap"]
+    assert done.code == 1
+    # A log that the user names must exist.
+    done = ipsys("batch", command[0], "logs/gone.mcap", *command[1:])
+    assert (done.code, done.err) == (1, "ipsys: logs/gone.mcap does not exist\n")
 
 
 def test_table_names_files_that_are_not_utf_8(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def replay(
         ) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""
             with Session(logs) as session:
-                check_earlier_runs(session, inputs.values())
+                check_earlier_runs(session, outcomes)
                 if MODEL in stage.writes and request.model_from is not None:
                     task: Task | str = copy_model(request, str(model))[0]
                 else:

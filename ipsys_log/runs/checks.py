@@ -38,7 +38,7 @@ from ipsys_log.runs.model_checks import (
     check_models,
 )
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import check_run_name, find_run, newest_run
+from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, newest_run
 from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.stages.detect import usual_corners
 
@@ -162,7 +162,7 @@ def _check_request(paths: Sequence[LogLocation], request: Request, models: Seque
         raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")
 
 
-def check_earlier_runs(session: Session, runs: Collection[str]) -> None:
+def check_earlier_runs(session: Session, outcomes: Sequence[Outcome]) -> None:
     """Check that a log has the runs of earlier stages: another program can replace it between stages.
 
     Raises
@@ -170,11 +170,13 @@ def check_earlier_runs(session: Session, runs: Collection[str]) -> None:
     LogError
         A run is missing: its stage has read another log.
     """
-    if missing := set(filter(None, runs)) - session.run_names():
-        raise LogError(
-            f"{session}: another program has replaced the log in the meantime (run {min(missing)} is "
-            "missing); run the command again"
-        )
+    recorded = {(record.stage, record.run) for record in session.runs()}
+    for outcome in outcomes:
+        if (outcome.stage, outcome.run) not in recorded:
+            raise LogError(
+                f"{session}: another program has replaced the log in the meantime ({outcome.stage} of run "
+                f"{outcome.run} is missing); run the command again"
+            )
 
 
 def _check_rigs(session: Session, request: Request) -> None:

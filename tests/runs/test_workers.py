@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing.connection
 import shutil
 from collections import deque
@@ -103,6 +104,25 @@ def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(KeyboardInterrupt):
         replay([lab], REQUEST, "detect", jobs=2)
     assert lab.read_bytes() == before
+    assert [worker.process.poll() for worker in started] == [-9, -9]
+
+
+def test_too_many_workers_for_the_system_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The workers before the failed one end."""
+    started: list[workers._Worker] = []
+
+    class Limited(workers._Worker):
+        def __init__(self) -> None:
+            if len(started) == 2:
+                raise OSError(errno.EMFILE, "Too many open files")
+            super().__init__()
+            started.append(self)
+
+    monkeypatch.setattr(workers, "_Worker", Limited)
+    plan = _plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(9)))
+    text = r"only 2 of 9 worker processes can be started \(Too many open files\).*fewer processes with --jobs"
+    with LocalWorkers(1000) as local, pytest.raises(IpsysError, match=text):
+        list(local.compute(plan))
     assert [worker.process.poll() for worker in started] == [-9, -9]
 
 

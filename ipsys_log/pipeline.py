@@ -253,6 +253,7 @@ def live(
         raise IpsysError(
             f"{fault}; {target} has all frames; to process them: ipsys replay {target}"
         ) from fault
+    log.check_file()
     try:
         outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.errors import LogError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -29,10 +30,11 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.pipeline import replay
 from ipsys_log.rig.file import load_rig
+from ipsys_log.runs import replay as replay_stages
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.stream import in_threads, run
-from tests.conftest import Ipsys, data_section
+from tests.conftest import ROOT, Ipsys, data_section
 from tests.wiring import wired
 
 RIG_TOML = """
@@ -372,3 +374,22 @@ def test_errors_against_the_truth_and_against_the_tape(ipsys: Ipsys, detected_la
         assert 0 < errors["3d"]["mean_cm"] < 4
         assert errors["truth"] != {key: errors[key] for key in ("3d", "2d")}
     assert 0 < model["tracks"]["truth"]["3d"]["mean_cm"] < 4
+
+
+def test_log_that_is_replaced_between_stages_gets_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next stage would find no input in the new file, and append an empty run to it."""
+    paper = ROOT / "sample_logs" / "paper_lab.mcap"
+    log = Path(shutil.copy(paper, tmp_path / "paper.mcap"))
+    run_stage = replay_stages.run_stage
+
+    def run_and_replace(*arguments: Any) -> Any:
+        outcome = run_stage(*arguments)
+        Path(shutil.copy(paper, tmp_path / "new.mcap")).rename(log)
+        return outcome
+
+    monkeypatch.setattr(replay_stages, "run_stage", run_and_replace)
+    with pytest.raises(LogError, match=r"another program has replaced the log .* is missing\)"):
+        replay([log], Request(models=("rigid",)), "evaluate")
+    assert log.read_bytes() == paper.read_bytes()

@@ -51,6 +51,10 @@ class RecentFrames:
             self._write()
 
     @property
+    def is_displaced(self) -> bool:
+        return self._log.is_displaced
+
+    @property
     def full(self) -> WriteError | None:
         return self._log.full
 

@@ -54,6 +54,7 @@ __all__ = [
 
 # After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0
+_DISPLACED = "deleted or renamed"
 
 
 class Source(Protocol):
@@ -93,8 +94,12 @@ class CameraSource(Source, Protocol):
 class Target(Protocol):
     """Destination of messages, in the order of their log times.
 
-    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages.
+    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages. ``is_displaced`` is
+    True if another program has deleted or renamed the file.
     """
+
+    @property
+    def is_displaced(self) -> bool: ...
 
     @property
     def full(self) -> WriteError | None: ...
@@ -120,13 +125,16 @@ class Recording:
     ----------
     counts : number of messages so far, by topic.
     full : set when the disk is full; then the reserved space is in use.
+    is_displaced : set soon after another program has deleted or renamed the file.
     syncer : syncs the log to the disk.
     """
 
     def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
         self.counts: dict[str, int] = {}
         self.full: WriteError | None = None
-        self.syncer = Syncer(writer.sync)
+        self.is_displaced = False
+        self.syncer = Syncer(self._sync)
+        self._file = writer.path.stat()
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
         self._torn = False
@@ -155,14 +163,30 @@ class Recording:
         """The first error of the disk when it failed to keep written messages."""
         return self.syncer.fault
 
+    def check_file(self) -> None:
+        """Check that the log still has its name.
+
+        Raises
+        ------
+        IpsysError
+            Another program has deleted or renamed it.
+        """
+        self._find_file()
+        if self.is_displaced:
+            raise IpsysError(
+                f"{self._writer.path}: another program has {_DISPLACED} the log; the recording has stopped. "
+                "A renamed log is complete up to this time under its new name; a deleted one is lost"
+            )
+
     def check_disk(self) -> None:
         """Check that all messages were written.
 
         Raises
         ------
         IpsysError
-            The disk was full or failed; the text describes the log.
+            The disk was full or failed, or the file is displaced; the text describes the log.
         """
+        self.check_file()
         if self.full is not None:
             raise IpsysError(describe_disk_full(self._writer.path, self.full)) from self.full
         if self.fault is not None:
@@ -171,6 +195,18 @@ class Recording:
     def settle(self) -> bool:
         """Prevent further writes from all threads; return False if a thread is still writing."""
         return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
+
+    def _sync(self) -> None:
+        self._find_file()
+        self._writer.sync()
+
+    def _find_file(self) -> None:
+        """Note that the path leads to another file or to none; a fault of the disk is no proof of that."""
+        try:
+            is_same = os.path.samestat(self._file, self._writer.path.stat())
+        except OSError as error:
+            is_same = not isinstance(error, FileNotFoundError)
+        self.is_displaced = self.is_displaced or not is_same
 
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
@@ -189,7 +225,8 @@ class Recording:
 def write_each(source: Source, log: Target) -> Iterator[Message | None]:
     """Yield the messages of a source, each after it was written.
 
-    A measurement is confirmed as soon as it is on the disk. When the disk is full, the source is stopped.
+    A measurement is confirmed as soon as it is on the disk. When the disk is full, or another program has
+    deleted or renamed the log, the source is stopped.
     Messages other than frames are still written, to the reserved space.
     """
     warned = False
@@ -216,6 +253,8 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
                 source.stop(
                     "the disk is full" if is_full(log.full.cause) else describe_disk_fault(log.full.cause)
                 )
+            elif log.is_displaced:
+                source.stop(f"another program has {_DISPLACED} the log")
 
 
 @contextmanager

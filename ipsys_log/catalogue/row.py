@@ -80,13 +80,15 @@ class Baseline:
     model_from: LogLocation
 
 
-def read_row(path: LogLocation, name: str, state: LogState, baseline: Baseline | None) -> dict[str, Any]:
+def read_row(
+    path: LogLocation, name: str, state: LogState | None, baseline: Baseline | None
+) -> dict[str, Any]:
     """Return the row of a log; the row of a log that cannot be read has its error instead of contents.
 
     Parameters
     ----------
     name : of the log in the catalogue.
-    state : of the log before it is read, so that a later change is noticed.
+    state : of the log before it is read, so that a later change is noticed; None: there was no such file.
     baseline : for the drift of the cameras since then; None: no drift.
     """
     row: dict[str, Any] = {"log": name, **state_columns(state)}
@@ -100,8 +102,10 @@ def read_row(path: LogLocation, name: str, state: LogState, baseline: Baseline |
     return row | (_drift(path, baseline) if baseline is not None else {})
 
 
-def state_columns(state: LogState) -> dict[str, Any]:
+def state_columns(state: LogState | None) -> dict[str, Any]:
     """Return the columns that show a change of a log: a log with the same ones is not read again."""
+    if state is None:
+        return dict.fromkeys(("bytes", "changed_ns", "object_version"))
     return {
         "bytes": state.size,
         "changed_ns": state.changed_ns,

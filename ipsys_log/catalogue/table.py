@@ -11,7 +11,7 @@ from typing import Any
 
 from ipsys_log.catalogue.row import COLUMNS, Baseline, read_row, state_columns
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.parquet_rows import read_rows, write_rows
+from ipsys_log.exchange.parquet_rows import escape_surrogates, read_rows, write_rows
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.log_files import read_log_state, states_below
 from ipsys_log.runs.graph import VERSIONS
@@ -65,7 +65,7 @@ def update_catalogue(
         There is no such folder, it has no logs and had none before, a store cannot be listed, PyArrow is not
         installed, or the target is another file.
     """
-    logs = {name: (log, state) for name, log, state in states_below(folder)}
+    logs = {escape_surrogates(name): (log, state) for name, log, state in states_below(folder)}
     mark = _mark(baseline)
     before = _earlier_rows(target, mark) if target.exists() else {}
     if not logs and not before:

@@ -250,7 +250,7 @@ def _export(
     paths = expand_folders(logs)
     suffix = check_exports(paths, output, **wishes)
     options = {"folder": output.absolute(), "suffix": suffix, "overwrite": overwrite, **wishes}
-    _run(BatchTask(export_log, options), logs=paths, **batch)
+    _run(BatchTask(export_log, options), logs=logs, paths=paths, **batch)
 
 
 def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -286,9 +286,20 @@ def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _run(
-    task: BatchTask, logs: list[LogLocation], table: Path | None, as_json: bool, **settings: Any
+    task: BatchTask,
+    logs: list[LogLocation],
+    table: Path | None,
+    as_json: bool,
+    paths: list[LogLocation] | None = None,
+    **settings: Any,
 ) -> None:
-    """Do the work on each log, and print the results in the order of the logs."""
+    """Do the work on each log, and print the results in the order of the logs.
+
+    Parameters
+    ----------
+    logs : as the user named them. Each must exist; a link without a file in a folder only fails itself.
+    paths : the logs of the folders and patterns in ``logs``; None: they are searched here.
+    """
     from ipsys_log.batch.settings import WorkerSettings
     from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
@@ -299,8 +310,9 @@ def _run(
         check_installed("--table needs", "pyarrow")
         check_parquet_name(table, "--table")
         check_file(table, "--table", logs)
-    workers, paths = WorkerSettings(**settings), expand_folders(logs)
-    check_present(paths)
+    workers = WorkerSettings(**settings)
+    paths = expand_folders(logs) if paths is None else paths
+    check_present(logs)
     if workers.scheduler is not None:  # its workers have other working directories
         paths = [path.absolute() if isinstance(path, Path) else path for path in paths]
         task = replace(task, options={name: _absolute(value) for name, value in task.options.items()})

@@ -11,7 +11,7 @@ from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 
-__all__ = ["Columns", "read_rows", "write_rows"]
+__all__ = ["Columns", "escape_surrogates", "read_rows", "write_rows"]
 
 # The type of each column by its name: a plain type, or the columns of the items of a list.
 Columns = Mapping[str, "str | Columns"]
@@ -25,7 +25,8 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
     Parameters
     ----------
     rows : by row, the value of each column; a missing one is null. Times are integers in ns; the file has
-        them in us and without a time zone, because DuckDB has few functions for any others.
+        them in us and without a time zone, because DuckDB has few functions for any others. Texts are those
+        of :func:`escape_surrogates`.
     columns : the type of each column, such as ``int64``, ``list<string>`` or ``time``; the columns of the
         items for a list of rows.
     mark : a text that :func:`read_rows` returns.
@@ -40,7 +41,7 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
     from pyarrow import parquet
 
     schema = pa.schema(_fields(columns)).with_metadata({_MARK: mark})
-    table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
+    table = pa.Table.from_pylist([escape_surrogates(dict(row)) for row in rows], schema=schema)
     table = _with_times(table, pa.timestamp("us"))
     with replacement_of(path) as file:
         parquet.write_table(table, file, compression="zstd")
@@ -71,6 +72,25 @@ def read_rows(path: Path) -> tuple[str | None, list[dict[str, Any]]]:
     table = _with_times(_with_times(table, pa.timestamp("ns")), pa.int64())
     rows: list[dict[str, Any]] = table.to_pylist()
     return mark.decode(), rows
+
+
+def escape_surrogates(value: Any) -> Any:
+    r"""Return a value whose texts can be stored: bytes of a file name that are not UTF-8 become escapes.
+
+    Parameters
+    ----------
+    value : a text, or a list, a tuple or a dict with texts at any depth; other values stay as they are.
+
+    Examples
+    --------
+    >>> escape_surrogates(["red.mcap", "red\udcff.mcap", 7])
+    ['red.mcap', 'red\\udcff.mcap', 7]
+    """
+    if isinstance(value, str):
+        return value if value.isascii() else value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {key: escape_surrogates(item) for key, item in value.items()}
+    return [escape_surrogates(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def _with_times(table: Any, kind: Any) -> Any:

@@ -46,15 +46,28 @@ def expand_folders(logs: Iterable[LogLocation]) -> list[LogLocation]:
     >>> expand_folders([Path("b.mcap"), Path("a.mcap"), Path("./b.mcap")])
     [PosixPath('b.mcap'), PosixPath('a.mcap')]
     """
-    found: dict[LogLocation, LogLocation] = {}
+    found: dict[object, LogLocation] = {}
     for location in logs:
         for log in _logs_of(location):
-            found.setdefault(log.resolve() if isinstance(log, Path) else log, log)
+            found.setdefault(_identity(log), log)
     return list(found.values())
+
+
+def _identity(log: LogLocation) -> object:
+    """Return a value that is equal for all names of a log, also for hard links."""
+    if isinstance(log, LogUrl):
+        return log
+    try:
+        status = log.stat()
+    except OSError:  # no such file, or a link that leads nowhere
+        return log.absolute()
+    return status.st_dev, status.st_ino
 
 
 def logs_below(folder: Path) -> list[Path]:
     """Return all files below a folder whose name ends in ``.mcap``, sorted by path.
+
+    A link without a file is returned, too: perhaps its disk is not mounted, and the user must know.
 
     Raises
     ------
@@ -63,13 +76,18 @@ def logs_below(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise IpsysError(f"{folder}: is not a folder; name a folder with logs")
-    return sorted(path for path in folder.rglob("*.mcap") if path.is_file())
+    return sorted(path for path in folder.rglob("*.mcap") if path.is_file() or _is_broken_link(path))
 
 
-def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogState]]:
+def _is_broken_link(path: Path) -> bool:
+    return path.is_symlink() and not path.exists()
+
+
+def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogState | None]]:
     """Yield the logs below a folder, or those of a URL with a pattern: name below the folder, log and state.
 
-    The lists of an object store have the states, so an unchanged object needs no request of its own.
+    The state is None for a file that does not exist any more, and for a link without a file. The lists of an
+    object store have the states, so an unchanged object needs no request of its own.
 
     Raises
     ------
@@ -78,13 +96,20 @@ def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogSta
     """
     if isinstance(folder, Path):
         for path in logs_below(folder):
-            yield str(path.relative_to(folder)), path, read_log_state(path)
+            yield str(path.relative_to(folder)), path, _state_of_file(path)
         return
     from ipsys_log.log.remote_object import list_states
 
     pattern = folder if folder.is_pattern else _all_below(folder)
     for log, state in list_states(pattern).items():
         yield str(log.below_pattern), log, state or read_log_state(log)
+
+
+def _state_of_file(path: Path) -> LogState | None:
+    try:
+        return read_log_state(path)
+    except OSError:
+        return None
 
 
 def _all_below(folder: LogUrl) -> LogUrl:

@@ -121,6 +121,7 @@ class PendingAppend:
     def finish(self, tail: bytes) -> None:
         if not self._pieces:
             return
+        self._check_unchanged()
         try:
             pieces = (*self._pieces, tail)
             replace_tail(self.storage, self.path, self.fd, self.start, pieces, self.make_temporary_tail)
@@ -130,6 +131,25 @@ class PendingAppend:
             with suppress(OSError):
                 roll_back(self.storage, self.path, self.fd)
             raise
+
+    def _check_unchanged(self) -> None:
+        """Check that the path still leads to the opened file: programs without locks can replace or cut it.
+
+        Raises
+        ------
+        LogError
+            The messages would be lost with the old file, or would damage another one.
+        """
+        status = os.fstat(self.fd)
+        try:
+            is_same = os.path.samestat(status, self.path.stat())
+        except OSError:
+            is_same = False
+        if not is_same or status.st_size != self.size:
+            raise LogError(
+                f"{self.path}: another program has replaced or changed the log in the meantime, so nothing "
+                "was written to it; run the command again"
+            )
 
     def _settle(self, error: OSError, tail: bytes) -> None:
         """Roll back after a disk fault if possible, and report which log is valid.

@@ -8,13 +8,13 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.geometry.lenses import check_calibration, check_size
 from ipsys_log.images.decode import frame_size
 from ipsys_log.images.video import Video
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.location import LogLocation
+from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.messages import CompressedVideo
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
@@ -38,11 +38,11 @@ from ipsys_log.runs.model_checks import (
     check_models,
 )
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import check_run_name, find_run, newest_run
+from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, newest_run
 from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.stages.detect import usual_corners
 
-__all__ = ["check_inputs", "image_sizes"]
+__all__ = ["check_earlier_runs", "check_inputs", "image_sizes"]
 
 # Most messages of a channel that the checks read. Some recorders write a calibration with each frame, so that
 # all of them are spread over the whole log.
@@ -155,16 +155,28 @@ def _check_request(paths: Sequence[LogLocation], request: Request, models: Seque
         )
     if request.model_from is None:
         return
-    if request.model_from in paths or _is_same_file(request.model_from, paths):
+    source = request.model_from
+    if source in paths or (isinstance(source, Path) and is_one_of(source, paths)):
         raise IpsysError(f"--model-from {request.model_from}: is the same log; leave out --model-from")
     if request.train != "train":
         raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")
 
 
-def _is_same_file(log: LogLocation, others: Sequence[LogLocation]) -> bool:
-    return isinstance(log, Path) and any(
-        isinstance(other, Path) and log.resolve() == other.resolve() for other in others
-    )
+def check_earlier_runs(session: Session, outcomes: Sequence[Outcome]) -> None:
+    """Check that a log has the runs of earlier stages: another program can replace it between stages.
+
+    Raises
+    ------
+    LogError
+        A run is missing: its stage has read another log.
+    """
+    recorded = {(record.stage, record.run) for record in session.runs()}
+    for outcome in outcomes:
+        if (outcome.stage, outcome.run) not in recorded:
+            raise LogError(
+                f"{session}: another program has replaced the log in the meantime ({outcome.stage} of run "
+                f"{outcome.run} is missing); run the command again"
+            )
 
 
 def _check_rigs(session: Session, request: Request) -> None:

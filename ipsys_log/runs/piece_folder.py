@@ -18,7 +18,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.piece_file import from_bytes, to_bytes
-from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun, compute_piece
+from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun, check_versions, compute_piece
 from ipsys_log.runs.provenance import fingerprint
 
 __all__ = [
@@ -173,16 +173,10 @@ def store_piece(task: PieceTask) -> None:
         names = [name for name in task.software if software.get(name) != task.software[name]]
         raise OtherSoftwareError(f"the workers have different versions: {', '.join(names)}")
     with Session(task.run.paths) as session, one_blas_thread():
-        _check_versions(session, task)
+        check_versions(session, task.run)
         result = compute_piece(session, task.run, task.piece)
-        _check_versions(session, task)
+        check_versions(session, task.run)
     PieceFolder(task.folder).write(task.key, to_bytes(result))
-
-
-def _check_versions(session: Session, task: PieceTask) -> None:
-    for reader, version in zip(session.readers, task.run.versions, strict=True):
-        if reader.view.identity()[1] != version:
-            raise IpsysError(f"{reader.path} changed while it was read: run the command again")
 
 
 def _keys(plan: PiecePlan, software: Mapping[str, str]) -> list[str]:

@@ -46,6 +46,7 @@ __all__ = [
     "PieceResult",
     "PieceRun",
     "PieceWorkers",
+    "check_versions",
     "compute_piece",
     "merge_pieces",
     "order_frames",
@@ -216,6 +217,19 @@ def split_frames(frames: PieceFrames, resets: Resets) -> list[Piece]:
             firsts.append((int(indices[row]), piece))
             row = int(np.searchsorted(times_ns, piece.end_ns))
     return [piece for _, piece in sorted(firsts)]
+
+
+def check_versions(session: Session, run: PieceRun) -> None:
+    """Check that open logs are still those of a run.
+
+    Raises
+    ------
+    IpsysError
+        Another program has changed or replaced a log.
+    """
+    for reader, version in zip(session.readers, run.versions, strict=True):
+        if reader.view.identity()[1] != version:
+            raise IpsysError(f"{reader.path} changed while it was read: run the command again")
 
 
 def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:

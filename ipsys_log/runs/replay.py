@@ -15,6 +15,7 @@ from ipsys_log.messages.channels import MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
+from ipsys_log.runs.checks import check_earlier_runs
 from ipsys_log.runs.execute import compute_messages, run_stage
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.model_checks import check_fits
@@ -102,6 +103,7 @@ class Replay:
         """Run a stage, or find its result; return its run."""
         request = self.request
         with Session(self.logs) as session:
+            check_earlier_runs(session, self.outcomes)
             if MODEL in stage.writes and request.model_from is not None:
                 task: Task | str = copy_model(request, str(model))[0]
             else:

@@ -63,8 +63,13 @@ class _Worker:
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self._sender = Connection(os.dup(self.process.stdin.fileno()), readable=False)
-        self.receiver = Connection(os.dup(self.process.stdout.fileno()), writable=False)
+        try:
+            self._sender = Connection(os.dup(self.process.stdin.fileno()), readable=False)
+            self.receiver = Connection(os.dup(self.process.stdout.fileno()), writable=False)
+        except OSError:  # no file descriptor is free
+            self.process.kill()
+            self.process.wait()
+            raise
         self.process.stdin.close()
         self.process.stdout.close()
 
@@ -144,7 +149,7 @@ class LocalWorkers:
         Raises
         ------
         IpsysError
-            A worker was killed.
+            A worker was killed, or cannot be started.
         Exception
             An error in a worker, with a note of its traceback.
         """
@@ -165,10 +170,22 @@ class LocalWorkers:
             self._stop()
 
     def _start(self, count: int) -> None:
-        """Start workers up to a number of them."""
+        """Start workers up to a number of them.
+
+        Raises
+        ------
+        IpsysError
+            The system has no more processes or file descriptors for this program.
+        """
         while len(self._workers) < count:
             with undivided():
-                self._workers.append(_Worker())
+                try:
+                    self._workers.append(_Worker())
+                except OSError as error:
+                    raise IpsysError(
+                        f"only {len(self._workers)} of {count} worker processes can be started "
+                        f"({error.strerror}); give fewer processes with --jobs"
+                    ) from error
 
     def _feed(self, waiting: deque[tuple[int, Piece]], stop: int) -> None:
         """Send pieces with numbers below ``stop``: first to idle workers, then one more to each of them."""
@@ -238,10 +255,11 @@ def _answers(run: PieceRun, receiver: Connection) -> Iterator[PieceResult]:
 
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.blas import one_blas_thread
-    from ipsys_log.runs.pieces import compute_piece
+    from ipsys_log.runs.pieces import check_versions, compute_piece
 
     cv2.setNumThreads(1)
     with Session(run.paths) as session, one_blas_thread():
+        check_versions(session, run)
         while True:
             yield compute_piece(session, run, receiver.recv())
 

@@ -8,6 +8,7 @@ import socket
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import h11
 from uvicorn import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
@@ -124,6 +125,16 @@ class _Connection(H11Protocol):
         self._is_answered = True
         self._restart_timer()
         super().on_response_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer an invalid request instead of the app, whose answer would be an internal error by now."""
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            super().send_400_response(msg)
+        else:
+            self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._timer is not None:

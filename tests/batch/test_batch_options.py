@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from ipsys_log.batch.exports import check_exports
 from ipsys_log.batch.settings import WorkerSettings
-from ipsys_log.batch.tasks import BatchTask, LogResult
+from ipsys_log.batch.tasks import BatchTask, LogResult, perform
 from ipsys_log.batch.workers import most_tasks, open_workers
+from ipsys_log.cli import batch as batch_command
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.log_files import expand_folders
+from ipsys_log.report.batch import write_results
 from tests.conftest import Ipsys
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
@@ -115,12 +120,52 @@ def test_logs_are_named_once_and_folders_searched(tmp_path: Path) -> None:
     for name in ("b.mcap", "week/monday/a.mcap", "week/c.mcap", "week/notes.txt"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "link.mcap").symlink_to(tmp_path / "b.mcap")
-    given_names = ("b.mcap", "week", "link.mcap", "none.mcap")
+    (tmp_path / "hard.mcap").hardlink_to(tmp_path / "b.mcap")
+    given_names = ("b.mcap", "week", "link.mcap", "hard.mcap", "none.mcap")
     found = expand_folders(tmp_path / name for name in given_names)
     assert [path.name for path in found] == ["b.mcap", "c.mcap", "a.mcap", "none.mcap"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(IpsysError, match="has no file that ends in"):
         expand_folders([tmp_path / "empty"])
+
+
+def test_links_that_lead_nowhere_are_not_left_out(tmp_path: Path) -> None:
+    """A log on a disk that is not mounted must not be missing without a word."""
+    (tmp_path / "gone.mcap").symlink_to("nowhere")
+    (tmp_path / "loop.mcap").symlink_to("loop.mcap")
+    (tmp_path / "folder.mcap").mkdir()
+    links = [tmp_path / "gone.mcap", tmp_path / "loop.mcap"]
+    assert expand_folders([tmp_path, *links]) == links
+
+
+@pytest.mark.parametrize("command", [("check",), ("export", "-o", "out")])
+def test_link_without_a_file_fails_alone(
+    command: tuple[str, ...], tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("logs").mkdir()
+    Path("logs/gone.mcap").symlink_to("nowhere")
+    Path("logs/text.mcap").write_text("no log")
+
+    def perform_here(task: BatchTask, paths: list[Path], _: WorkerSettings) -> list[LogResult]:
+        return [perform(task, path) for path in paths]
+
+    monkeypatch.setattr(batch_command, "_collect", perform_here)
+    done = ipsys("batch", command[0], "logs", *command[1:], "--json")
+    texts = {row["log"]: row["text"] for row in json.loads(done.out)["results"]}
+    assert texts["logs/gone.mcap"] == "does not exist"
+    assert "is not an MCAP file" in texts["logs/text.mcap"]
+    assert done.code == 1
+    # A log that the user names must exist.
+    done = ipsys("batch", command[0], "logs/gone.mcap", *command[1:])
+    assert (done.code, done.err) == (1, "ipsys: logs/gone.mcap does not exist\n")
+
+
+def test_table_names_files_that_are_not_utf_8(tmp_path: Path) -> None:
+    name = os.fsdecode(b"red\xff.mcap")
+    write_results(tmp_path / "rows.parquet", [LogResult(name, "failed", False, f"run: ipsys repair {name}")])
+    (row,) = pd.read_parquet(tmp_path / "rows.parquet").to_dict("records")
+    assert (row["log"], row["text"]) == ("red\\udcff.mcap", "run: ipsys repair red\\udcff.mcap")
 
 
 def test_exports_that_would_have_one_file_are_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -90,6 +91,19 @@ def test_broken_log_is_a_row_with_its_error(folder: Path, tmp_path: Path, ipsys:
     assert f"broken.mcap: {row['error']}" in done.out
     assert pd.isna(row["start_utc"])
     assert row["bytes"] == 50_000
+
+
+def test_names_that_are_not_utf_8_and_broken_links_are_rows(tmp_path: Path) -> None:
+    folder, target = tmp_path / "logs", tmp_path / "c.parquet"
+    folder.mkdir()
+    (folder / os.fsdecode(b"red\xff.mcap")).write_bytes(b"no log")
+    (folder / "gone.mcap").symlink_to("nowhere.mcap")
+    assert set(update_catalogue(folder, target).errors) == {"red\\udcff.mcap", "gone.mcap"}
+    assert rows_of(target)["gone.mcap"]["error"] == "does not exist"
+    assert update_catalogue(folder, target).read == 0
+    # The disk of the linked log is mounted.
+    shutil.copy(PAPER_LAB, folder / "nowhere.mcap")
+    assert update_catalogue(folder, target).read == 2
 
 
 def test_only_new_and_changed_logs_are_read(folder: Path, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from ipsys_log.log.journal import Disk, journal_path, replace_tail
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import repair
 from ipsys_log.log.summary import load_contents
+from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 
 PER_SESSION = 5
@@ -197,6 +198,39 @@ def _crash_after_truncate(path: Path, whole: bytes) -> None:
         replace_tail(Crashing(), path, fd, summary_start - 13, (b"new tail",))
     finally:
         os.close(fd)
+
+
+def _replace(path: Path, other: Path) -> None:
+    other.rename(path)
+
+
+def _overwrite(path: Path, other: Path) -> None:
+    path.write_bytes(other.read_bytes())
+
+
+def _delete(path: Path, other: Path) -> None:
+    path.unlink()
+
+
+@pytest.mark.parametrize("change", [_replace, _overwrite, _delete])
+def test_append_to_a_log_that_others_change_is_refused(
+    tmp_path: Path, change: Callable[[Path, Path], None]
+) -> None:
+    """Without this check, the results are lost with the old file, or they damage the new one."""
+    path = create(tmp_path / "a.mcap", FIRST)
+    other = create(tmp_path / "b.mcap", FIRST[:3])
+    whole = other.read_bytes()
+
+    def write_meanwhile() -> None:
+        with LogWriter.append(path) as writer:
+            writer.add_channel("/runs/a", None)
+            writer.write("/runs/a", 100, 100, b"result")
+            change(path, other)
+
+    with pytest.raises(LogError, match=r"a\.mcap: another program has replaced or changed the log"):
+        write_meanwhile()
+    assert not journal_path(path).exists()
+    assert not path.exists() or path.read_bytes() == whole
 
 
 def test_log_is_the_same_through_every_link(tmp_path: Path) -> None:

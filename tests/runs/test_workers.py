@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing.connection
 import shutil
 import threading
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.reader import LogReader
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import pieces, workers
 from ipsys_log.runs.options import Request
@@ -108,6 +110,25 @@ def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [worker.process.poll() for worker in started] == [-9, -9]
 
 
+def test_too_many_workers_for_the_system_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The workers before the failed one end."""
+    started: list[workers._Worker] = []
+
+    class Limited(workers._Worker):
+        def __init__(self) -> None:
+            if len(started) == 2:
+                raise OSError(errno.EMFILE, "Too many open files")
+            super().__init__()
+            started.append(self)
+
+    monkeypatch.setattr(workers, "_Worker", Limited)
+    plan = _plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(9)))
+    text = r"only 2 of 9 worker processes can be started \(Too many open files\).*fewer processes with --jobs"
+    with LocalWorkers(1000) as local, pytest.raises(IpsysError, match=text):
+        list(local.compute(plan))
+    assert [worker.process.poll() for worker in started] == [-9, -9]
+
+
 def test_bug_in_a_worker_keeps_its_traceback(lab_log: Path) -> None:
     run = _run(lab_log)
     with LocalWorkers(2) as local, pytest.raises(KeyError) as bug:
@@ -122,6 +143,15 @@ def test_log_that_disappears_is_an_error_of_one_line(lab: Path) -> None:
         list(local.compute(_plan(run, Piece("red", 0, 1))))
 
 
+def test_log_that_is_replaced_is_an_error_of_one_line(lab_log: Path, tmp_path: Path) -> None:
+    """The results of another log would come into a run that names the first one as its input."""
+    log = Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
+    run = _run(log)
+    Path(shutil.copy(lab_log, tmp_path / "other.mcap")).rename(log)
+    with LocalWorkers(2) as local, pytest.raises(IpsysError, match=r"lab\.mcap changed while it was read"):
+        list(local.compute(_plan(run, Piece("red", 0, 1))))
+
+
 def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
     worker = workers._Worker()
     worker.begin(_run(lab_log))
@@ -132,7 +162,14 @@ def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
 
 
 def _run(log: Path) -> PieceRun:
-    return PieceRun(paths=(log,), stage="detect", parameters={"corners": "stock"}, topics=(), lenses={})
+    parameters = {"corners": "stock"}
+    versions: tuple[object, ...] = ()
+    if log.exists():
+        with LogReader(log) as reader:
+            versions = (reader.view.identity()[1],)
+    return PieceRun(
+        paths=(log,), stage="detect", parameters=parameters, topics=(), lenses={}, versions=versions
+    )
 
 
 def _plan(run: PieceRun, *pieces: Piece) -> PiecePlan:

@@ -244,6 +244,24 @@ def test_client_that_publishes_or_sends_garbage_is_disconnected() -> None:
             assert isinstance(client.recv(_LIMIT_S), bytes)
 
 
+def test_silent_connections_leave_descriptors_to_the_recorder() -> None:
+    with streaming() as (stream, events), ExitStack() as stack:
+        client = stack.enter_context(opened(stream))
+        assert json.loads(client.recv(_LIMIT_S))["op"] == "serverInfo"
+        silent = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", stream.port), timeout=_LIMIT_S))
+            for _ in range(foxglove_stream._MOST_WAITING + 5)
+        ]
+        for connection in silent[:5]:  # the oldest ones
+            with suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
+        # Clients are not disconnected, and another one can connect.
+        assert json.loads(client.recv(_LIMIT_S))["op"] == "advertise"
+        with opened(stream) as later:
+            assert json.loads(later.recv(_LIMIT_S))["op"] == "serverInfo"
+    assert events == []
+
+
 def ended(client: ClientConnection) -> bool:
     try:
         client.recv(0.1)

@@ -219,7 +219,10 @@ def test_unread_answers_are_closed_in_time() -> None:
 
 def test_noise_on_the_port_stays_off_the_screen(capfd: pytest.CaptureFixture[str]) -> None:
     with page_with(PageLimits(total=6, per_address=4)) as (caller, page):
-        for noise in (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET\r\n\r\n", b"\0" * (1 << 17)):
+        post = b"POST / HTTP/1.1\r\nHost: localhost\r\nx-ipsys: 1\r\n"
+        chunk = post + b"Transfer-Encoding: chunked\r\n\r\nwrong\r\n"
+        hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"
+        for noise in (hello, b"GET\r\n\r\n", b"\0" * (1 << 17), chunk):
             with connections(caller, 1) as (noisy,):
                 noisy.sendall(noise)
                 assert is_closed_by_page(noisy)

@@ -37,8 +37,11 @@ _MOST_WAITING_BYTES, _MOST_RECENT_BYTES = 32 << 20, 64 << 20
 _MOST_REQUESTS = 4
 _MOST_FRAMES = 64
 _TURN_S = 0.1
-# The node of a finished recording waits for a centre that still asks.
+# The node of a finished recording waits for a centre that still asks for its session.
 _SILENT_NS = 3 * NS_PER_S
+# A centre that has another session for this time refuses this node; it accepts a node that was started again
+# earlier.
+_REFUSED_NS = 10 * NS_PER_S
 _SESSION_BYTES = 8
 
 
@@ -92,8 +95,11 @@ class Node:
         self._channel: GrowingChannel | None = None
         self._session: Any = None
         self._count = self._received = 0
-        self._has_ended = self._is_refused = False
+        self._has_ended = self._has_other_version = self._is_refused = False
+        # The last request of a centre, the last one for this session, and the first one for another session.
         self._asked_ns: int | None = None
+        self._accepted_ns: int | None = None
+        self._other_ns: int | None = None
         self._changed = threading.Condition()
         self._waiting: deque[_Recorded] = deque()
         self._waiting_bytes = self._recent_bytes = 0
@@ -157,16 +163,20 @@ class Node:
     def finish(self, has_ended: bool) -> int:
         """Wait until the centre has all frames, as long as it asks; return the number that it does not have.
 
+        A centre that refuses this node asks, too, but not for its session.
+
         Parameters
         ----------
         has_ended : the source has ended; otherwise the node was stopped, and may start again.
         """
         self._has_ended = has_ended
+        start_ns = self._clock.now_ns()
         while not self._stopped.wait(_TURN_S):
             now_ns = self._clock.now_ns()
             if (
                 self._asked_ns is None
                 or now_ns - self._asked_ns > _SILENT_NS
+                or now_ns - max(self._accepted_ns or 0, start_ns) > _SILENT_NS
                 or self._received >= self._count
             ):
                 break
@@ -211,16 +221,28 @@ class Node:
             query.reply(state_key(self._camera), state.encode(), express=True)
 
     def _note_centre(self, request: StateRequest, now_ns: int) -> None:
-        if self._asked_ns is None:
-            self._say(f"the centre {self._network} receives the frames of camera {self._camera}")
         self._asked_ns = now_ns
         if request.session == self.session_name:
-            self._received = request.received
-        if request.version != self._version and not self._is_refused:
-            self._is_refused = True
+            if self._accepted_ns is None:
+                self._say(f"the centre {self._network} receives the frames of camera {self._camera}")
+            self._received, self._accepted_ns, self._other_ns = request.received, now_ns, None
+        elif request.session:
+            self._note_other(now_ns)
+        if request.version != self._version and not self._has_other_version:
+            self._has_other_version = True
             self._say(
                 f"the centre {self._network} has ipsys {request.version}, but this machine has ipsys "
                 f"{self._version}; install one version on both"
+            )
+
+    def _note_other(self, now_ns: int) -> None:
+        """Note a request for the session of another node; report once that the centre keeps that node."""
+        self._other_ns = self._other_ns or now_ns
+        if now_ns - self._other_ns > _REFUSED_NS and not self._is_refused:
+            self._is_refused = True
+            self._say(
+                f"the centre {self._network} receives camera {self._camera} from another node, and refuses "
+                "this one; end one of them, or give it another --camera"
             )
 
     def _enqueue_request(self, query: Any) -> None:

@@ -13,6 +13,7 @@ import logging
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -39,6 +40,9 @@ __all__ = ["FoxgloveStream"]
 
 _BACKLOG = 16
 _MOST_CLIENTS = 32
+# Connections without a complete request: a recorder needs the other file descriptors. The oldest one has its
+# transport, because the loop accepts at most _BACKLOG connections in a turn.
+_MOST_WAITING = 64
 _LARGEST_MESSAGE = 1 << 16  # bytes, of a client
 _MOST_REFUSALS = 10  # events; others could fill the log
 _MOST_CHANNELS = 1000
@@ -96,6 +100,7 @@ class FoxgloveStream:
         self._latched: dict[str, tuple[int, bytes]] = {}
         # Replaced as a whole: other threads iterate over it.
         self._clients: frozenset[Client] = frozenset()
+        self._waiting: list[ServerConnection] = []  # the oldest first
         for topic in topics:
             self._advertise(topic, Tracks)
         self._loop = asyncio.new_event_loop()
@@ -164,7 +169,9 @@ class FoxgloveStream:
         async with serve(
             self._handle,
             sock=self._listening,
+            backlog=_BACKLOG,
             process_request=self._check,
+            create_connection=self._connect,  # type: ignore[arg-type]  # only called, never subclassed
             subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
             max_size=_LARGEST_MESSAGE,
             compression=None,
@@ -180,6 +187,15 @@ class FoxgloveStream:
         """End all connections now: a stalled client would delay the end."""
         for connection in server.connections:
             connection.transport.abort()
+
+    def _connect(self, *arguments: Any, **options: Any) -> ServerConnection:
+        """Return a new connection, and close the oldest one of too many that have sent no request."""
+        connection = ServerConnection(*arguments, **options)
+        self._waiting = [other for other in self._waiting if not _is_closed(other)]
+        if len(self._waiting) >= _MOST_WAITING:
+            self._waiting.pop(0).transport.abort()
+        self._waiting.append(connection)
+        return connection
 
     def _check(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse a connection before the handshake, unless it comes from a client with the secret."""
@@ -212,6 +228,7 @@ class FoxgloveStream:
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"refused: the connection {reason}\n")
 
     async def _handle(self, connection: ServerConnection) -> None:
+        self._waiting = [other for other in self._waiting if other is not connection]
         client = Client(connection, self._drops)
         client.put(write_server_info("ipsys", self._session, self._is_replayed))
         client.put(write_advertise(list(self._channels.values())))
@@ -261,3 +278,8 @@ class FoxgloveStream:
             self._time_ns = time_ns
             for client in self._clients:
                 client.put(pack_time(time_ns))
+
+
+def _is_closed(connection: ServerConnection) -> bool:
+    # A connection gets its transport in the next turn of the loop.
+    return hasattr(connection, "transport") and connection.transport.is_closing()

@@ -20,7 +20,14 @@ from ipsys_log.report.figures import style_axes
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
 
-__all__ = ["clocks_figure", "has_clocks", "poses_figure", "residual_limit_px", "residuals_figure"]
+__all__ = [
+    "clocks_figure",
+    "first_residuals",
+    "has_clocks",
+    "poses_figure",
+    "residual_limit_px",
+    "residuals_figure",
+]
 
 Array = NDArray[np.float64]
 
@@ -29,6 +36,8 @@ _MS_PER_S = 1000.0
 # Colours from pale (small residual) to dark, readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
 _WIDTH_IN = 4.7
+# Of many cameras, a page shows so many images first.
+_MOST_IMAGES = 4
 # A residual that is usual in the image has an arrow of this share of the image's width.
 _ARROW = 0.04
 
@@ -166,6 +175,14 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     bar.locator = MaxNLocator(5)
     bar.update_ticks()
     return figure
+
+
+def first_residuals(cameras: Sequence[CalibratedCamera]) -> list[str]:
+    """Return the cameras whose residuals a page shows first: of many, those with the largest ones."""
+    rms_px = {one.camera: one.residuals.total_rms_px for one in cameras if one.residuals is not None}
+    if has_legend(len(rms_px)):
+        return list(rms_px)
+    return sorted(rms_px, key=lambda name: (-rms_px[name], name))[:_MOST_IMAGES]
 
 
 def residual_limit_px(cameras: Sequence[CalibratedCamera]) -> float:

@@ -109,7 +109,7 @@ def test_map_outlines_only_the_selected_camera(browser: Phone, hall: LiveLab) ->
         browser.tap("figure:nth-of-type(2)")
         assert browser.run("document.querySelector('#view').value") == "a2"
         assert browser.run(COUNT.format("#floor .view")) == 1
-        assert browser.text("#floor .camera.selected") == "a2"
+        assert browser.run("document.querySelector('#floor .camera.selected').textContent") == "a2"
 
 
 def test_names_of_many_robots_leave_room_on_a_phone(browser: Phone, hall: LiveLab) -> None:

@@ -160,7 +160,7 @@ def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
 def joint_pictures(findings: Findings) -> list[Picture]:
     """Return the poses and the clocks of the cameras of the joint model, and the residuals in each image.
 
-    Of many cameras, only the images with the largest residuals are here.
+    With many cameras, only the images with the largest residuals are here.
     """
     cameras = findings.calibrated
     if not cameras:

@@ -94,7 +94,7 @@ def _fitted(findings: Findings) -> dict[str, str] | None:
             "cameras": ": " + ", ".join(camera for camera, _ in points),
         }
     counted = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else str(counts[0])
-    return {"counts": counted, "cameras": f" of each of {len(points)} cameras"}
+    return {"counts": counted, "cameras": f", per camera, with {len(points)} cameras"}
 
 
 def _counts(accuracy: Accuracy) -> list[str]:

@@ -36,7 +36,7 @@ _MS_PER_S = 1000.0
 # Colours from pale (small residual) to dark, readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
 _WIDTH_IN = 4.7
-# Of many cameras, a page shows so many images first.
+# A page with many cameras shows so many images first.
 _MOST_IMAGES = 4
 # A residual that is usual in the image has an arrow of this share of the image's width.
 _ARROW = 0.04

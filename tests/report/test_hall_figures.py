@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jinja2 import ChoiceLoader, DictLoader, Environment, PackageLoader
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
@@ -41,7 +42,9 @@ def hall() -> tuple[CalibratedCamera, ...]:
 def drawn_lines(figure: Figure) -> int:
     """Return the number of lines and outlines that a reader must tell apart on the first map."""
     axes = figure.axes[0]
-    outlines = [patch for patch in axes.patches if patch.get_edgecolor()[3] and patch.get_linewidth()]
+    outlines = [
+        patch for patch in axes.patches if to_rgba(patch.get_edgecolor())[3] and patch.get_linewidth()
+    ]
     return len(outlines) + sum(line.get_linestyle() != "None" for line in axes.lines)
 
 

@@ -1,4 +1,4 @@
-// The table of the cameras and their warnings. Of many cameras, it has those with faults, and a row for the others.
+// The table of the cameras and their warnings. With many cameras, it has those with faults, and a row for the others.
 import { make } from "./make.js";
 import { isMany } from "./map.js";
 import { count, fill, table } from "./tables.js";

@@ -225,7 +225,7 @@ function alignment(state, act) {
     ...lines(found.coverage.map(([text, good]) => [good ? "good" : "warn", text])),
   ];
   const isMany = found.cameras.length > MOST_LARGE;
-  // Of many cameras, those to turn are shown, below the answer for the floor.
+  // With many cameras, those to turn are shown, below the answer for the floor.
   const shown = isMany ? found.cameras.filter((one) => one.level !== true) : found.cameras;
   const level = found.cameras.filter((one) => !shown.includes(one));
   const levelled = level.length ? [make("details", {}, make("summary", { textContent: `Level cameras: ${level.length}` }), cards(level.map(card)))] : [];

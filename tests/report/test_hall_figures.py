@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ipsys_log.messages import Floor
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.html_figures import joint_pictures, other_residual_pictures
 from ipsys_log.report.joint_figures import clocks_figure, poses_figure
+from ipsys_log.report.lab_calibration_figure import _panels
 from ipsys_log.report.learning_figure import _figure
 from ipsys_log.report.points_figure import draw_hulls
 from ipsys_log.simulation.hall import grid_names
@@ -127,3 +129,15 @@ def test_video_of_many_cameras_has_the_largest_pictures(count: int, columns: int
     left, places = _arrange(count, (1920, 1080))
     assert len({x for x, *_ in places}) == columns
     assert left <= 960
+
+
+@pytest.mark.parametrize(("count", "columns", "rows"), [(3, 3, 1), (6, 3, 2), (24, 6, 4)])
+def test_maps_of_expected_errors_fit_a_screen(count: int, columns: int, rows: int) -> None:
+    lab: Any = SimpleNamespace(
+        grid=SimpleNamespace(xs_m=np.linspace(0.25, 19.75, 40), ys_m=np.linspace(0.25, 14.75, 30))
+    )
+    panels = _panels(lab, count)
+    assert panels.columns == columns
+    # A screen of 1920 x 1080 px, at 100 px per inch.
+    assert columns * (panels.width_in + panels.gap_in) < 17.4
+    assert rows * panels.row_in < 9.8

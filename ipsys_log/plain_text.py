@@ -1,10 +1,11 @@
-"""Conversion of untrusted text into text that is safe to print."""
+"""Untrusted text as text that is safe to print, and lists of names in a line."""
 
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Sequence
 
-__all__ = ["plain_text"]
+__all__ = ["join_names", "plain_text"]
 
 # Control characters, invisible ones that change the direction of text, bytes of a file name that are not
 # UTF-8, and separators of lines.
@@ -45,3 +46,15 @@ def _escape(sign: str) -> str:
     if number < 0x100:
         return f"\\x{number:02x}"
     return f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
+
+
+def join_names(names: Sequence[str], most: int = 5) -> str:
+    """Return names with commas; of many names, the first ones and the number of the others.
+
+    Examples
+    --------
+    >>> join_names(["red", "white"]), join_names(["a1", "a2", "a3", "a4"], most=3)
+    ('red, white', 'a1, a2, a3 and 1 more')
+    """
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

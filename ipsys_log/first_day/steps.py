@@ -12,6 +12,7 @@ from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.first_day.lab_folder import FitFacts, LabFolder, LogFacts
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.models.table import min_pairs
+from ipsys_log.plain_text import join_names
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import check_references
 
@@ -97,7 +98,7 @@ def read_progress(folder: LabFolder) -> SetupProgress:
     # Each step needs the cameras, and the steps from the alignment on also need all intrinsics.
     unknown = [one.camera for one in intrinsics if not one.known]
     missing = f"first {'correct' if cameras else 'choose'} the cameras" if camera_fault else ""
-    missing = missing or (f"intrinsics are missing for {', '.join(unknown)}" if unknown else "")
+    missing = missing or (f"intrinsics are missing for {join_names(unknown)}" if unknown else "")
     steps = (
         _rig_step(rig, rig_fault),
         _cameras_step(rig, cameras, camera_fault),
@@ -157,7 +158,7 @@ def _cameras_step(rig: Rig | None, cameras: tuple[RigCamera, ...], fault: str) -
     text = (
         "first describe the lab"
         if rig is None
-        else fault or f"used: {', '.join(one.name for one in cameras)}"
+        else fault or f"used: {join_names([one.name for one in cameras])}"
     )
     return StepState("cameras", "Cameras", "ipsys cameras --rig lab.toml", status, text)
 
@@ -165,9 +166,9 @@ def _cameras_step(rig: Rig | None, cameras: tuple[RigCamera, ...], fault: str) -
 def _intrinsics_step(intrinsics: tuple[CameraIntrinsics, ...], camera_fault: str) -> StepState:
     unknown = [one.camera for one in intrinsics if not one.known]
     status = Status.WAITS if camera_fault else Status.READY if unknown else Status.DONE
-    text = "first choose the cameras" if camera_fault else f"missing for {', '.join(unknown)}"
+    text = "first choose the cameras" if camera_fault else f"missing for {join_names(unknown)}"
     if status is Status.DONE:
-        text = f"known for {', '.join(one.camera for one in intrinsics)}"
+        text = f"known for {join_names([one.camera for one in intrinsics])}"
     named = "".join(f" --camera {camera}" for camera in unknown)
     command = f"ipsys calibrate --rig lab.toml --board 6x4{named}"
     return StepState("intrinsics", "Camera intrinsics", command, status, text)
@@ -180,7 +181,7 @@ def _alignment_step(alignment: LogFacts | None, cameras: tuple[RigCamera, ...], 
     known = {one.camera for one in alignment.alignment.cameras if one.level is not None}
     unknown = [camera.name for camera in cameras if camera.name not in known]
     status = Status.READY if unknown else Status.DONE
-    text = f"no result for {', '.join(unknown)}" if unknown else "measured"
+    text = f"no result for {join_names(unknown)}" if unknown else "measured"
     return StepState("alignment", title, command, status, f"{text} in {alignment.path.name}")
 
 

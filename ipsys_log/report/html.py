@@ -21,6 +21,7 @@ from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
+from ipsys_log.report.camera_labels import MOST_IN_LEGEND
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.report.html_recording import recording_values
 from ipsys_log.report.overlap_figure import overlap_pictures
@@ -71,6 +72,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **recording_values(session),
         **_provenance(session, findings),
         commands=_commands(session, findings),
+        most_cameras=MOST_IN_LEGEND,
     )
 
 
@@ -108,6 +110,7 @@ def _figure_values(findings: Findings) -> dict[str, Any]:
         "learning_pictures": html_figures.learning_pictures(findings),
         "published_pictures": html_figures.published_pictures(findings),
         "joint_pictures": html_figures.joint_pictures(findings),
+        "other_residual_pictures": html_figures.other_residual_pictures(findings),
         "coverage_picture": html_figures.coverage_picture(findings),
     }
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,10 +11,12 @@ from matplotlib.lines import Line2D
 
 from ipsys_log.log.dataset import Session
 from ipsys_log.report.advice import has_published, label
+from ipsys_log.report.camera_labels import has_legend
 from ipsys_log.report.figures import svg_data_uri
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.joint_figures import (
     clocks_figure,
+    first_residuals,
     has_clocks,
     poses_figure,
     residual_limit_px,
@@ -32,12 +34,16 @@ from ipsys_log.report.paper_figures import (
 from ipsys_log.report.points_figure import draw_coverage
 from ipsys_log.report.tracks_figure import draw_tracks, read_drawn_tracks
 
+if TYPE_CHECKING:
+    from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
+
 __all__ = [
     "coverage_picture",
     "joint_pictures",
     "learning_pictures",
     "models_pictures",
     "new_figure",
+    "other_residual_pictures",
     "picture",
     "published_pictures",
     "residual_pictures",
@@ -105,11 +111,15 @@ def residual_pictures(findings: Findings) -> list[Picture]:
         bar.ax.tick_params(labelsize=8)
         caption = (
             f"Errors of {label(accuracy.model)}, seen from above. An arrow points from the calibration "
-            "point to the estimated position; arrows are enlarged. Dashed: area of the calibration points "
-            "of a camera"
+            "point to the estimated position; arrows are enlarged. "
+            f"{_hull_text(findings)}: area of the calibration points of a camera"
         )
         pictures.append(picture(figure, caption))
     return pictures
+
+
+def _hull_text(findings: Findings) -> str:
+    return "Dashed" if has_legend(len(findings.training_m())) else "Grey line"
 
 
 def learning_pictures(findings: Findings) -> list[Picture]:
@@ -148,7 +158,10 @@ def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
 
 
 def joint_pictures(findings: Findings) -> list[Picture]:
-    """Return the poses and the clocks of the cameras of the joint model, and the residuals in each image."""
+    """Return the poses and the clocks of the cameras of the joint model, and the residuals in each image.
+
+    With many cameras, only the images with the largest residuals are here.
+    """
     cameras = findings.calibrated
     if not cameras:
         return []
@@ -165,15 +178,27 @@ def joint_pictures(findings: Findings) -> list[Picture]:
         )
         text = ". ".join([text, *(f"Contradiction: {line}" for line in findings.clock_contradictions)])
         pictures.append(picture(clocks_figure(cameras), text))
-    most_px = residual_limit_px(cameras)
-    for camera in cameras:
-        if camera.residuals is None:
-            continue
+    return pictures + _residuals_pictures(cameras, first_residuals(cameras))
+
+
+def other_residual_pictures(findings: Findings) -> list[Picture]:
+    """Return the residuals in the images that :func:`joint_pictures` leaves out."""
+    first = first_residuals(findings.calibrated)
+    names = [one.camera for one in findings.calibrated if one.residuals is not None]
+    return _residuals_pictures(findings.calibrated, [name for name in names if name not in first])
+
+
+def _residuals_pictures(cameras: Sequence[CalibratedCamera], names: Sequence[str]) -> list[Picture]:
+    pictures, most_px = [], residual_limit_px(cameras)
+    known = {one.camera: one for one in cameras}
+    for name in names:
+        residuals = known[name].residuals
+        assert residuals is not None
         caption = (
-            f"Corner residuals in the image of {camera.camera}, estimated minus measured, as means of cells; "
-            f"arrows are enlarged{_left_out(camera.residuals.outliers)}"
+            f"Corner residuals in the image of {name}, estimated minus measured, as means of cells; "
+            f"arrows are enlarged{_left_out(residuals.outliers)}"
         )
-        pictures.append(picture(residuals_figure(camera, most_px), caption))
+        pictures.append(picture(residuals_figure(known[name], most_px), caption))
     return pictures
 
 

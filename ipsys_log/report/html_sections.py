@@ -15,6 +15,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import GROUPS, Choice, label, uses_height
+from ipsys_log.report.camera_labels import has_legend
 from ipsys_log.report.findings import Findings, overall_row, overall_row_with_excluded
 from ipsys_log.report.points_figure import hull_m
 from ipsys_log.units import CM_PER_M, MM_PER_M
@@ -76,9 +77,24 @@ def headline(findings: Findings) -> dict[str, Any]:
         "told": [
             (label(accuracy.model), _overall_mean(findings, accuracy)) for accuracy in height_models[:1]
         ],
-        "fitted": [(camera, len(points_m)) for camera, points_m in in_order(findings, findings.training_m())],
+        "fitted": _fitted(findings),
         "cameras": findings.cameras,
     }
+
+
+def _fitted(findings: Findings) -> dict[str, str] | None:
+    """Return the numbers of fitted points of the cameras, or their range for many cameras."""
+    points = in_order(findings, findings.training_m())
+    counts = [len(points_m) for _, points_m in points]
+    if not points:
+        return None
+    if has_legend(len(points)):
+        return {
+            "counts": ", ".join(map(str, counts)),
+            "cameras": ": " + ", ".join(camera for camera, _ in points),
+        }
+    counted = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else str(counts[0])
+    return {"counts": counted, "cameras": f", per camera, with {len(points)} cameras"}
 
 
 def _counts(accuracy: Accuracy) -> list[str]:

@@ -20,7 +20,14 @@ from ipsys_log.report.figures import style_axes
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
 
-__all__ = ["clocks_figure", "has_clocks", "poses_figure", "residual_limit_px", "residuals_figure"]
+__all__ = [
+    "clocks_figure",
+    "first_residuals",
+    "has_clocks",
+    "poses_figure",
+    "residual_limit_px",
+    "residuals_figure",
+]
 
 Array = NDArray[np.float64]
 
@@ -29,12 +36,16 @@ _MS_PER_S = 1000.0
 # Colours from pale (small residual) to dark, readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
 _WIDTH_IN = 4.7
+# A page with many cameras shows so many images first.
+_MOST_IMAGES = 4
 # A residual that is usual in the image has an arrow of this share of the image's width.
 _ARROW = 0.04
 
 
 def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure:
     """Draw the cameras from above and from the side, each with its field of view on the floor."""
+    if not has_legend(len(cameras)):
+        return _many_poses_figure(cameras, rig)
     figure = Figure(figsize=(_WIDTH_IN, 7.0), layout="constrained")
     above, beside = figure.subplots(2, 1, height_ratios=[3.2, 1.4])
     _draw_above(above, cameras, rig)
@@ -44,9 +55,49 @@ def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure
     beside.set_xlim(above.get_ylim() if axis else above.get_xlim())
     for axes in (above, beside):
         axes.tick_params(labelsize=8)
-    if has_legend(len(cameras)):
-        figure.legend(loc="outside lower center", frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", frameon=False, fontsize=8)
     return figure
+
+
+def _many_poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure:
+    """Draw many cameras from above, and their heights and uncertainties side by side.
+
+    Their views overlap, so that only the shade shows how many cameras see a place.
+    """
+    figure = Figure(figsize=(_WIDTH_IN, 7.6), layout="constrained")
+    above, heights, sigmas = figure.subplots(3, 1, height_ratios=[3.2, 1.0, 1.0])
+    _draw_many_above(above, cameras, rig)
+    places = range(len(cameras))
+    sigmas_mm = np.array([camera.sigmas_m for camera in cameras]) * _MM_PER_M
+    heights_m = [float(camera.origin_m[2]) for camera in cameras]
+    heights.errorbar(
+        places, heights_m, 2 * sigmas_mm[:, 2] / _MM_PER_M, fmt="o", color=NOTE, ms=3.5, capsize=2
+    )
+    heights.set_title("Height in m, with two standard deviations", loc="left", fontsize=10)
+    sigmas.plot(places, np.hypot(*sigmas_mm[:, :2].T), "o", color=NOTE, ms=3.5)
+    sigmas.set_title("Standard deviation of the place in mm", loc="left", fontsize=10)
+    sigmas.set_ylim(bottom=0.0)
+    names = [shorten(camera.camera) for camera in cameras]
+    for axes in (heights, sigmas):
+        axes.set_xticks(places, names, rotation=90)
+        axes.ticklabel_format(axis="y", useOffset=False)
+        style_axes(axes)
+    for axes in (above, heights, sigmas):
+        axes.tick_params(labelsize=8)
+    return figure
+
+
+def _draw_many_above(axes: Axes, cameras: Sequence[CalibratedCamera], rig: Rig | None) -> None:
+    draw_ground(axes, rig, [camera.origin_m[None, :2] for camera in cameras])
+    for camera in cameras:
+        if len(camera.outline_m):
+            axes.add_patch(Polygon(camera.outline_m, fc=NOTE, ec="none", alpha=0.05, zorder=1.1))
+        axes.plot(*camera.origin_m[:2], "o", color=NOTE, ms=4, zorder=4)
+        _draw_axis(axes, camera, NOTE)
+    beside_m = 0.03 * float(np.ptp(axes.get_ylim()))
+    places_m = {camera.camera: camera.origin_m[:2] - [0.0, beside_m] for camera in cameras}
+    name_cameras(axes, places_m, dict.fromkeys(places_m, NOTE))
+    axes.set_title("From above", loc="left", fontsize=10)
 
 
 def _draw_above(axes: Axes, cameras: Sequence[CalibratedCamera], rig: Rig | None) -> None:
@@ -60,9 +111,6 @@ def _draw_above(axes: Axes, cameras: Sequence[CalibratedCamera], rig: Rig | None
         x_m, y_m, _ = camera.origin_m.tolist()
         axes.plot(x_m, y_m, shape, color=colour, ms=8, label=_pose_label(camera), zorder=4)
         _draw_axis(axes, camera, colour)
-    beside_m = 0.03 * float(np.ptp(axes.get_ylim()))
-    places_m = {camera.camera: camera.origin_m[:2] - [0.0, beside_m] for camera in cameras}
-    name_cameras(axes, places_m, {name: colour for name, (colour, _) in styles.items()})
     axes.set_title("From above", loc="left", fontsize=10)
 
 
@@ -113,7 +161,9 @@ def has_clocks(cameras: Sequence[CalibratedCamera]) -> bool:
 
 def clocks_figure(cameras: Sequence[CalibratedCamera]) -> Figure:
     """Draw the clock offset of each camera with two standard deviations."""
-    figure = Figure(figsize=(_WIDTH_IN, 1.3 + 0.32 * len(cameras)), layout="constrained")
+    # The labels of many cameras have one line.
+    between, row_in = ("\n", 0.32) if has_legend(len(cameras)) else ("  ", 0.2)
+    figure = Figure(figsize=(_WIDTH_IN, 1.3 + row_in * len(cameras)), layout="constrained")
     axes = figure.add_subplot()
     styles = camera_styles(camera.camera for camera in cameras)
     labels = []
@@ -122,7 +172,7 @@ def clocks_figure(cameras: Sequence[CalibratedCamera]) -> Figure:
         offset_ms, sigma_ms = camera.clock_s * _MS_PER_S, camera.clock_sigma_s * _MS_PER_S
         axes.errorbar(offset_ms, row, xerr=2 * sigma_ms, fmt=shape, color=colour, ms=6, capsize=3)
         text = f"{offset_ms:+.2f} ± {sigma_ms:.2f} ms" if sigma_ms else "constant"
-        labels.append(f"{shorten(camera.camera)}\n{text}")
+        labels.append(f"{shorten(camera.camera)}{between}{text}")
     axes.axvline(0.0, color=NOTE, lw=1.0)
     axes.set_yticks(range(len(cameras)), labels)
     axes.set_ylim(len(cameras) - 0.5, -0.5)
@@ -166,6 +216,14 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     bar.locator = MaxNLocator(5)
     bar.update_ticks()
     return figure
+
+
+def first_residuals(cameras: Sequence[CalibratedCamera]) -> list[str]:
+    """Return the cameras whose residuals a page shows first: of many, those with the largest ones."""
+    rms_px = {one.camera: one.residuals.total_rms_px for one in cameras if one.residuals is not None}
+    if has_legend(len(rms_px)):
+        return list(rms_px)
+    return sorted(rms_px, key=lambda name: (-rms_px[name], name))[:_MOST_IMAGES]
 
 
 def residual_limit_px(cameras: Sequence[CalibratedCamera]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,6 +14,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from ipsys_log.report.camera_labels import has_legend
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE, REST, shorten
@@ -23,35 +25,65 @@ __all__ = ["draw_lab"]
 
 # Colours from pale (small error) to dark, as in the figure of a plan.
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])
-_PANEL_IN, _LEFT_IN, _GAP_IN, _BOTTOM_IN, _ROW_IN = 4.0, 0.7, 0.45, 0.95, 4.75
-_MOST_COLUMNS = 3
+_LEFT_IN, _BOTTOM_IN = 0.7, 0.95
 # Distance from the map to the walls.
 _WALL_M = 0.25
+
+
+class _Panels(NamedTuple):
+    """The panels of a figure: columns, sizes and distances in inches, and the size of a point."""
+
+    columns: int
+    width_in: float
+    gap_in: float
+    height_in: float
+    between_in: float
+    point_pt: float
+
+    @property
+    def row_in(self) -> float:
+        return self.height_in + self.between_in
+
+
+def _panels(lab: LabCalibration, count: int) -> _Panels:
+    """Return large panels for the cameras of a lab, or small ones with the shape of the floor for a hall."""
+    if has_legend(count):
+        return _Panels(min(count, 3), 4.0, 0.45, 4.0, 0.75, 6.0)
+    width_m, depth_m = (float(np.ptp(places_m)) for places_m in (lab.grid.xs_m, lab.grid.ys_m))
+    height_in = 2.4 * float(np.clip(depth_m / width_m, 0.3, 2.0))
+    return _Panels(6, 2.4, 0.3, height_in, 0.55, 2.0)
 
 
 def draw_lab(lab: LabCalibration, path: Path) -> None:
     """Draw the expected error over the floor, one panel for each camera."""
     shown = [camera for camera in lab.cameras if len(camera.expected.errors_m)]
-    columns = min(len(shown), _MOST_COLUMNS)
-    rows = math.ceil(len(shown) / columns)
-    width_in = _LEFT_IN + columns * (_PANEL_IN + _GAP_IN) + 1.1
-    height_in = _BOTTOM_IN + rows * _ROW_IN + 0.1
+    panels = _panels(lab, len(shown))
+    rows = math.ceil(len(shown) / panels.columns)
+    width_in = _LEFT_IN + panels.columns * (panels.width_in + panels.gap_in) + 1.1
+    height_in = _BOTTOM_IN + rows * panels.row_in + 0.1
     figure = Figure(figsize=(width_in, height_in), dpi=100)
     errors_mm = np.concatenate([camera.expected.errors_m for camera in shown]) * MM_PER_M
     # A few nodes with large errors must not use most of the colour range.
     top_mm = float(np.quantile(errors_mm, 0.98))
     for number, camera in enumerate(shown):
-        row, column = divmod(number, columns)
-        left_in = _LEFT_IN + column * (_PANEL_IN + _GAP_IN)
-        bottom_in = _BOTTOM_IN + (rows - 1 - row) * _ROW_IN
-        frame = left_in / width_in, bottom_in / height_in, _PANEL_IN / width_in, _PANEL_IN / height_in
+        row, column = divmod(number, panels.columns)
+        left_in = _LEFT_IN + column * (panels.width_in + panels.gap_in)
+        bottom_in = _BOTTOM_IN + (rows - 1 - row) * panels.row_in
+        frame = (
+            left_in / width_in,
+            bottom_in / height_in,
+            panels.width_in / width_in,
+            panels.height_in / height_in,
+        )
         axes = figure.add_axes(frame)
-        shades = _draw_camera(axes, lab, camera, top_mm)
+        shades = _draw_camera(axes, lab, camera, top_mm, panels.point_pt)
         axes.set_ylabel("y in m" if column == 0 else "")
-    right_in = _LEFT_IN + columns * (_PANEL_IN + _GAP_IN) - 0.2
-    box = figure.add_axes(
-        (right_in / width_in, _BOTTOM_IN / height_in, 0.18 / width_in, _PANEL_IN / height_in)
-    )
+        if not has_legend(len(shown)):
+            axes.set_xlabel("x in m" if number + panels.columns >= len(shown) else "")
+            axes.tick_params(labelsize=8, labelleft=column == 0)
+    right_in = _LEFT_IN + panels.columns * (panels.width_in + panels.gap_in) - 0.2
+    bar_in = max(panels.height_in, min(4.0, rows * panels.row_in - panels.between_in))
+    box = figure.add_axes((right_in / width_in, _BOTTOM_IN / height_in, 0.18 / width_in, bar_in / height_in))
     figure.colorbar(shades, cax=box, extend="max", label="expected 2D error in mm")
     title = f"Expected error over the floor: mean {lab.mean_m * MM_PER_M:.1f} mm, "
     title += f"for markers {lab.height_m * 100:.0f} cm above it"
@@ -68,7 +100,9 @@ def draw_lab(lab: LabCalibration, path: Path) -> None:
     write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 
-def _draw_camera(axes: Axes, lab: LabCalibration, camera: CameraResult, top_mm: float) -> AxesImage:
+def _draw_camera(
+    axes: Axes, lab: LabCalibration, camera: CameraResult, top_mm: float, point_pt: float
+) -> AxesImage:
     grid, half_m = lab.grid, lab.grid.step_m / 2
     map_mm = np.full(len(camera.expected.seen), np.nan)
     map_mm[camera.expected.seen] = camera.expected.errors_m * MM_PER_M
@@ -82,7 +116,16 @@ def _draw_camera(axes: Axes, lab: LabCalibration, camera: CameraResult, top_mm: 
     axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=REST, lw=0.8, zorder=2))
     axes.plot(*camera.places_m.T, ".", color=NOTE, ms=1.5, zorder=3)
     axes.plot([], [], ".", color=NOTE, ms=5, label="a marker was here")
-    axes.plot(*lab.points_m.T, "o", mfc="black", mec="white", ms=6, zorder=4, label="calibration point")
+    axes.plot(
+        *lab.points_m.T,
+        "o",
+        mfc="black",
+        mec="white",
+        ms=point_pt,
+        mew=point_pt / 6,
+        zorder=4,
+        label="calibration point",
+    )
     if lab.points:
         _draw_points(axes, lab, camera)
     if lab.gap is not None and not lab.is_enough and lab.gap.camera == camera.camera:

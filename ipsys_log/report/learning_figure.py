@@ -19,6 +19,7 @@ from ipsys_log.report.advice import (
     mean_curve,
     uses_height,
 )
+from ipsys_log.report.camera_labels import has_legend
 from ipsys_log.report.figures import scale_logarithmic, set_ticks, style_axes
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.styles import NOTE, ModelStyle, model_styles, shorten
@@ -41,6 +42,8 @@ Curves = Mapping[str, Curve]
 _LOG_RATIO = 8.0
 # Distance of the error bars of several models at one number of points. The marks are not shifted.
 _APART_PT = 0.9
+# Panels of many cameras are in rows of so many.
+_MOST_COLUMNS = 4
 _SPACE = {True: "Mean 3D error in cm", False: "Mean 2D error in cm"}
 
 
@@ -76,14 +79,19 @@ def learning_figure(findings: Findings) -> Figure:
 
 
 def _figure(panels: Mapping[str, Curves], title: str, ylabel: str) -> Figure:
-    figure = Figure(figsize=(4.0 * len(panels) + 2.6, 4.6), layout="constrained")
+    columns = len(panels) if has_legend(len(panels)) else _MOST_COLUMNS
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.0 * columns + 2.6, 0.6 + 4.0 * rows), layout="constrained")
     styles = model_styles(dict.fromkeys(model for curves in panels.values() for model in curves))
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    axes = figure.subplots(rows, columns, sharey=True, squeeze=False)
     limits = limits_cm(panels.values())
-    for panel, (name, curves) in zip(axes, panels.items(), strict=True):
+    for panel, (name, curves) in zip(axes.flat, panels.items(), strict=False):
         draw_curves(panel, curves, styles, limits)
         panel.set_title(name, fontsize=10, loc="left")
-    axes[0].set_ylabel(ylabel)
+    for panel in axes.flat[len(panels) :]:
+        panel.set_visible(False)
+    for panel in axes[:, 0]:
+        panel.set_ylabel(ylabel)
     figure.legend(
         handles=[_handle(model, styles[model]) for model in _by_end([*panels.values()])],
         loc="outside right upper", frameon=False, fontsize=9, title=_note(styles), title_fontsize=8,

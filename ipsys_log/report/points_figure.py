@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from ipsys_log.report.camera_labels import has_legend, legend_label, name_cameras
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.floor_figure import draw_ground
-from ipsys_log.report.styles import NOTE, TEST, camera_styles, shorten
+from ipsys_log.report.styles import NOTE, REST, TEST, camera_styles, shorten
 
 __all__ = ["draw_coverage", "draw_hulls", "hull_m", "places_figure"]
 
@@ -84,27 +84,44 @@ def hull_m(points_m: Array) -> Array | None:
 
 def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
     """Draw the convex hull of the fitted points of each camera on the floor."""
-    styles, training_m = camera_styles(findings.cameras), findings.training_m()
+    training_m = findings.training_m()
+    styles = _styles(findings)
     middles_m, colours = {}, {}
     for camera, points_m in training_m.items():
         corners_m = hull_m(points_m)
         if corners_m is not None:
-            colour, _ = styles.get(camera, (NOTE, "o"))
-            middles_m[camera], colours[camera] = corners_m.mean(axis=0), colour
+            middles_m[camera], colours[camera] = corners_m.mean(axis=0), styles[camera].name
             if fill:
                 axes.add_patch(Polygon(corners_m, fc="white", ec="none", zorder=1.5))
-            axes.add_patch(
-                Polygon(
-                    corners_m,
-                    fill=False,
-                    ec=colour,
-                    lw=1.3,
-                    ls="--",
-                    zorder=2.2,
-                    label=legend_label(f"camera {shorten(camera)}", len(training_m)),
-                )
-            )
+            text = legend_label(f"camera {shorten(camera)}", len(training_m))
+            edge = styles[camera].edge
+            axes.add_patch(Polygon(corners_m, fill=False, zorder=2.2, label=text, **edge))
     name_cameras(axes, middles_m, colours)
+
+
+class _Style(NamedTuple):
+    """The colour of a camera's name, the look of its hull, and the look of its points."""
+
+    name: str
+    edge: dict[str, Any]
+    points: dict[str, Any]
+
+
+def _styles(findings: Findings) -> dict[str, _Style]:
+    """Return the styles of the cameras; the hulls of many overlap, and 24 colours would hide the errors."""
+    training_m, styles = findings.training_m(), camera_styles(findings.cameras)
+    if not has_legend(len(training_m)):
+        quiet = _Style(NOTE, {"ec": REST, "lw": 0.7}, {"marker": "o", "color": NOTE, "ms": 2.5})
+        return dict.fromkeys(training_m, quiet)
+    found = {camera: styles.get(camera, (NOTE, "o")) for camera in training_m}
+    return {
+        camera: _Style(
+            colour,
+            {"ec": colour, "lw": 1.3, "ls": "--"},
+            {"marker": shape, "color": colour, "ms": 4, "alpha": 0.8},
+        )
+        for camera, (colour, shape) in found.items()
+    }
 
 
 def draw_coverage(axes: Axes, findings: Findings) -> None:
@@ -116,9 +133,8 @@ def draw_coverage(axes: Axes, findings: Findings) -> None:
         corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * (floor.width_m, floor.depth_m)
         axes.add_patch(Polygon(corners, fc="#F1F1F1", ec="#9A9A9A", hatch="///", lw=0, zorder=1.2))
     draw_hulls(axes, findings, fill=True)
-    styles = camera_styles(findings.cameras)
+    styles = _styles(findings)
     for camera, points_m in training_m.items():
-        colour, shape = styles.get(camera, (NOTE, "o"))
-        axes.plot(*points_m[:, :2].T, shape, color=colour, ms=4, alpha=0.8, zorder=3)
+        axes.plot(*points_m[:, :2].T, ls="none", zorder=3, **styles[camera].points)
     if has_legend(len(training_m)):
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False, fontsize=9)

@@ -184,7 +184,7 @@ def _split(direction: str, ids: Sequence[Any], first_share: float | None = None)
 
 def _grid(ids: Sequence[str]) -> Any:
     """Return panels as rows of one column, or of a few columns for many panels."""
-    columns = 1 if len(ids) <= _MOST_ROWS else math.ceil(math.sqrt(len(ids) * _TILES_ACROSS))
+    columns = 1 if len(ids) <= _MOST_ROWS else max(2, math.floor(math.sqrt(len(ids) * _TILES_ACROSS)))
     rows = [_split("row", ids[first : first + columns]) for first in range(0, len(ids), columns)]
     return _split("column", rows)
 

@@ -11,13 +11,12 @@ from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MEASUREMENTS_TOPIC, RIG, RIG_TOPIC
+from ipsys_log.plain_text import join_names
 from ipsys_log.rig.file import check_rig
 from ipsys_log.runs.checks import image_sizes
 from ipsys_log.soundness.finding import REMARK, LogFinding
 
 __all__ = ["check_cameras", "check_intrinsics", "check_measurements", "check_rigs"]
-
-_MOST_NAMES = 5
 
 
 def check_rigs(session: Session) -> Iterator[LogFinding]:
@@ -55,7 +54,7 @@ def check_cameras(session: Session) -> Iterator[LogFinding]:
         return
     for camera, topic in sorted(_cameras(session).items()):
         if camera not in known:
-            text = f"camera {camera} is not in the rig, which has {_names(sorted(known))}"
+            text = f"camera {camera} is not in the rig, which has {join_names(sorted(known))}"
             yield LogFinding("reference", REMARK, text, "add it to lab.toml as [[cameras]]", topic)
 
 
@@ -100,7 +99,7 @@ def check_measurements(session: Session) -> Iterator[LogFinding]:
                 faults.setdefault(fault, []).append((payload.id, message.log_time_ns))
             _follow(payload, active, withdrawn)
     for (text, advice), places in faults.items():
-        ids = _names([name for name, _ in places])
+        ids = join_names([name for name, _ in places])
         title = "measurement" if len(places) == 1 else "measurements"
         place = MEASUREMENTS_TOPIC, places[0][1], len(places)
         yield LogFinding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
@@ -145,8 +144,3 @@ def _faults(
     points = {point.name for point in rig.reference_points}
     for name in sorted({distance.reference for distance in measurement.distances} - points):
         yield f"reference point {name} is not in the rig", complete
-
-
-def _names(names: list[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return ", ".join(names[:_MOST_NAMES]) + more

@@ -19,7 +19,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC, CompressedImage, Latency, Message, image_topic
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.hall import grid_names
-from ipsys_log.sinks.foxglove_layout import make_layout
+from ipsys_log.sinks.foxglove_layout import _grid, make_layout
 from tests.conftest import ROOT, Ipsys
 
 _SCORED = ROOT / "tests" / "golden" / "v0_1_0.mcap"
@@ -253,3 +253,22 @@ def test_command_writes_the_layout_and_keeps_the_log(recorded: Path, tmp_path: P
     unknown = ipsys("view", recorded, "--run", "nothing", "--foxglove-layout", tmp_path / "x.json")
     assert (unknown.code, "has no run 'nothing'" in unknown.err) == (1, True)
     assert not (tmp_path / "x.json").exists()
+
+
+def tile_sizes(node: Any, width: float, height: float) -> list[tuple[float, float]]:
+    """Return width and height of each panel of a layout, in px."""
+    if isinstance(node, str):
+        return [(width, height)]
+    share = node["splitPercentage"] / 100
+    across = node["direction"] == "row"
+    first = (width * share, height) if across else (width, height * share)
+    second = (width * (1 - share), height) if across else (width, height * (1 - share))
+    return [*tile_sizes(node["first"], *first), *tile_sizes(node["second"], *second)]
+
+
+@pytest.mark.parametrize(("count", "least_px"), [(3, 580), (7, 300), (24, 190)])
+def test_images_of_many_cameras_are_as_large_as_possible(count: int, least_px: float) -> None:
+    """The images are in two fifths of a screen of 1920 x 1080; a title has 30 px."""
+    tiles = tile_sizes(_grid([f"Image!{n}" for n in range(count)]), 0.4 * 1920, 1080)
+    assert len(tiles) == count
+    assert min(min(width, (height - 30) * 16 / 9) for width, height in tiles) >= least_px - 1

@@ -52,21 +52,29 @@ RIG = Rig(
 
 
 class LiveLab:
-    """A recording with two cameras, whose clock and messages are those of the test.
+    """A recording, by default with two cameras, whose clock and messages are those of the test.
 
     Attributes
     ----------
     written : payloads that the page has written to the log; ``said`` are the texts on the terminal.
     """
 
-    def __init__(self, log: Path, model: Any = None, lenses: Any = None, streams: Iterable[Any] = ()) -> None:
+    def __init__(
+        self,
+        log: Path,
+        model: Any = None,
+        lenses: Any = None,
+        streams: Iterable[Any] = (),
+        cameras: Iterable[str] = ("red", "white"),
+        rig: Rig = RIG,
+    ) -> None:
         self.time_ns = BEGIN_NS
         self.written: list[Event] = []
         self.said: list[str] = []
-        self.states = {name: CameraState(frames=30, up=True, delay_s=0.004) for name in ("red", "white")}
+        self.states = {name: CameraState(frames=30, up=True, delay_s=0.004) for name in cameras}
         self.checks = {"red": FrameCheck((0,), (), 120.0, 1.0, ("the image is blurred: add light",))}
         setting = DashboardSetting(
-            RIG, lenses or {}, model, "poly", self.states, self.checks, log, self.now_ns, tuple(streams)
+            rig, lenses or {}, model, "poly", self.states, self.checks, log, self.now_ns, tuple(streams)
         )
         self.operator = Operator(self.write, self.now_ns, self.said.append)
         self.dashboard = Dashboard(setting, self.operator)

@@ -25,6 +25,8 @@ _NOTE: RGB = (165, 165, 172)
 _MOST_LEFT = 0.5
 _SHAPE = 16 / 9
 _FONT_SHARE = 1 / 52
+# Numbers of columns of many cameras; the one with the largest pictures is used.
+_MANY_COLUMNS = range(3, 9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +120,26 @@ class Composite:
         canvas.text((width - text_size(text, font_px)[0] - font_px, base), text, font_px, _NOTE)
 
 
+def _left(columns: int, rows: int, size_px: tuple[int, int]) -> int:
+    width, height = size_px
+    return round(min(columns * height / rows * _SHAPE * 0.94, _MOST_LEFT * width))
+
+
+def _picture_width(columns: int, count: int, size_px: tuple[int, int]) -> float:
+    """Return the width of each picture of ``count`` cameras below the titles."""
+    rows, height = ceil(count / columns), size_px[1]
+    room = height / rows - 2 * height * _FONT_SHARE
+    return min(_left(columns, rows, size_px) / columns, room * _SHAPE)
+
+
 def _arrange(count: int, size_px: tuple[int, int]) -> tuple[int, list[tuple[int, int, int, int]]]:
     """Return the width of the cameras, and the place and size (x, y, width, height) of each panel."""
-    width, height = size_px
-    columns = 1 if count <= 3 else 2 if count <= 8 else 3
+    height = size_px[1]
+    columns = 1 if count <= 3 else 2
+    if count > 8:
+        columns = max(_MANY_COLUMNS, key=lambda one: _picture_width(one, count, size_px))
     rows = ceil(count / columns)
-    left = round(min(columns * height / rows * _SHAPE * 0.94, _MOST_LEFT * width))
+    left = _left(columns, rows, size_px)
     xs = [left * n // columns for n in range(columns + 1)]
     ys = [height * n // rows for n in range(rows + 1)]
     gap = max(height // 240, 1)

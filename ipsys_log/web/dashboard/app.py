@@ -21,7 +21,7 @@ from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json, whole
 __all__ = ["build_dashboard"]
 
 _OWN = "ipsys_log.web.dashboard"
-_SCRIPTS = ("dashboard", "map", "tiles", "panels", "operate")
+_SCRIPTS = ("dashboard", "map", "tiles", "tables", "panels", "cameras_panel", "operate")
 _FILES = {
     "/": ("dashboard.html", "text/html", _OWN),
     "/dashboard.css": ("dashboard.css", "text/css", _OWN),

@@ -41,7 +41,7 @@ function connect() {
     if (waiting === null) requestAnimationFrame(() => { map.move(waiting); showRobots(waiting); waiting = null; });
     waiting = data;
   });
-  listen("tiles", showTiles);
+  listen("tiles", (data) => showTiles(data, (camera) => map.select(camera)));
   listen("status", (data) => {
     end = data.end;
     played = data.playback ?? null;
@@ -80,7 +80,7 @@ async function begin() {
     document.title = "ipsys playback";
     $("kind").textContent = $("recording-title").textContent = "Playback";
   }
-  map = new FloorMap($("floor"), $("legend"), $("growth"), scene);
+  map = new FloorMap($("floor"), $("legend"), $("growth"), $("view"), scene);
   operation = new Operation(scene.may_operate);
   reconnect();
   setInterval(judge, 500);

@@ -3,18 +3,24 @@ import { element, make } from "./make.js";
 
 const PAD = { left: 34, right: 12, top: 12, bottom: 40 };
 const TRAIL_MS = 10000, STALE_MS = 500;
-// A legend of more cameras is longer than the map: their names are on the map instead.
+// A legend of more cameras is longer than the map, and their outlines hide the robots: their names are on the
+// map instead, and the outline of a selected one.
 const MOST_IN_LEGEND = 6;
+// More names of robots overlap on a map that is less wide, in px; the table has them, too.
+const MOST_NAMES = 6, ROOM_FOR_NAMES = 560;
 const STEPS_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 
+export const isMany = (cameras) => cameras.length > MOST_IN_LEGEND;
+
 export class FloorMap {
-  constructor(svg, legend, growth, scene) {
-    Object.assign(this, { svg, growth, floor: scene.floor, trails: new Map(), robots: new Map(), data: null });
+  constructor(svg, legend, growth, view, scene) {
+    Object.assign(this, { svg, growth, view, floor: scene.floor, trails: new Map(), robots: new Map(), data: null });
     for (const [name, points] of Object.entries(scene.trails)) this.trails.set(name, points);
     this.still = element("g");
     this.moving = element("g", { "clip-path": "url(#on-map)" });
     svg.replaceChildren(this.still, this.moving);
     this.fillLegend(legend);
+    this.fillViews();
     growth.addEventListener("change", () => this.data && this.move(this.data));
     new ResizeObserver(() => this.resize()).observe(svg.parentElement);
     this.resize();
@@ -60,17 +66,17 @@ export class FloorMap {
     }
     const inside = element("g", { "clip-path": "url(#on-floor)" });
     if (this.floor.measured.length) inside.append(element("polygon", { points: path(this.floor.measured), class: "measured" }));
+    const many = isMany(this.floor.views), selected = this.view.value;
     for (const view of this.floor.views) {
-      inside.append(element("polygon", { points: path(view.outline), class: "view-area", fill: view.colour }),
-        element("polygon", { points: path(view.outline), class: "view-halo" }),
-        element("polygon", { points: path(view.outline), class: "view", stroke: view.colour }));
+      const points = path(view.outline);
+      inside.append(element("polygon", { points, ...(many ? { class: "view-area shared" } : { class: "view-area", fill: view.colour }) }));
+      if (many && view.camera !== selected) continue;
+      inside.append(element("polygon", { points, class: "view-halo" }), element("polygon", { points, class: "view", stroke: view.colour }));
     }
-    if (this.floor.views.length > MOST_IN_LEGEND) {
-      for (const view of this.floor.views) {
-        const middle = (axis) => view.outline.reduce((sum, point) => sum + point[axis], 0) / view.outline.length;
-        const [x, y] = at(middle(0), middle(1));
-        inside.append(element("text", { x, y: y + 4, class: "camera middle" }, view.camera));
-      }
+    for (const view of many ? this.floor.views : []) {
+      const middle = (axis) => view.outline.reduce((sum, point) => sum + point[axis], 0) / view.outline.length;
+      const [x, y] = at(middle(0), middle(1));
+      inside.append(element("text", { x, y: y + 4, class: `camera middle${view.camera === selected ? " selected" : ""}` }, view.camera));
     }
     parts.push(inside);
     for (const point of this.floor.references) {
@@ -93,6 +99,7 @@ export class FloorMap {
     this.data = data;
     if (!this.at) return;
     const growth = Number(this.growth.value), present = new Set();
+    this.named = this.svg.clientWidth >= ROOM_FOR_NAMES || data.robots.filter((robot) => robot.colour).length <= MOST_NAMES;
     for (const robot of data.robots) {
       present.add(robot.name);
       this.extend(robot);
@@ -131,6 +138,7 @@ export class FloorMap {
     if (drawn.arrow) drawn.arrow.setAttribute("visibility", robot.heading === undefined ? "hidden" : "visible");
     if (drawn.arrow && robot.heading !== undefined) drawn.arrow.setAttribute("transform", `rotate(${(-robot.heading * 180) / Math.PI})`);
     if (!robot.colour) return;
+    drawn.label.textContent = this.named ? robot.name : "";
     // The name does not cover the arrow.
     drawn.name.setAttribute("y", Math.sin(robot.heading ?? -1) > 0.2 ? 26 : -16);
     const [long, short, angle] = robot.ellipse ?? [0, 0, 0], k = this.scale * growth;
@@ -146,9 +154,23 @@ export class FloorMap {
     };
     const views = this.floor.views, few = views.length <= MOST_IN_LEGEND ? views : [];
     const rows = few.map((view) => [swatch("view", view.colour), `view of ${view.camera}`]);
-    if (views.length > few.length) rows.push([swatch("view", "currentColor"), "view of a camera, with its name"]);
+    if (views.length > few.length) rows.push([swatch("view-edge"), "views of the cameras, with their names; stronger where they overlap"]);
     if (this.floor.measured.length) rows.push([swatch("measured-edge"), "calibrated area"]);
     legend.replaceChildren(...rows.map((row) => make("li", {}, ...row)));
+  }
+
+  // The list of many cameras selects the one whose outline is drawn.
+  fillViews() {
+    this.view.parentElement.hidden = !isMany(this.floor.views);
+    for (const view of this.floor.views) this.view.append(make("option", { value: view.camera }, view.camera));
+    this.view.addEventListener("change", () => this.drawStill());
+  }
+
+  // Draw the field of view of a camera; without a list, all of them are drawn.
+  select(camera) {
+    if (this.view.parentElement.hidden || !this.floor.views.some((view) => view.camera === camera)) return;
+    this.view.value = camera;
+    this.drawStill();
   }
 }
 
@@ -162,10 +184,10 @@ function robotElement(robot) {
   }
   const trail = element("polyline", { class: "trail", stroke: robot.colour });
   const ellipse = element("ellipse", { class: "ellipse", stroke: robot.colour });
-  const name = element("text", { x: 0, class: "name" }, robot.name, age);
+  const label = element("tspan"), name = element("text", { x: 0, class: "name" }, label, age);
   const arrow = element("path", { d: "M12,0L24,0M18,-5L25,0L18,5", class: "arrow" });
   body.append(ellipse, arrow, element("circle", { r: 11, stroke: robot.colour }),
     element("text", { y: 4, class: "id" }, String(robot.id)), name);
   whole.append(trail, body);
-  return { whole, body, trail, ellipse, arrow, name, age };
+  return { whole, body, trail, ellipse, arrow, name, label, age };
 }

@@ -1,25 +1,11 @@
 // The tables beside the map.
+import { showCameras } from "./cameras_panel.js";
+import { count, fill, table } from "./tables.js";
 import { make } from "./make.js";
 
 const $ = (id) => document.getElementById(id);
 const ROBOTS_MS = 250;
 let robotsShown = -Infinity;
-
-// Replace the content only if it changed, so that selected text and the focus stay.
-function fill(where, key, parts) {
-  const text = JSON.stringify(key);
-  if (where.dataset.content === text) return;
-  where.dataset.content = text;
-  where.replaceChildren(...parts());
-}
-
-function table(where, headings, rows, empty) {
-  fill(where, [headings, rows], () => rows.length
-    ? [make("thead", {}, make("tr", {}, ...headings.map((text) => make("th", { scope: "col" }, text)))),
-      make("tbody", {}, ...rows.map(([name, ...cells]) => make("tr", {}, make("th", { scope: "row" }, name),
-        ...cells.map((cell) => (Array.isArray(cell) ? make("td", { className: cell[1] }, cell[0]) : make("td", {}, cell))))))]
-    : [make("caption", {}, empty)]);
-}
 
 export function showRobots(data) {
   if (performance.now() - robotsShown < ROBOTS_MS) return;
@@ -45,19 +31,6 @@ export function showStatus(data) {
   fill($("overlap"), lines, () => lines.map((line) => make("li", {}, line)));
   $("streams-panel").hidden = !data.streams.length;
   table($("streams"), ["stream", "clients", "dropped"], data.streams.map((row) => [row.name, String(row.clients ?? "–"), count(row.dropped)]), "");
-}
-
-const count = (number) => (number ? [String(number), "bad"] : String(number ?? "–"));
-
-function showCameras(cameras) {
-  const rows = cameras.map((camera) => [camera.name,
-    camera.state !== "up" ? [camera.state, camera.state === "lost" ? "bad" : ""] : camera.rate_hz === undefined ? "–" : `${camera.rate_hz.toFixed(1)} Hz`,
-    count(camera.dropped),
-    camera.skipped ? [String(camera.skipped), "warn"] : "0", camera.delay_ms === undefined ? "–" : `${camera.delay_ms.toFixed(0)} ms`,
-    camera.age_ms === undefined ? "–" : [`${(camera.age_ms / 1000).toFixed(1)} s`, camera.age_ms > 2000 && camera.state !== "ended" ? "bad" : ""]]);
-  table($("cameras"), ["camera", "rate", "dropped", "skipped", "delay", "age"], rows, "There are no cameras.");
-  const texts = cameras.flatMap((camera) => camera.warnings.map((text) => `${camera.name}: ${text}`));
-  fill($("warnings"), texts, () => texts.map((text) => make("li", {}, text)));
 }
 
 const UNITS = ["B", "kB", "MB", "GB", "TB"];

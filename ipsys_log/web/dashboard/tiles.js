@@ -1,16 +1,20 @@
 // The newest image of each camera with the detected markers.
 import { element, make } from "./make.js";
+import { isMany } from "./map.js";
 
 const tiles = new Map();
-const LABEL_SHARE = 0.045;
+// Size of an id as a share of the image, and the least size that can be read.
+const LABEL_SHARE = 0.045, LEAST_LABEL_PX = 9;
 
-export function showTiles(data) {
+// select(camera): the user has chosen a tile.
+export function showTiles(data, select) {
   const where = document.getElementById("tiles");
+  document.getElementById("tiles-panel").classList.toggle("many", isMany(data.cameras));
   for (const camera of data.cameras) {
     if (!tiles.has(camera.name)) {
       const svg = element("svg", { role: "img", "aria-label": `No image of camera ${camera.name} yet` }), note = make("small");
       tiles.set(camera.name, { svg, note, picture: null, loading: false });
-      where.append(make("figure", {}, svg, make("figcaption", {}, camera.name, note)));
+      where.append(make("figure", { onclick: () => select(camera.name) }, svg, make("figcaption", {}, camera.name, note)));
     }
     show(tiles.get(camera.name), camera);
   }
@@ -35,7 +39,7 @@ async function show(tile, camera) {
   tile.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   tile.svg.replaceChildren(
     element("image", { href: camera.picture, width, height }),
-    ...camera.markers.flatMap((marker) => outline(marker, width)),
+    ...camera.markers.flatMap((marker) => outline(marker, labelSize(tile.svg, width))),
   );
   const count = camera.markers.length;
   tile.note.textContent = camera.size_px ? `${count} ${count === 1 ? "marker" : "markers"}` : "not processed";
@@ -43,11 +47,14 @@ async function show(tile, camera) {
   tile.svg.setAttribute("aria-label", `Image of camera ${camera.name}, ${ids ? `with markers ${ids}` : "without markers"}`);
 }
 
-function outline(marker, width) {
+// The size of an id, in pixels of the image.
+const labelSize = (svg, width) => width * Math.max(LABEL_SHARE, LEAST_LABEL_PX / (svg.clientWidth || Infinity));
+
+function outline(marker, size) {
   const corners = marker.corners_px.map(([x, y]) => [x + 0.5, y + 0.5]);
   const x = Math.max(...corners.map((c) => c[0])), y = Math.min(...corners.map((c) => c[1]));
   return [
     element("polygon", { points: corners.join(" ") }),
-    element("text", { x, y, "font-size": LABEL_SHARE * width }, String(marker.id)),
+    element("text", { x, y, "font-size": size }, String(marker.id)),
   ];
 }

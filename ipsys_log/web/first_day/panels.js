@@ -3,6 +3,10 @@ import { change, choice, field, markFault, showFaults } from "./fields.js";
 import { make } from "./make.js";
 import { alignedImage, cameraImage, floorSketch } from "./pictures.js";
 
+// More cards than these are compact, so that a page of them can be surveyed.
+const MOST_LARGE = 6;
+const cards = (made) => make("div", { className: `cards${made.length > MOST_LARGE ? " many" : ""}` }, ...made);
+
 const cameraId = (key) => `camera-${key.replace(/[^a-z0-9]/gi, (sign) => `_${sign.charCodeAt(0)}`)}`;
 
 // The lines of a calibration that has ended.
@@ -151,21 +155,23 @@ function use(one) {
 
 function cameras(state, act, step) {
   const form = make("form", {});
-  const cards = state.cameras.map((one) => make("div", { className: "card" },
+  const made = state.cameras.map((one) => make("div", { className: "card" },
     cameraImage(one.picture, one.name || one.key, one.fault ? "no picture" : "no picture yet"),
     make("div", {}, make("b", { textContent: one.key }), make("p", { className: "text", textContent: one.text }),
       ...(one.fault ? [make("p", { className: "fault", textContent: one.fault })] : []),
       ...use(one))));
-  form.append(make("div", { className: "cards" }, ...cards));
+  form.append(cards(made));
   const isSeen = state.cameras.some((one) => one.picture);
   submit(form, state, act, step.status !== "done" && isSeen, async () => {
     const names = Object.fromEntries(state.cameras.map((one) => [one.key, document.getElementById(cameraId(one.key)).value]));
     showFaults(form, await change("cameras", { names }), cameraId);
   });
+  const unseen = state.cameras.filter((one) => one.fault).map((one) => one.name || one.key);
   return [
     make("p", { textContent: "Choose the cameras that the lab uses, and save. Names have small letters, digits and _." }),
     ...(state.attached ? [] : [make("p", { className: "text", textContent: "No USB camera is found. Plug one in, and search again." })]),
     make("div", { className: "actions" }, starter("Search and take pictures", "pictures", state, act, step.status !== "done" && !isSeen)),
+    ...(state.cameras.length > MOST_LARGE && unseen.length ? lines([["warn", `No picture of: ${unseen.join(", ")}.`]]) : []),
     form,
     make("h3", { textContent: "Network camera" }),
     make("p", { textContent: "The address is in the manual of the camera. A camera of another computer with ipsys has the address zenoh:NAME. The password is only written into lab.toml." }),
@@ -175,23 +181,23 @@ function cameras(state, act, step) {
 
 function intrinsics(state, act) {
   const works = state.job && !state.job.ended;
-  const made = state.board_fields.map(([key, label, value, choices]) => (choices.length ? choice(key, label, value, choices) : field(key, label, value, { maxLength: 40 })));
+  const fields = state.board_fields.map(([key, label, value, choices]) => (choices.length ? choice(key, label, value, choices) : field(key, label, value, { maxLength: 40 })));
   // Most users keep all but the first values: the board itself.
-  const form = make("form", {}, make("div", { className: "grid" }, made[0]),
-    make("details", {}, make("summary", { textContent: "Square, lens model and ChArUco board" }), make("div", { className: "grid" }, ...made.slice(1))));
+  const form = make("form", {}, make("div", { className: "grid" }, fields[0]),
+    make("details", {}, make("summary", { textContent: "Square, lens model and ChArUco board" }), make("div", { className: "grid" }, ...fields.slice(1))));
   form.addEventListener("submit", (event) => event.preventDefault());
   const typed = () => Object.fromEntries(state.board_fields.map(([key]) => [key, document.getElementById(key).value]));
   const calibrate = (camera) => act(async () => {
     showFaults(form, await change("calibrate", { camera, options: typed() }), (key) => key);
   });
-  const cards = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
+  const made = state.intrinsics.map((one) => make("div", { className: "card" }, make("div", {},
     make("b", { textContent: one.camera }),
     make("p", { className: one.known ? "text" : "fault", textContent: one.text }),
     make("div", { className: "actions" },
       ...(one.file ? [button(`Use ${one.file}`, () => act(() => change("intrinsics", { camera: one.camera })), `use-${one.camera}`, { className: "main", disabled: !state.may_change })] : []),
       button(one.known ? "Calibrate again" : "Calibrate", () => calibrate(one.camera), `calibrate-${one.camera}`,
         { className: one.known || one.file ? "" : "main", disabled: works || !state.may_change })))));
-  const listed = make("div", { className: "cards" }, ...cards);
+  const listed = cards(made);
   // The user who moves a board looks at its image: it is above all texts.
   const shown = state.board ? [make("div", { id: "calibration" }, make("div", { id: "board-image" }), listed)] : [];
   return [
@@ -212,12 +218,19 @@ function alignment(state, act) {
     make("div", { className: "actions" }, starter(found ? "Measure again" : "Measure the alignment", "align", state, act, !found)),
   ];
   if (!found) return parts;
-  const cards = found.cameras.map((one) => make("div", { className: "card" }, alignedImage(one),
-    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: `To do: ${sentence(one.advice)}` }))));
-  return [
-    ...parts, make("div", { className: "cards" }, ...cards),
+  const card = (one) => make("div", { className: "card" }, alignedImage(one),
+    make("div", {}, make("b", { textContent: one.camera }), make("p", { textContent: `To do: ${sentence(one.advice)}` })));
+  const floor = [
     ...(found.coverage.length ? [make("h3", { textContent: "Floor" })] : []),
     ...lines(found.coverage.map(([text, good]) => [good ? "good" : "warn", text])),
+  ];
+  const isMany = found.cameras.length > MOST_LARGE;
+  // With many cameras, those to turn are shown, below the answer for the floor.
+  const shown = isMany ? found.cameras.filter((one) => one.level !== true) : found.cameras;
+  const level = found.cameras.filter((one) => !shown.includes(one));
+  const levelled = level.length ? [make("details", {}, make("summary", { textContent: `Level cameras: ${level.length}` }), cards(level.map(card)))] : [];
+  return [
+    ...parts, ...(isMany ? floor : []), ...(shown.length ? [cards(shown.map(card))] : []), ...levelled, ...(isMany ? [] : floor),
     ...(found.notes.length ? [make("details", {}, make("summary", { textContent: `Remarks on markers and floor: ${found.notes.length}` }), ...lines(found.notes.map((text) => ["warn", text])))] : []),
   ];
 }

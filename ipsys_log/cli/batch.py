@@ -265,7 +265,7 @@ def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of :func:`ipsys_log.api.replay`; rig and intrinsics are read once."""
-    from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.cli.options import load_calibrations, split_calibration
     from ipsys_log.errors import IpsysError
     from ipsys_log.models.table import check_name
     from ipsys_log.rig.file import load_rig
@@ -274,8 +274,9 @@ def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
         check_name(model)
     rig, calibration = options.pop("rig"), options.pop("calibration") or []
     for text in calibration:
-        if "=" not in text:
-            raise IpsysError(f"--calibration {text}: has no camera name; in a batch, write camera=file.yaml")
+        camera, place = split_calibration(text)
+        if camera is None:
+            raise IpsysError(f"--calibration {place}: has no camera name; in a batch, write camera=file.yaml")
     return {
         "rig": None if rig is None else load_rig(rig),
         "calibrations": load_calibrations(calibration, tuple),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, log_option
+from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appended_log_option, log_option
 
 if TYPE_CHECKING:
     from ipsys_log.exchange.import_truth import TruthOptions
@@ -157,7 +157,7 @@ def truth(
         typer.Argument(metavar="FILE", help="A CSV table (.csv), or a TUM trajectory (.tum) of one robot."),
     ],
     into: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="The log of the same drive; it gets the ground truth.")
+        Path | None, appended_log_option(help="The log of the same drive; it gets the ground truth.")
     ] = None,
     output: Annotated[
         Path | None, log_option(help="A new log for the ground truth. Without --into, it needs --rig.")
@@ -216,7 +216,7 @@ def detections(
         Path, typer.Argument(metavar="FILE", help="A CSV table of markers, one row for each marker.")
     ],
     into: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="A log without images, which gets a new run.")
+        Path | None, appended_log_option(help="A log without images, which gets a new run.")
     ] = None,
     output: Annotated[
         Path | None, log_option(help="A new log for the markers. Without --into, it needs --rig.")

@@ -1,4 +1,4 @@
-"""Commands that write new files from logs at URLs, logs without write permission, and what needs a file."""
+"""Commands that write new files from logs at URLs, and logs without write permission."""
 
 from __future__ import annotations
 
@@ -79,17 +79,6 @@ def test_model_and_intrinsics_come_from_a_url(store: Store, here: Path, ipsys: I
         )
         assert done.code == 0, done.err
     assert Path("remote.mcap").read_bytes() == Path("local.mcap").read_bytes()
-
-
-@pytest.mark.parametrize(
-    "words", [("pack",), ("exclude", "p001", "--reason", "x"), ("measure",), ("align",), ("repair",)]
-)
-def test_command_that_needs_a_file_refuses_a_url(words: tuple[str, ...], here: Path, ipsys: Ipsys) -> None:
-    done = ipsys(words[0], "s3://lab/monday.mcap", *words[1:])
-    assert done.code == 1
-    assert (
-        done.err == "ipsys: monday.mcap: is at a URL, but this command reads files; download the log first\n"
-    )
 
 
 def test_log_without_write_permission_gets_a_derived_log(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

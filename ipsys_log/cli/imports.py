@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.local_files import read_files
 from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appended_log_option, log_option
 
 if TYPE_CHECKING:
@@ -315,7 +316,9 @@ def _refuse_log(path: Path) -> None:
 
 def _by_camera(files: list[str]) -> dict[str, Path]:
     named = _split_names(files, "video", "camera=file.mp4")
-    return {camera: Path(name) for camera, name in named.items()}
+    paths = {camera: Path(name) for camera, name in named.items()}
+    read_files([*paths.values()])
+    return paths
 
 
 def _topic_of(options: list[str]) -> dict[str, str]:

@@ -29,7 +29,7 @@ def read_files(given: Paths) -> Paths:
     IpsysError
         A URL is among them.
     """
-    _refuse(given, "is at a URL, but this command reads files; download the log first")
+    _refuse(given, "is at a URL, but this command reads files; download them first")
     return given
 
 

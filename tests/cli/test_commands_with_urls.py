@@ -31,7 +31,11 @@ WRITE_INTO_A_LOG = (
     "measure U --csv sheet.csv",
     "repair U",
 )
-READ_FILES = ("calibrate U --board 6x4", "pack U -o dataset --card card.toml")
+READ_FILES = (
+    "calibrate U --board 6x4",
+    "import videos red=U -o new.mcap",
+    "pack U -o dataset --card card.toml",
+)
 NEED_LOCAL_PATHS = (
     "align LOG --rig U",
     "cameras --rig U",
@@ -105,8 +109,8 @@ READ_LOGS = (
 )
 # They print a result for each log, and an error in it.
 REPORT_ERRORS = ("batch check", "batch evaluate", "batch verify", "check")
-# It takes the address of a dataset, or names of cameras with their files.
-OTHER = ("score", "import videos")
+# It takes the address of a dataset.
+OTHER = ("score",)
 
 
 @pytest.fixture
@@ -141,7 +145,7 @@ def run(ipsys: Ipsys, line: str, url: str) -> str:
 def test_command_that_needs_a_file_refuses_a_url(line: str, url: str, here: Path, ipsys: Ipsys) -> None:
     expected = {
         WRITE_INTO_A_LOG: f"{SHOWN[url]}: is at a URL, but this command writes into the log; download",
-        READ_FILES: f"{SHOWN[url]}: is at a URL, but this command reads files; download the log first",
+        READ_FILES: f"{SHOWN[url]}: is at a URL, but this command reads files; download",
         NEED_LOCAL_PATHS: f"{SHOWN[url]}: is a URL; name a file or a folder on this machine",
         WRITE_NEW_FILES: f"-o {SHOWN[url]}: is a URL; name a file or a folder on this machine",
     }

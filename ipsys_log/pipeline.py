@@ -117,7 +117,8 @@ def replay(
         task: Task, session: Session, name: str, following: Sequence[Stage], model: str
     ) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
-        waiting = one_pass.results(session, task, name, progress)
+        show = _name_run(progress, name) if len(models) > 1 and is_of_model(task.stage) else progress
+        waiting = one_pass.results(session, task, name, show)
         if waiting is not None:
             yield from waiting
             return
@@ -125,7 +126,7 @@ def replay(
             if MODEL in task.stage.writes and task.foreign == () and unchecked:
                 check_fits(session, request, task.inputs, unchecked)
                 unchecked.clear()
-            messages = compute_messages(task, session, name, progress, workers or local)
+            messages = compute_messages(task, session, name, show, workers or local)
             if task.stage.in_threads and fits and request.model_from is None:
                 messages = preload(messages, models)
             yield from one_pass.follow(messages, session, task, name, following, model)
@@ -167,6 +168,11 @@ def replay(
                     raise
                 say(f"{model} is left out: {error}")
     return outcomes
+
+
+def _name_run(progress: Progress, run: str) -> Progress:
+    """Return a progress function whose steps name their run: with several models, a stage has several."""
+    return lambda stage, done, total: progress(f"{stage} {run}", done, total)
 
 
 def record(

@@ -326,11 +326,13 @@ def check_log(path: LogLocation, folder: Path | None = None) -> LogResult:
     from ipsys_log import api
 
     derived = derived_log_of(path, folder)
-    logs = [path] if derived is None or not derived.exists() else [path, derived]
+    if derived is not None and not derived.exists():
+        derived = None
+    logs = [path] if derived is None else [path, derived]
     checks = api.check(*logs)
     state = LogCheck.worst(checks)
-    if state != BROKEN and len(logs) > 1:
-        check_source([path], logs[-1])
+    if state != BROKEN and derived is not None:
+        check_source([path], derived)
     return LogResult(str(path), state, state == SOUND, _worst_text(checks), derived=name_derived(logs))
 
 

@@ -115,7 +115,7 @@ def test_export_of_a_derived_log_follows_its_changes(bucket: Any, derived: Path,
     target = tmp_path / "tables" / "lab.csv"
 
     def export() -> LogResult:
-        options = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
+        options: dict[str, Any] = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
         return export_log(url, target.parent, ".csv", derived=derived.parent, **options)
 
     assert export().state == "exported"

@@ -408,7 +408,7 @@ def live(
     rig: StrPath,
     *,
     record: StrPath,
-    model_from: StrPath,
+    model_from: StrPath | LogUrl,
     models: Iterable[str] = (),
     cameras: Sequence[str] = (),
     calibrations: Mapping[str, CameraCalibration] | None = None,
@@ -423,7 +423,7 @@ def live(
     ----------
     rig : the rig file, ``lab.toml``; the streams of its ``[stream]`` are opened.
     record : the new log.
-    model_from : the log with the fitted models.
+    model_from : the log with the fitted models, a file or a URL.
     models : names of models; none: ``poly`` if there is one, else the newest.
     cameras : only these cameras of the rig.
     calibrations : they replace the intrinsics that the rig names, by camera.
@@ -447,7 +447,10 @@ def live(
     ...         print(tracks.time_ns, tracks.tracks)
     """
     request = Request(
-        models=tuple(dict.fromkeys(models)), model_from=Path(model_from), corners=corners, method=method
+        models=tuple(dict.fromkeys(models)),
+        model_from=parse_location(model_from),
+        corners=corners,
+        method=method,
     )
 
     def track(tracker: Tracker) -> list[Outcome]:

@@ -16,9 +16,10 @@ from typing import Any
 from ipsys_log import __version__
 from ipsys_log.errors import IpsysError, WriteError, os_error_text, reason_without
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.runs.graph import VERSIONS
-from ipsys_log.runs.output import choose_target
+from ipsys_log.runs.output import check_source, choose_target, derived_log_of, logs_with_results
 from ipsys_log.runs.piece_folder import (
     OtherSoftwareError,
     PieceFolder,
@@ -28,7 +29,7 @@ from ipsys_log.runs.piece_folder import (
     store_piece,
 )
 from ipsys_log.runs.superseded import outdated_runs
-from ipsys_log.soundness.finding import BROKEN, SOUND
+from ipsys_log.soundness.finding import BROKEN, SOUND, LogCheck
 
 __all__ = [
     "FAILED",
@@ -40,6 +41,7 @@ __all__ = [
     "VersionError",
     "Work",
     "check_log",
+    "name_derived",
     "perform",
     "perform_or_divide",
     "perform_piece",
@@ -74,6 +76,7 @@ class LogResult:
     trace : the traceback of a fault of the program; "" otherwise.
     pieces : the number of merged pieces of a long log; None for a log that was one task.
     lost_attempts : the number of their further results, which were deleted; None for a log that was one task.
+    derived : the derived log with results of the log, which was read or extended; None without one.
     """
 
     log: str
@@ -85,6 +88,7 @@ class LogResult:
     trace: str = ""
     pieces: int | None = None
     lost_attempts: int | None = None
+    derived: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +145,8 @@ def perform(task: BatchTask, path: LogLocation) -> LogResult:
     """
     _check_versions(task)
     try:
-        return task.work(path, **task.options)
+        with one_reading():
+            return task.work(path, **task.options)
     except PiecesMissingError:
         raise
     except Exception as error:
@@ -271,6 +276,7 @@ def replay_log(
         messages=sum(outcome.messages for outcome in new),
         pieces=stored.merged or None,
         lost_attempts=lost if stored.merged else None,
+        derived=None if target == path else str(target),
     )
 
 
@@ -285,12 +291,19 @@ def _remarks_text(remarks: Sequence[str]) -> str:
     return "; ".join(lines[:_MOST_REMARKS] + more)
 
 
-def verify_log(path: LogLocation, run: str | None = None) -> LogResult:
-    """Repeat the runs of a log, and compare each channel, as :func:`ipsys_log.api.verify` does."""
+def verify_log(path: LogLocation, run: str | None = None, folder: Path | None = None) -> LogResult:
+    """Repeat the runs of a log, and compare each channel, as :func:`ipsys_log.api.verify` does.
+
+    Parameters
+    ----------
+    run : only this run.
+    folder : of derived logs, whose runs are repeated, too; None: the working folder.
+    """
     from ipsys_log import api
 
     remarks: list[str] = []
-    comparisons = api.verify(path, run=run, say=remarks.append)
+    logs = logs_with_results(path, folder)
+    comparisons = api.verify(*logs, run=run, say=remarks.append)
     other = [comparison.topic for comparison in comparisons if not comparison.equal]
     text = f"{len(other)} of {len(comparisons)} channels differ, such as {other[0]}" if other else ""
     return LogResult(
@@ -299,18 +312,46 @@ def verify_log(path: LogLocation, run: str | None = None) -> LogResult:
         not other,
         text or _remarks_text(remarks),
         messages=sum(comparison.left for comparison in comparisons),
+        derived=name_derived(logs),
     )
 
 
-def check_log(path: LogLocation) -> LogResult:
-    """Read a log completely and check it, as :func:`ipsys_log.api.check` does."""
+def check_log(path: LogLocation, folder: Path | None = None) -> LogResult:
+    """Read a log completely and check it, as :func:`ipsys_log.api.check` does.
+
+    Parameters
+    ----------
+    folder : of derived logs; the state is the worst of the log and its derived log. None: the working folder.
+    """
     from ipsys_log import api
 
-    (check,) = api.check(path)
-    findings = check.remarks
-    worst = next((finding for finding in findings if finding.level == BROKEN), None)
-    first = worst or (findings[0] if findings else None)
-    more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
-    place = f"{first.topic}: " if first and first.topic else ""
-    text = f"{place}{first.text}{more}" if first else ""
-    return LogResult(str(path), check.state, check.state == SOUND, text)
+    derived = derived_log_of(path, folder)
+    if derived is not None and not derived.exists():
+        derived = None
+    logs = [path] if derived is None else [path, derived]
+    checks = api.check(*logs)
+    state = LogCheck.worst(checks)
+    if state != BROKEN and derived is not None:
+        check_source([path], derived)
+    return LogResult(str(path), state, state == SOUND, _worst_text(checks), derived=name_derived(logs))
+
+
+def _worst_text(checks: Sequence[LogCheck]) -> str:
+    """Return the worst remark on a log and its derived log, and the number of the others."""
+    remarks = [
+        (finding, "" if number == 0 else f"{check.path.name}: ")
+        for number, check in enumerate(checks)
+        for finding in check.remarks
+    ]
+    if not remarks:
+        return ""
+    broken = (remark for remark in remarks if remark[0].level == BROKEN)
+    finding, log = next(broken, remarks[0])
+    place = f"{finding.topic}: " if finding.topic else ""
+    more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
+    return f"{log}{place}{finding.text}{more}"
+
+
+def name_derived(logs: Sequence[LogLocation]) -> str | None:
+    """Return the name of the derived log in the result of a log; None without one."""
+    return str(logs[-1]) if len(logs) > 1 else None

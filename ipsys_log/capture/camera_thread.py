@@ -17,6 +17,7 @@ from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
 from ipsys_log.messages.channels import MARKERS
+from ipsys_log.messages.events import NODE_AWAITED
 from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
@@ -350,8 +351,11 @@ class CameraReader:
         self._say(STAMP_UNRELIABLE, text, start_ns, end_ns)
 
     def _say_setting(self, text: str) -> None:
-        """Report a setting that the camera refused, once, also if the camera is opened several times."""
-        self._say_once("camera_setting", text)
+        """Report a setting that the camera refused, once, also if the camera is opened several times.
+
+        A node has the settings of its camera, and its centre reports only that it waits for the node.
+        """
+        self._say_once(NODE_AWAITED if is_of_node(self._camera) else "camera_setting", text)
 
     def _say_once(self, kind: str, text: str) -> None:
         if text not in self._said:

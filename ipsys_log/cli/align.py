@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,22 +15,23 @@ from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
     Corners,
+    NoLogs,
     RigFile,
     cameras_of,
-    file_log_argument,
     load_calibrations,
+    log_argument,
     log_option,
 )
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.report.alignment import AlignedLab
 
 __all__ = ["add_commands"]
 
-NoLogs = Annotated[
-    Optional[list[Path]],  # noqa: UP045
-    file_log_argument(help="Logs, read as one session. The last log gets the results."),
+NoOrLogs = Annotated[
+    NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
 ]
 Plot = Annotated[
     Path | None,
@@ -46,7 +48,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def align(
-    logs: NoLogs = None,
+    logs: NoOrLogs = None,
     rig: RigFile = None,
     calibration: Calibrations = None,
     corners: Corners = None,
@@ -103,7 +105,7 @@ def _prepare_now(
     return lab
 
 
-def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
+def _align(logs: Sequence[LogLocation], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RIG
     from ipsys_log.report.alignment import read_alignment

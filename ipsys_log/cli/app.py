@@ -38,6 +38,7 @@ from ipsys_log.cli import (
     stages,
     stream,
 )
+from ipsys_log.cli.local_files import needs_local_files
 from ipsys_log.cli.signals import interruptible
 from ipsys_log.stages import ENTRIES
 
@@ -296,7 +297,7 @@ arrange(app)
 for typer_app in (app, *(group.typer_instance for group in app.registered_groups)):
     for command in typer_app.registered_commands if typer_app else ():
         if command.callback is not None:
-            command.callback = interruptible(_with_one_reading(command.callback))
+            command.callback = interruptible(needs_local_files(_with_one_reading(command.callback)))
 
 
 def _print_version(wanted: bool) -> None:

@@ -53,6 +53,14 @@ _FOLDER = (
     ],
     None,
 )
+_DERIVED_HELP = (
+    "The folder of -o in ipsys batch replay, with the results of logs that cannot be appended to. Each log "
+    "is read together with its derived log. Default: the working folder."
+)
+_DERIVED = (
+    Annotated[_Path, typer.Option("--derived", "-o", metavar="FOLDER", help=_DERIVED_HELP)],
+    None,
+)
 # The options of the workers and of the result, which all commands of the group have.
 _WORKERS: dict[str, tuple[Any, Any]] = {
     "scheduler": (
@@ -156,6 +164,7 @@ _EXPORT: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "robot": (Annotated[_Text, typer.Option(metavar="NAME", help="Export only this robot.")], None),
+    "derived": (Annotated[_Path, typer.Option("--derived", metavar="FOLDER", help=_DERIVED_HELP)], None),
     "overwrite": (
         Annotated[bool, typer.Option("--overwrite", help="Export all logs, also those with a newer file.")],
         False,
@@ -182,8 +191,8 @@ def add_commands(app: typer.Typer) -> None:
     text += _MORE + _REPEAT
     add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _FOLDER})
     text = "Compute every run of each log again, and compare it byte for byte." + _MORE
-    add("verify", text, _verify, {"run": _RUN})
-    add("check", "Read each log completely and check it." + _MORE, _check, {})
+    add("verify", text, _verify, {"run": _RUN, "derived": _DERIVED})
+    add("check", "Read each log completely and check it." + _MORE, _check, {"derived": _DERIVED})
     text = "Export each log to a file of its name in a folder." + _MORE + _REPEAT
     add("export", text, _export, _EXPORT)
     app.add_typer(group, name="batch")
@@ -206,30 +215,30 @@ def _replay_each(given: dict[str, Any], **further: Any) -> None:
     from ipsys_log.batch.tasks import BatchTask, replay_log
 
     options, batch = _divide(given)
-    folder = _result_folder(options.pop("output"))
+    folder = _result_folder(options.pop("output"), "-o")
     work = {**further, "folder": folder, **_replay_options(options)}
     _run(BatchTask(replay_log, work, divides=True), **batch)
 
 
-def _result_folder(folder: Path | None) -> Path:
+def _result_folder(folder: Path | None, option: str) -> Path:
     """Return the folder for derived logs, as workers with other working folders name it."""
     from ipsys_log.errors import IpsysError
 
     if folder is not None and folder.exists() and not folder.is_dir():
-        raise IpsysError(f"-o {folder}: is not a folder; name a folder for the results")
+        raise IpsysError(f"{option} {folder}: is not a folder; name a folder for the results")
     return (folder or Path()).absolute()
 
 
-def _verify(run: str | None, **batch: Any) -> None:
+def _verify(run: str | None, derived: Path | None, **batch: Any) -> None:
     from ipsys_log.batch.tasks import BatchTask, verify_log
 
-    _run(BatchTask(verify_log, {"run": run}), **batch)
+    _run(BatchTask(verify_log, {"run": run, "folder": _result_folder(derived, "--derived")}), **batch)
 
 
-def _check(**batch: Any) -> None:
+def _check(derived: Path | None, **batch: Any) -> None:
     from ipsys_log.batch.tasks import BatchTask, check_log
 
-    _run(BatchTask(check_log), **batch)
+    _run(BatchTask(check_log, {"folder": _result_folder(derived, "--derived")}), **batch)
 
 
 def _export(
@@ -239,6 +248,7 @@ def _export(
     channel: str,
     run: str | None,
     robot: str | None,
+    derived: Path | None,
     overwrite: bool,
     **batch: Any,
 ) -> None:
@@ -249,7 +259,13 @@ def _export(
     wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
     paths = expand_folders(logs)
     suffix = check_exports(paths, output, **wishes)
-    options = {"folder": output.absolute(), "suffix": suffix, "overwrite": overwrite, **wishes}
+    options = {
+        "folder": output.absolute(),
+        "suffix": suffix,
+        "overwrite": overwrite,
+        "derived": _result_folder(derived, "--derived"),
+        **wishes,
+    }
     _run(BatchTask(export_log, options), logs=logs, paths=paths, **batch)
 
 
@@ -264,7 +280,7 @@ def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of :func:`ipsys_log.api.replay`; rig and intrinsics are read once."""
-    from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.cli.options import load_calibrations, split_calibration
     from ipsys_log.errors import IpsysError
     from ipsys_log.models.table import check_name
     from ipsys_log.rig.file import load_rig
@@ -273,8 +289,9 @@ def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
         check_name(model)
     rig, calibration = options.pop("rig"), options.pop("calibration") or []
     for text in calibration:
-        if "=" not in text:
-            raise IpsysError(f"--calibration {text}: has no camera name; in a batch, write camera=file.yaml")
+        camera, place = split_calibration(text)
+        if camera is None:
+            raise IpsysError(f"--calibration {place}: has no camera name; in a batch, write camera=file.yaml")
     settings = replay_options(**options)
     if settings["model_from"] is not None:
         check_present([settings["model_from"]])

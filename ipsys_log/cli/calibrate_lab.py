@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -22,17 +23,19 @@ from ipsys_log.cli.options import (
     Corners,
     Force,
     Host,
+    NoLogs,
     Port,
     RigFile,
     cameras_of,
-    file_log_argument,
     load_calibrations,
     load_matching_rig,
+    log_argument,
     log_option,
 )
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Rig
     from ipsys_log.survey.lab_calibration import LabCalibration
 
@@ -60,10 +63,10 @@ Plot = Annotated[
 
 
 Sources = Annotated[
-    Optional[list[Path]],  # noqa: UP045
-    file_log_argument(
-        help="Logs, read as one session. The last log gets the results. Without LOG: use the cameras of "
-        "--rig now.",
+    NoLogs,
+    log_argument(
+        help="Logs, files or URLs, read as one session. The last log gets the results. Without LOG: use the "
+        "cameras of --rig now.",
     ),
 ]
 Seconds = Annotated[
@@ -171,7 +174,7 @@ def calibrate_lab(
         _show(lab, plot, as_json)
 
 
-def _check(logs: list[Path], rig: Rig | None) -> None:
+def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:
     """Check that the logs have a rig and a marker or an image, before any stage runs."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session

@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Progress
     from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks", "say"]
+__all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "progress_lines", "remarks", "say"]
 
 _DRAW_EVERY_S = 0.1
 # A stage with more runs than this gets a count instead of a list.
 _MANY_RUNS = 4
 _LONGEST = 10_000
+# A step with more messages than this prints more than one line in a pipe.
+_LONG_STEP = 100
 
 
 class SafeConsole(Console):
@@ -83,12 +85,17 @@ def print_warnings() -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar(frame_steps: Collection[str] | None = None) -> Iterator[Progress]:
-    """Yield the progress function; it shows a bar for each working step, only on a terminal.
+def progress_bar(
+    frame_steps: Collection[str] | None = None, lines_in_pipe: bool = False
+) -> Iterator[Progress]:
+    """Yield the progress function; it shows a bar for each working step on a terminal.
+
+    The runs of a stage, such as ``fit rigid`` and ``fit poly``, share a bar.
 
     Parameters
     ----------
     frame_steps : names of the steps that count frames: their bars show a rate. Default: the causal stages.
+    lines_in_pipe : print lines in a file or a pipe, as :func:`progress_lines`; otherwise nothing.
     """
     from rich.progress import (
         BarColumn,
@@ -107,17 +114,22 @@ def progress_bar(frame_steps: Collection[str] | None = None) -> Iterator[Progres
         TimeRemainingColumn(),
     )
     if not remarks.is_terminal:
-        yield lambda stage, done, total: None
+        yield progress_lines() if lines_in_pipe else lambda stage, done, total: None
         return
     rated = _causal_stages() if frame_steps is None else frame_steps
     with Progress(*columns, console=remarks, transient=True) as bar:
         bars: dict[str, TaskID] = {}
+        steps: dict[str, str] = {}
         drawn_s = 0.0
 
         def show(stage: str, done: int, total: int | None) -> None:
             nonlocal drawn_s
-            if stage not in bars or done == 0:
-                bars[stage] = bar.add_task(stage, total=total, rate="")
+            step, (stage, _, run) = stage, stage.partition(" ")
+            if stage not in bars or (done == 0 and not run and bar.tasks[bars[stage]].completed):
+                bars[stage] = bar.add_task(step, total=total, rate="")
+            elif steps[stage] != step:
+                bar.reset(bars[stage], total=total, description=step, rate="")
+            steps[stage] = step
             # Drawing the bar takes longer than processing a message.
             now_s = monotonic()
             if now_s - drawn_s < _DRAW_EVERY_S and done != total:
@@ -128,6 +140,21 @@ def progress_bar(frame_steps: Collection[str] | None = None) -> Iterator[Progres
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show
+
+
+def progress_lines() -> Progress:
+    """Return a progress function that prints a line for the end of a step, and tenths of a long one."""
+    before = "", 0  # the step, and its tenths
+
+    def show(stage: str, done: int, total: int | None) -> None:
+        nonlocal before
+        tenths = 10 * done // total if total else 0
+        known = before[1] if before[0] == stage and before[1] <= tenths else 0
+        before = stage, tenths
+        if total and tenths > known and (done == total or total > _LONG_STEP):
+            say(f"{stage}: {done} of {total}")
+
+    return show
 
 
 def _causal_stages() -> set[str]:

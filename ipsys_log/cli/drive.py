@@ -10,7 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
-from ipsys_log.cli.options import AsJson, Force, NewLog
+from ipsys_log.cli.options import AsJson, Force, NewLog, OneLog, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
 
 if TYPE_CHECKING:
@@ -50,7 +50,10 @@ def add_commands(app: typer.Typer) -> None:
 def drive(
     output: NewLog,
     model_from: Annotated[
-        Path, typer.Option("--model-from", metavar="LOG", help="The log of the simulated lab with the model.")
+        OneLog,
+        other_log_option(
+            "--model-from", help="The log of the simulated lab with the model, a file or a URL."
+        ),
     ],
     model: Models = None,
     robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,

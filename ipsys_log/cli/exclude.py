@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.options import AsJson, file_log_argument
+from ipsys_log.cli.options import AsJson, appended_log_argument
 
 __all__ = ["add_commands"]
 
@@ -21,7 +21,7 @@ def add_commands(app: typer.Typer) -> None:
 def exclude(
     log: Annotated[
         Path,
-        file_log_argument(help="A finished log with measurements, which gets the change."),
+        appended_log_argument(help="A finished log with measurements, which gets the change."),
     ],
     points: Annotated[
         list[str],

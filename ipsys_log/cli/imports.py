@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, log_option
+from ipsys_log.cli.local_files import read_files
+from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appended_log_option, log_option
 
 if TYPE_CHECKING:
     from ipsys_log.exchange.import_truth import TruthOptions
@@ -157,7 +158,7 @@ def truth(
         typer.Argument(metavar="FILE", help="A CSV table (.csv), or a TUM trajectory (.tum) of one robot."),
     ],
     into: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="The log of the same drive; it gets the ground truth.")
+        Path | None, appended_log_option(help="The log of the same drive; it gets the ground truth.")
     ] = None,
     output: Annotated[
         Path | None, log_option(help="A new log for the ground truth. Without --into, it needs --rig.")
@@ -216,7 +217,7 @@ def detections(
         Path, typer.Argument(metavar="FILE", help="A CSV table of markers, one row for each marker.")
     ],
     into: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="A log without images, which gets a new run.")
+        Path | None, appended_log_option(help="A log without images, which gets a new run.")
     ] = None,
     output: Annotated[
         Path | None, log_option(help="A new log for the markers. Without --into, it needs --rig.")
@@ -315,7 +316,9 @@ def _refuse_log(path: Path) -> None:
 
 def _by_camera(files: list[str]) -> dict[str, Path]:
     named = _split_names(files, "video", "camera=file.mp4")
-    return {camera: Path(name) for camera, name in named.items()}
+    paths = {camera: Path(name) for camera, name in named.items()}
+    read_files([*paths.values()])
+    return paths
 
 
 def _topic_of(options: list[str]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
-from ipsys_log.cli.options import AsJson, ReadLogs, file_log_argument
+from ipsys_log.cli.options import AsJson, ReadLogs, appended_log_argument
 from ipsys_log.cli.signals import writes_nothing
 from ipsys_log.cli.stages import MORE, build_command, derive, options_until
 
@@ -98,7 +98,7 @@ def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
 
 
 def repair(
-    log: Annotated[Path, file_log_argument(help="A damaged or incomplete log.")],
+    log: Annotated[Path, appended_log_argument(help="A damaged or incomplete log.")],
 ) -> None:
     """Repair a log in place: keep all complete records, report the losses, and complete its runs.
 

@@ -20,8 +20,8 @@ from ipsys_log.cli.options import (
     Only,
     Port,
     RigFile,
+    appended_log_argument,
     cameras_of,
-    file_log_argument,
     load_calibrations,
     load_matching_rig,
     log_option,
@@ -37,7 +37,7 @@ __all__ = ["add_commands", "serve_page"]
 
 Log = Annotated[
     Optional[Path],  # noqa: UP045
-    file_log_argument(
+    appended_log_argument(
         help="A finished log, which gets the measurements. Without LOG: use the cameras of --rig now.",
     ),
 ]

@@ -16,6 +16,7 @@ from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Measurement, Message, Model
     from ipsys_log.runs.options import Request
     from ipsys_log.survey.live import LiveScene
@@ -34,7 +35,7 @@ def measure_now(
     camera: list[str] | None,
     calibration: list[str] | None,
     corners: str | None,
-    model_from: Path | None,
+    model_from: LogLocation | None,
     force: bool,
     terminal: bool,
     host: str | None,
@@ -67,7 +68,7 @@ def measure_now(
     return scene.history()
 
 
-def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Model | None:
+def ready_to_measure(lab: Lab, request: Request, model_from: LogLocation | None) -> Model | None:
     """Check that these cameras can measure points; return the newest model of the other log, if named."""
     import ipsys_log.models.poly  # noqa: F401 - the outliers need it, and no frame must wait for it
     from ipsys_log.capture.live_plan import check_model, check_start

@@ -14,6 +14,7 @@ from ipsys_log.cli.options import cameras_of
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration
 
 __all__ = ["FieldOfView", "Focal", "SaveNominal", "nominal_lenses", "nominal_lenses_of_logs", "write_nominal"]
@@ -47,7 +48,7 @@ SaveNominal = Annotated[
 
 
 def nominal_lenses_of_logs(
-    logs: list[Path],
+    logs: Sequence[LogLocation],
     given: dict[str, CameraCalibration],
     focal: list[str],
     field_of_view: list[str],

@@ -14,13 +14,14 @@ from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.cli.console import console, remarks, say
-from ipsys_log.cli.options import load_lab
+from ipsys_log.cli.options import load_lab, split_calibration
 from ipsys_log.cli.signals import Interrupted, stop_on_signal
 from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.capture.disk import DiskRoom
     from ipsys_log.capture.multiplexer import LiveCameras
+    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
     from ipsys_log.report.cameras import LiveStatus
 
@@ -49,7 +50,7 @@ class Lab(NamedTuple):
     rig: Rig
     cameras: list[RigCamera]
     lenses: dict[str, CameraCalibration]
-    files: list[tuple[str, Path]]
+    files: list[tuple[str, LogLocation]]
     folder: Path
 
     @property
@@ -89,10 +90,12 @@ def prepare_lab(
     return lab
 
 
-def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
+def _files(
+    rig: Path, cameras: list[RigCamera], calibration: list[str] | None
+) -> list[tuple[str, LogLocation]]:
     from ipsys_log.capture.video_files import split_source
 
-    files = [("a calibration", Path(option.rpartition("=")[2])) for option in calibration or ()]
+    files = [("a calibration", split_calibration(option)[1]) for option in calibration or ()]
     for camera in cameras:
         if camera.calibration is not None:
             files.append((f"the calibration of camera {camera.name}", rig.parent / camera.calibration))
@@ -101,7 +104,7 @@ def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -
     return files
 
 
-def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -> None:
+def check_target(output: Path, force: bool, files: Iterable[tuple[str, LogLocation]]) -> None:
     """Check that a log can be written.
 
     Parameters
@@ -116,6 +119,7 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import DISK, journal_path
+    from ipsys_log.log.location import is_one_of
     from ipsys_log.log.lock import check_free, check_locks, open_locked
     from ipsys_log.report.files import check_file
 
@@ -129,8 +133,8 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
         check_free(output)
         check_locks(output.parent)
     else:
-        for purpose, path in files:
-            if path.exists() and output.samefile(path):
+        for purpose, log in files:
+            if is_one_of(output, [log]):
                 raise IpsysError(f"-o {output}: is {purpose}; give another name")
         if not force:
             raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")

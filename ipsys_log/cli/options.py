@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import remarks
+from ipsys_log.cli.local_files import appended_logs, is_url, read_files
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
 if TYPE_CHECKING:
@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     LogList = list[LogLocation]
     OneLog = LogLocation
     OtherLog = LogLocation | None
+    NoLogs = LogList | None
 else:
     LogList = list[str]  # typer knows no union of types
     OneLog = str
     OtherLog = Optional[str]  # noqa: UP045
+    NoLogs = Optional[list[str]]  # noqa: UP045
 
 __all__ = [
     "AsJson",
@@ -37,6 +39,7 @@ __all__ = [
     "Method",
     "ModelOfOther",
     "NewLog",
+    "NoLogs",
     "OneLog",
     "Only",
     "OtherLog",
@@ -46,6 +49,8 @@ __all__ = [
     "RigFile",
     "RigNow",
     "annotate",
+    "appended_log_argument",
+    "appended_log_option",
     "build_option",
     "cameras_of",
     "check_present",
@@ -57,6 +62,7 @@ __all__ = [
     "log_option",
     "one_log_argument",
     "other_log_option",
+    "split_calibration",
 ]
 
 
@@ -76,11 +82,11 @@ def annotate(parameter: StageParameter) -> Any:
     return Annotated[kind, build_option(parameter)]
 
 
-def _locations(texts: list[str]) -> list[Any]:
+def _locations(texts: list[str] | None) -> list[Any]:
     """Return the logs of an argument; a pattern of a URL gives all its objects."""
     from ipsys_log.log.location import find_logs
 
-    return find_logs(texts)
+    return find_logs(texts or ())
 
 
 def _location(text: str | None) -> Any:
@@ -90,35 +96,17 @@ def _location(text: str | None) -> Any:
     return None if text is None else parse_location(text)
 
 
-def _files(given: list[Path] | Path | None) -> list[Path] | Path | None:
-    """Return the log file, or the files, of an argument of a command that needs files.
-
-    Raises
-    ------
-    IpsysError
-        A URL is among them.
-    """
-    for path in [given] if isinstance(given, Path) else given or ():
-        if _URL_AS_PATH.match(str(path)) and not path.exists():
-            from ipsys_log.errors import IpsysError
-
-            raise IpsysError(
-                f"{path.name}: is at a URL, but this command reads files; download the log first"
-            )
-    return given
-
-
 log_argument = partial(typer.Argument, metavar="LOG", callback=_locations)
 one_log_argument = partial(typer.Argument, metavar="LOG", callback=_location)
 other_log_option = partial(typer.Option, metavar="LOG", callback=_location)
-file_log_argument = partial(typer.Argument, metavar="LOG", callback=_files)
+file_log_argument = partial(typer.Argument, metavar="LOG", callback=read_files)
+appended_log_argument = partial(typer.Argument, metavar="LOG", callback=appended_logs)
+appended_log_option = partial(typer.Option, metavar="LOG", callback=appended_logs)
 Logs = Annotated[
     LogList, log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
 ]
 ReadLogs = Annotated[LogList, log_argument(help="Logs, files or URLs, read as one session.")]
 
-# A path has lost one of the two slashes of a URL.
-_URL_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 # File name extensions of other input and output files: a log with such a name is a mistake.
 _OTHER_FILES = (
     *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
@@ -149,7 +137,7 @@ def _named_as_log(path: Path | None) -> Path | None:
     IpsysError
         The name is that of another kind of file.
     """
-    if path is None or path.suffix == ".mcap" or path.is_dir():
+    if path is None or path.suffix == ".mcap" or path.is_dir() or is_url(path):
         return path
     if path.suffix.lower() in _OTHER_FILES:
         from ipsys_log.errors import IpsysError
@@ -204,9 +192,10 @@ RigNow = Annotated[
     Path, typer.Option("--rig", metavar="FILE", help="The rig file, with a source for each camera.")
 ]
 ModelOfOther = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option(
-        "--model-from", metavar="LOG", help="While measuring, compare each point with the model of this log."
+    OtherLog,
+    other_log_option(
+        "--model-from",
+        help="While measuring, compare each point with the model of this log, a file or a URL.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -227,30 +216,42 @@ def load_calibrations(
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.location import parse_location
 
     lenses: dict[str, CameraCalibration] = {}
     for option in options:
-        camera, equals, name = option.partition("=")
-        if equals:
-            calibrations = {camera: read_intrinsics(Path(name), camera)}
-        elif (place := parse_location(option)).suffix == ".mcap":
+        camera, place = split_calibration(option)
+        if camera is not None:
+            calibrations = {camera: read_intrinsics(place, camera)}
+        elif place.suffix == ".mcap":
             with Session([place]) as log:
                 recorded = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
             calibrations = {c: lens for c, lens in recorded.items() if c in cameras()}
             if not calibrations:
                 raise IpsysError(
-                    f"--calibration {option}: has no calibration of these cameras; give another log"
+                    f"--calibration {place}: has no calibration of these cameras; give another log"
                 )
         else:
             raise IpsysError(
-                f"--calibration {option}: has no camera name; write camera=file.yaml, or name a log (.mcap)"
+                f"--calibration {place}: has no camera name; write camera=file.yaml, or name a log (.mcap)"
             )
         for name in calibrations:
             if name in lenses:
                 raise IpsysError(f"--calibration: camera {name!r} has two calibrations; give one")
         lenses.update(calibrations)
     return lenses
+
+
+def split_calibration(option: str) -> tuple[str | None, LogLocation]:
+    """Return the camera and the file of ``camera=file``; the camera is None if the option names only a log.
+
+    The query of a URL may have an equals sign, too.
+    """
+    from ipsys_log.log.location import LogUrl, parse_location
+
+    camera, equals, name = option.partition("=")
+    if not equals or isinstance(parse_location(option), LogUrl):
+        return None, parse_location(option)
+    return camera, parse_location(name)
 
 
 def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]]) -> Rig | None:

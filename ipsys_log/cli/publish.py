@@ -78,7 +78,7 @@ def pack(
         raise IpsysError("pack needs logs and a dataset: ipsys pack lab.mcap -o dataset --card card.toml")
     if card is None:
         raise IpsysError("pack needs --card FILE; to write an empty form: ipsys pack --card-form card.toml")
-    with say_kept(lambda _: f"{output} was not written"), progress_bar() as progress:
+    with say_kept(lambda _: f"{output} was not written"), progress_bar(lines_in_pipe=True) as progress:
         result = pack_logs(
             logs,
             output,
@@ -117,7 +117,7 @@ def score(
     from ipsys_log import api
     from ipsys_log.report.pack_scores import score_answer, score_json, score_tables
 
-    with say_kept(lambda _: f"{dataset} is unchanged"), progress_bar() as progress:
+    with say_kept(lambda _: f"{dataset} is unchanged"), progress_bar(lines_in_pipe=True) as progress:
         result = api.score(dataset, models=model or (), progress=progress, say=say)
     if as_json:
         print(json.dumps(score_json(result), indent=2, allow_nan=False))  # noqa: T201

@@ -20,9 +20,11 @@ from ipsys_log.cli.options import (
     Method,
     ModelOfOther,
     NewLog,
+    OneLog,
     Only,
     Port,
     RigNow,
+    other_log_option,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
@@ -119,7 +121,8 @@ def record(
 def live(
     output: NewLog,
     model_from: Annotated[
-        Path, typer.Option("--model-from", metavar="LOG", help="The log with the fitted model to apply.")
+        OneLog,
+        other_log_option("--model-from", help="The log with the fitted model to apply, a file or a URL."),
     ],
     rig: RigNow = Path("lab.toml"),
     model: Annotated[

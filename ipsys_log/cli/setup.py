@@ -6,13 +6,16 @@ import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import NewLog
+from ipsys_log.cli.options import NewLog, OtherLog, other_log_option
 from ipsys_log.cli.signals import say_kept
+
+if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
 
 __all__ = ["add_commands"]
 
@@ -59,8 +62,8 @@ def add_commands(app: typer.Typer) -> None:
 def init(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="The rig file to write.")] = Path("lab.toml"),
     log: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="LOG", help="Write the rig of a log, with its camera settings."),
+        OtherLog,
+        other_log_option("--from", help="Write the rig of a log, a file or a URL, with its camera settings."),
     ] = None,
     simulated: Annotated[
         bool,
@@ -105,7 +108,7 @@ def _init_simulated(path: Path) -> None:
     console.print(f"next: ipsys align --rig {path}", markup=False)
 
 
-def _rig_of(log: Path) -> str:
+def _rig_of(log: LogLocation) -> str:
     from ipsys_log.log.dataset import Session
     from ipsys_log.rig.file import rig_toml
     from ipsys_log.runs.select import rig_with_offsets

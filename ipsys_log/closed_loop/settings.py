@@ -15,6 +15,7 @@ from ipsys_log.closed_loop.ports import Ports, find_ports
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Waypoint
 from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing
 from ipsys_log.simulation.cameras import FLOOR_M, mount_cameras
@@ -234,7 +235,7 @@ def parse_failure(text: str) -> CameraFailure:
     return failure
 
 
-def read_lab(log: Path, lab: LabSettings) -> LabSettings:
+def read_lab(log: LogLocation, lab: LabSettings) -> LabSettings:
     """Return the settings of the simulated lab of a calibrated log, with its image size.
 
     Raises

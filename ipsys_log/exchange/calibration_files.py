@@ -15,6 +15,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.kalibr_files import find_cameras, read_camchain
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration
 
@@ -217,8 +218,10 @@ def _row(values: Iterable[float]) -> str:
     return f"[{', '.join(repr(float(value)) for value in values)}]"
 
 
-def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
+def read_intrinsics(path: LogLocation, camera: str) -> CameraCalibration:
     """Read the intrinsics of a camera from a YAML file of OpenCV, ROS or Kalibr, or from a log (``.mcap``).
+
+    The log can be at a URL.
 
     From a log, the newest calibration of the camera is read. If the log holds the calibration of a single
     camera, this camera may have another name.
@@ -229,6 +232,8 @@ def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
         The file does not exist, cannot be read, or holds no calibration of this camera.
     """
     if path.suffix != ".mcap":
+        if not isinstance(path, Path):
+            raise IpsysError(f"{path}: is at a URL, where only a log (.mcap) can be read; download the file")
         read = read_camchain if find_cameras(path) else read_opencv_calibration
         return read(path, camera)
     with Session([path]) as log:

@@ -10,6 +10,8 @@ __all__ = [
     "CAMERA_MOVED",
     "FRAME_SKIPPED",
     "MARK",
+    "NODE_ANSWERS",
+    "NODE_AWAITED",
     "OPERATOR_KINDS",
     "SEGMENT_ENDED",
     "SEGMENT_STARTED",
@@ -24,6 +26,8 @@ FRAME_SKIPPED = "frame_skipped"
 STAMP_UNRELIABLE = "stamp_unreliable"
 # The kind of an event for a camera that was knocked during a live recording.
 CAMERA_MOVED = "camera_moved"
+# The kinds of events for the first answers of the node of a camera, and for a long wait for them.
+NODE_ANSWERS, NODE_AWAITED = "node_answers", "node_awaited"
 # The kinds of events of an operator: a remark at an instant, and the start and the end of a named segment.
 MARK, SEGMENT_STARTED, SEGMENT_ENDED = "mark", "segment_started", "segment_ended"
 OPERATOR_KINDS = frozenset((MARK, SEGMENT_STARTED, SEGMENT_ENDED))

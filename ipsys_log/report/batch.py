@@ -78,6 +78,7 @@ def write_results(path: Path, results: Sequence[LogResult]) -> None:
         "trace": "string",
         "pieces": "int64",
         "lost_attempts": "int64",
+        "derived": "string",
     }
     rows = ({name: None if value == "" else value for name, value in asdict(one).items()} for one in results)
     write_rows(path, rows, columns)

@@ -27,8 +27,11 @@ __all__ = [
     "append_messages",
     "append_run",
     "check_copy",
+    "check_source",
     "choose_target",
     "create_copy",
+    "derived_log_of",
+    "logs_with_results",
     "open_target",
     "record_message",
     "serialize",
@@ -157,14 +160,31 @@ def choose_target(
     IpsysError
         The derived log has results of another log.
     """
-    source = paths[-1]
-    if output is not None or (isinstance(source, Path) and _can_append(source)):
+    if output is not None:
         return list(paths), output
-    derived = _derived_log(source, folder)
-    if not derived.exists():
+    derived = derived_log_of(paths[-1], folder)
+    if derived is None or not derived.exists():
         return list(paths), derived
-    _check_source(paths, derived)
+    check_source(paths, derived)
     return [*paths, derived], None
+
+
+def derived_log_of(source: LogLocation, folder: Path | None = None) -> Path | None:
+    """Return the derived log of a log, which may not exist yet; None if the log gets its results itself."""
+    if isinstance(source, Path) and _can_append(source):
+        return None
+    return _derived_log(source, folder)
+
+
+def logs_with_results(source: LogLocation, folder: Path | None = None) -> list[LogLocation]:
+    """Return a log, and its derived log in a folder if there is one, as :func:`choose_target` names it.
+
+    Raises
+    ------
+    IpsysError
+        The derived log has results of another log.
+    """
+    return choose_target([source], None, folder)[0]
 
 
 def _can_append(log: Path) -> bool:
@@ -179,17 +199,25 @@ def _derived_log(source: LogLocation, folder: Path | None) -> Path:
     return folder / source.below_pattern.with_name(name) if isinstance(source, LogUrl) else folder / name
 
 
-def _check_source(paths: Sequence[LogLocation], derived: Path) -> None:
+def check_source(paths: Sequence[LogLocation], derived: Path) -> None:
     """Check that a derived log has results of these logs: its runs name their inputs by content.
 
     The largest input decides, such as the markers: two logs of a lab can have equal rigs and intrinsics.
+
+    Raises
+    ------
+    IpsysError
+        The derived log has results of another log.
     """
     with Session([derived]) as results, Session(paths) as session:
         inputs = [read for run in results.runs() for read in run.inputs]
         known = [read for read in inputs if session.count(read.topic)]
         largest = max(known, key=lambda read: read.messages, default=None)
         if inputs and (largest is None or session.hash(largest.topic) != largest.hash):
-            raise IpsysError(f"{derived}: has results of another log than {session}; give a new log with -o")
+            raise IpsysError(
+                f"{derived}: has results of another log than {session}; move it, or choose another name or "
+                "folder for the results"
+            )
 
 
 @contextmanager

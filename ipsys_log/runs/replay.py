@@ -120,7 +120,10 @@ class Replay:
         self, task: Task, session: Session, name: str, following: Sequence[Stage], model: str
     ) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
-        waiting = self.one_pass.results(session, task, name, self.progress)
+        progress = self.progress
+        if len(self.models) > 1 and is_of_model(task.stage):
+            progress = _name_run(progress, name)
+        waiting = self.one_pass.results(session, task, name, progress)
         if waiting is not None:
             yield from waiting
             return
@@ -128,8 +131,13 @@ class Replay:
             if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
                 check_fits(session, self.request, task.inputs, self.unchecked)
                 self.unchecked.clear()
-            messages = compute_messages(task, session, name, self.progress, self.workers)
+            messages = compute_messages(task, session, name, progress, self.workers)
             fits = any(MODEL in stage.writes for stage in self.stages)
             if task.stage.in_threads and fits and self.request.model_from is None:
                 messages = preload(messages, self.models)
             yield from self.one_pass.follow(messages, session, task, name, following, model)
+
+
+def _name_run(progress: Progress, run: str) -> Progress:
+    """Return a progress function whose steps name their run: with several models, a stage has several."""
+    return lambda stage, done, total: progress(f"{stage} {run}", done, total)

@@ -16,7 +16,14 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.stored_schemas import compare_schema
 from ipsys_log.messages import Event
 from ipsys_log.messages.channels import CHANNELS, EVENTS, IMAGES, RUN_EVENTS, channel_of
-from ipsys_log.messages.events import CAMERA_MOVED, FRAME_SKIPPED, OPERATOR_KINDS, STAMP_UNRELIABLE
+from ipsys_log.messages.events import (
+    CAMERA_MOVED,
+    FRAME_SKIPPED,
+    NODE_ANSWERS,
+    NODE_AWAITED,
+    OPERATOR_KINDS,
+    STAMP_UNRELIABLE,
+)
 from ipsys_log.soundness.finding import NOTE, REMARK, LogFinding
 from ipsys_log.units import NS_PER_S
 
@@ -25,7 +32,10 @@ __all__ = ["check_events", "check_messages", "check_rates", "check_schemas", "de
 _PROGRESS_EVERY = 1000
 # Events of the recorder or of a run that need no action.
 _USUAL_EVENTS = frozenset(
-    ("camera_back", "ambiguous_marker", "unknown_marker", "rejected_marker", "robot_run", *OPERATOR_KINDS)
+    (
+        *("camera_back", "ambiguous_marker", "unknown_marker", "rejected_marker", "robot_run"),
+        *(NODE_ANSWERS, NODE_AWAITED, *OPERATOR_KINDS),
+    )
 )
 _ADVICE = {
     FRAME_SKIPPED: "the frames are in the log: ipsys replay processes them",

@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import shutil
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ipsys_log import api
+from ipsys_log.batch.exports import export_log
 from ipsys_log.batch.tasks import (
     BatchTask,
     LogPieces,
     LogResult,
+    check_log,
+    perform,
     perform_or_divide,
     perform_piece,
     replay_log,
+    verify_log,
 )
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.log.location import LogUrl
+from ipsys_log.messages import Message, Tracks
 from ipsys_log.runs import pieces
 from tests.batch.piece_works import PARAMETERS, UNTIL
 from tests.batch.works import batch
+from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.s3_server import put
 
@@ -44,11 +54,94 @@ def test_results_of_objects_are_in_derived_logs(bucket: Any, tmp_path: Path) -> 
     derived = [tmp_path / "out" / f"2026-{month}" / "lab.derived.mcap" for month in ("01", "02")]
     assert sorted(path for path in (tmp_path / "out").rglob("*") if path.is_file()) == derived
     assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
+    others = (("verify", "identical"), ("check", "sound"), ("evaluate", "up to date"))
+    for name, state in others:
+        options = ("--model", "rigid") if name == "evaluate" else ()
+        _, result, errors = batch(tmp_path, name, command[1], *options, "-o", "out", "--workers", 1)
+        assert result["states"] == {state: 2}, errors
+        assert [row["derived"] for row in result["results"]] == [*map(str, derived)]
+    assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
     put(bucket, "2026-03/lab.mcap", b"no log")
     _, result, errors = batch(tmp_path, *command)
     assert result["states"] == {"up to date": 2, "failed": 1}, errors
     assert result["results"][2]["log"] == "s3://logs/2026-03/lab.mcap"
     assert len(result["results"][2]["text"].splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the derived log of the small log of the paper, to be copied."""
+    path = tmp_path_factory.mktemp("results") / "lab.derived.mcap"
+    api.replay(PAPER_LAB, models=("rigid",), output=path)
+    return path
+
+
+@pytest.fixture
+def derived(results: Path, tmp_path: Path) -> Path:
+    (tmp_path / "out").mkdir()
+    return Path(shutil.copy(results, tmp_path / "out"))
+
+
+def test_verify_repeats_the_runs_of_a_derived_log(bucket: Any, derived: Path) -> None:
+    url = LogUrl(put(bucket, "lab.mcap", PAPER_LAB.read_bytes()))
+    result = verify_log(url, folder=derived.parent)
+    compared = api.verify(PAPER_LAB, derived)
+    assert (result.state, result.derived) == ("identical", str(derived))
+    assert result.messages == sum(comparison.left for comparison in compared) > 0
+
+    def move(message: Message) -> Message:
+        payload = message.payload
+        return (
+            replace(message, payload=replace(payload, tracks=())) if isinstance(payload, Tracks) else message
+        )
+
+    rewrite(derived, move).replace(derived)
+    result = verify_log(url, folder=derived.parent)
+    assert (result.state, result.good) == ("different", False)
+    assert "/runs/rigid/tracks" in result.text
+
+
+def test_check_reads_a_derived_log_too(bucket: Any, derived: Path) -> None:
+    url = LogUrl(put(bucket, "lab.mcap", PAPER_LAB.read_bytes()))
+    assert check_log(url, derived.parent) == LogResult(str(url), "sound", derived=str(derived))
+    derived.write_bytes(derived.read_bytes()[:-1000])
+    result = check_log(url, derived.parent)
+    assert (result.state, result.good) == ("broken", False)
+    assert result.text.startswith("lab.derived.mcap: ")
+
+
+def test_export_of_a_derived_log_follows_its_changes(bucket: Any, derived: Path, tmp_path: Path) -> None:
+    url = LogUrl(put(bucket, "lab.mcap", PAPER_LAB.read_bytes()))
+    target = tmp_path / "tables" / "lab.csv"
+
+    def export() -> LogResult:
+        options: dict[str, Any] = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
+        return export_log(url, target.parent, ".csv", derived=derived.parent, **options)
+
+    assert export().state == "exported"
+    with api.open(PAPER_LAB, derived) as log:
+        log.export(tmp_path / "expected.csv")
+    assert target.read_bytes() == (tmp_path / "expected.csv").read_bytes()
+    later_s = time.time() + 1000
+    os.utime(target, (later_s, later_s))
+    assert export().state == "up to date"
+    os.utime(derived, (later_s + 1000, later_s + 1000))
+    assert export().state == "exported"
+
+
+def test_derived_log_of_another_object_fails(bucket: Any, derived: Path, tmp_path: Path) -> None:
+    url = LogUrl(put(bucket, "lab.mcap", (ROOT / "sample_logs" / "small_lab.mcap").read_bytes()))
+    options = {"table": "tracks", "run": None, "robot": None, "format": "csv", "suffix": ".csv"}
+    tasks = (
+        BatchTask(verify_log, {"folder": derived.parent}),
+        BatchTask(check_log, {"folder": derived.parent}),
+        BatchTask(export_log, {"folder": tmp_path / "tables", "derived": derived.parent, **options}),
+    )
+    for task in tasks:
+        result = perform(task, url)
+        assert result.state == "failed"
+        assert result.text.startswith(f"{derived}: has results of another log than {url}; move it")
+    assert not (tmp_path / "tables").exists()
 
 
 def test_pieces_of_an_object_give_the_bytes_of_the_file(

@@ -1,4 +1,4 @@
-"""Commands that write new files from logs at URLs, logs without write permission, and what needs a file."""
+"""Commands that write new files from logs at URLs, and logs without write permission."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import api
+from ipsys_log.cli.options import load_calibrations
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogUrl
 from ipsys_log.runs.output import choose_target
 from tests.conftest import ROOT, Ipsys, small_disk
@@ -81,15 +85,26 @@ def test_model_and_intrinsics_come_from_a_url(store: Store, here: Path, ipsys: I
     assert Path("remote.mcap").read_bytes() == Path("local.mcap").read_bytes()
 
 
-@pytest.mark.parametrize(
-    "words", [("pack",), ("exclude", "p001", "--reason", "x"), ("measure",), ("align",), ("repair",)]
-)
-def test_command_that_needs_a_file_refuses_a_url(words: tuple[str, ...], here: Path, ipsys: Ipsys) -> None:
-    done = ipsys(words[0], "s3://lab/monday.mcap", *words[1:])
-    assert done.code == 1
-    assert (
-        done.err == "ipsys: monday.mcap: is at a URL, but this command reads files; download the log first\n"
-    )
+def test_rig_file_of_a_log_at_a_url(store: Store, here: Path, ipsys: Ipsys) -> None:
+    url = store.put("/lab.mcap", PAPER_LAB.read_bytes())
+    for place, name in ((PAPER_LAB, "local.toml"), (url, "remote.toml")):
+        done = ipsys("init", name, "--from", place)
+        assert done.code == 0, done.err
+    assert Path("remote.toml").read_text() == Path("local.toml").read_text()
+
+
+def test_intrinsics_of_one_camera_come_from_a_url(store: Store, here: Path) -> None:
+    url = f"{store.put('/lab.mcap', GOLDEN.read_bytes())}?signature=a=b"
+    with Session([GOLDEN]) as session:
+        cameras = [*session.calibrations]
+    texts = [
+        encode(load_calibrations([f"{cameras[0]}={place}"], lambda: cameras)[cameras[0]])
+        for place in (GOLDEN, url)
+    ]
+    assert texts[0] == texts[1]
+    assert [*load_calibrations([url], lambda: cameras)] == cameras
+    with pytest.raises(IpsysError, match=r"/red.yaml: is at a URL, where only a log \(.mcap\) can be read"):
+        load_calibrations([f"red={store.address}/red.yaml?secret"], lambda: cameras)
 
 
 def test_log_without_write_permission_gets_a_derived_log(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -148,7 +148,6 @@ class Centre:
             link = _Link(self._session, camera, self._nodes[camera.name], stream, clock, period_s)
             link.await_node(self._network, say, self._is_stopped)
             self._links[camera.name] = link
-            say(f"camera {camera.name}: its node answers; {stream.describe_clock()}")
         link.heard_ns = clock.now_ns()
         yield link.items()
 
@@ -220,6 +219,7 @@ class _Link:
                 f"camera {self._camera.name}: no node {self._node} answers at {network}; start it on its "
                 f"host: ipsys node lab.toml --camera {self._node}"
             )
+        self._early.insert(0, self._stream.report_answer(self._clock.now_ns()))
 
     def items(self) -> Iterator[Frame | SourceMessage | None]:
         """Yield the frames and the messages about them."""

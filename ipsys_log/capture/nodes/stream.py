@@ -15,6 +15,7 @@ from ipsys_log.capture.frames import Frame, SourceError, SourceMessage, mid_expo
 from ipsys_log.capture.nodes.wire import FrameHeader, FrameRequest, NodeState, StateRequest
 from ipsys_log.capture.video_packets import is_decodable_start
 from ipsys_log.messages import EVENTS_TOPIC, ClockEstimate, Event, RigCamera, clock_topic
+from ipsys_log.messages.events import NODE_ANSWERS
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["NodeStream"]
@@ -87,8 +88,12 @@ class NodeStream:
     def _expected(self) -> int:
         return self._first if self._next is None else self._next
 
-    def describe_clock(self) -> str:
-        """Return a text about the clock of the node."""
+    def report_answer(self, now_ns: int) -> SourceMessage:
+        """Return the event for the first answers of the node, with the state of its clock."""
+        text = f"camera {self._camera.name}: its node answers; {self._describe_clock()}"
+        return self._event(NODE_ANSWERS, text, now_ns)
+
+    def _describe_clock(self) -> str:
         line = self._history.line
         if line is None:
             return "its clock is not known yet"

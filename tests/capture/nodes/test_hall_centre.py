@@ -106,6 +106,9 @@ def test_centre_of_24_nodes_has_all_markers_and_tracks(tmp_path: Path, ipsys: Ip
     markers = driven_markers(lab)
     log = record_hall(tmp_path, lab, markers)
     with Session([log]) as session:
+        events = session.payloads(session.topics(EVENTS))
+        assert {event.camera for event in events if event.kind == "node_answers"} == set(markers)
+        assert not [event for event in events if event.kind == "camera_setting"]
         for camera, sent in markers.items():
             received = session.payloads([MARKERS.topic_of("nodes", camera)])
             received.sort(key=lambda row: row.node_frame)

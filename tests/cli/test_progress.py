@@ -1,0 +1,41 @@
+"""The progress of a command in a pipe: lines for the steps, and for the tenths of long steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.cli.console import progress_lines
+from tests.conftest import Ipsys
+from tests.publish.packs import SCORED, write_card, write_points_log
+
+
+def test_long_step_prints_tenths_and_short_one_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    show = progress_lines()
+    for done in range(1001):
+        show("detect", done, 1000)
+    for stage in ("fit rigid", "fit poly"):
+        for done in range(8):
+            show(stage, done, 7)
+            show(stage, done, 7)
+    show("cut", 0, 0)
+    show("fit joint", 1, None)
+    for _ in range(2):  # two logs
+        show("cut", 0, 3)
+        show("cut", 3, 3)
+    tenths = [f"detect: {done} of 1000" for done in range(100, 1001, 100)]
+    ends = ["fit rigid: 7 of 7", "fit poly: 7 of 7", "cut: 3 of 3", "cut: 3 of 3"]
+    assert capsys.readouterr().err.splitlines() == [*tenths, *ends]
+
+
+@pytest.mark.slow
+def test_pack_prints_its_models_in_a_pipe(tmp_path: Path, ipsys: Ipsys) -> None:
+    log, card = write_points_log(tmp_path / "lab.mcap"), write_card(tmp_path / "card.toml")
+    models = [word for name in SCORED for word in ("--model", name)]
+    done = ipsys("pack", log, "-o", tmp_path / "dataset", "--card", card, *models)
+    assert done.code == 0, done.err
+    lines = [line.partition(":")[0] for line in done.err.splitlines()]
+    assert lines == [f"{stage} {model}" for model in SCORED for stage in ("fit", "evaluate")]
+    scored = ipsys("score", tmp_path / "dataset")
+    assert "evaluate poly" in {line.partition(":")[0] for line in scored.err.splitlines()}, scored.err

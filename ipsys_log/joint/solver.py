@@ -26,6 +26,8 @@ _ROUGH = 0.3
 _TOLERABLE = 0.03
 # A relative change of the cost this small is no progress.
 _STALLED = 1e-9
+# In a hall, steps and motions of the whole lab that oppose each other may also alternate without end.
+_MOST_EASY_STEPS = 100
 # After the usual steps, long ones follow a curved valley.
 _MOST_LEAPS = 100
 _NOT_CONVERGED = (
@@ -91,7 +93,8 @@ def solve(
         state, cost, decrement, damping = _descend(problem, state, normal, damping, ease)
         progress(step + 1, cost)
         # A step that only reverses the last motion of the whole lab is the last one before the limit falls.
-        stalled = patient and ease > 1.0 and abs(last_cost - cost) <= _STALLED * cost
+        stalled = patient and ease > 1.0
+        stalled &= step >= _MOST_EASY_STEPS or abs(last_cost - cost) <= _STALLED * cost
         last_cost = cost
         if patient and ease > 1.0:
             state = anchor(problem, state)

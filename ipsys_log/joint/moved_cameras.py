@@ -81,9 +81,9 @@ def _motions(fit: JointFit, camera: int, times_s: Array) -> list[CameraMotion]:
             information -= own.T @ own
     motions = []
     for number, time_s in enumerate(times_s.tolist()):
-        own = slice(_POSE * number, _POSE * (number + 1))
-        gradient = extra.global_gradient[own]
-        step: Array = -np.linalg.pinv(information[own, own], rcond=1e-9, hermitian=True) @ gradient
+        part = slice(_POSE * number, _POSE * (number + 1))
+        gradient = extra.global_gradient[part]
+        step: Array = -np.linalg.pinv(information[part, part], rcond=1e-9, hermitian=True) @ gradient
         turn_rad, chi2 = float(np.linalg.norm(step[:3])), float(-step @ gradient)
         name = fit.observations.cameras[camera].name
         motions.append(CameraMotion(name, time_s, turn_rad, step[3:], chi2))

@@ -135,7 +135,7 @@ def test_short_drive_without_chessboard_converges() -> None:
     """
     cameras = ("a", "b", "c", "d")
     settings = LabSettings(seed=6, rate_hz=10.0, drive_s=10.0, markers=1, cameras=cameras)
-    lab = build_lab(GeometricSettings(settings, points=3, intrinsics="nominal", clock_offset_s=0.025))
+    lab = build_lab(GeometricSettings(lab=settings, points=3, intrinsics="nominal", clock_offset_s=0.025))
     observations = observe(lab)
     nominal = replace(
         observations, cameras=tuple(replace(camera, nominal=True) for camera in observations.cameras)

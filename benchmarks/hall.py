@@ -27,7 +27,14 @@ from results import Report, command
 from rounds import Row
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, summarize
+from ipsys_log.analysis.expected_error import mean_lengths
+from ipsys_log.analysis.floor_error import (
+    KnownSightings,
+    SightingErrors,
+    compute_errors,
+    region_shares,
+    summarize,
+)
 from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.start import PlacedCamera, place_cameras
@@ -52,7 +59,9 @@ class Figures:
 
     ``unmeasured`` cameras see no taped point. ``start_s`` and ``fit_s`` are processor times of the rough
     poses, and of the whole calibration. ``start_mm`` is the largest error of a rough origin. The other
-    errors are those over the floor; ``aligned_mm`` is the mean after the best rigid alignment.
+    errors are those over the floor; ``aligned_mm`` is the mean after the best rigid alignment. ``stated_mm``
+    is the mean expected error by the covariance, and ``nees`` the normalised squared error per degree of
+    freedom. ``worst_mm`` is the largest error of a node, ``worst_stated_mm`` the expected error there.
     """
 
     cameras: int
@@ -66,6 +75,10 @@ class Figures:
     mean_mm: float
     p95_mm: float
     aligned_mm: float
+    stated_mm: float
+    nees: float
+    worst_mm: float
+    worst_stated_mm: float
 
 
 def measure(options: argparse.Namespace) -> Report:
@@ -132,7 +145,8 @@ def calibrate_hall(grid: tuple[int, int], seed: int, drive_s: float, floor_mm: f
         fit_s = time.process_time() - placed_s
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB
         nodes = [_some(seen) for seen in nodes_of(session.lab)]
-        error = summarize(compute_errors(nodes, joint_locator(fit, session)), session.measured_m)
+        errors = compute_errors(nodes, joint_locator(fit, session))
+        error = summarize(errors, session.measured_m)
     return Figures(
         len(observations.cameras),
         sum(map(len, observations.sightings)),
@@ -145,6 +159,7 @@ def calibrate_hall(grid: tuple[int, int], seed: int, drive_s: float, floor_mm: f
         _MM * error.mean_m,
         _MM * error.p95_m,
         _MM * error.aligned_mean_m,
+        *_stated(errors),
     )
 
 
@@ -155,6 +170,15 @@ def _largest_miss_m(lab: GeometricLab, observations: Observations, placed: list[
         float(np.linalg.norm(view.origin_m - origins_m[camera.name]))
         for view, camera in zip(placed, observations.cameras, strict=True)
     )
+
+
+def _stated(errors: Sequence[SightingErrors]) -> tuple[float, float, float, float]:
+    """Return the mean expected error in mm, the NEES, and the largest error with the expected one there."""
+    apart_mm = _MM * np.concatenate([np.linalg.norm(one.errors_m, axis=1) for one in errors])
+    covariances_m2 = np.concatenate([c for one in errors if (c := one.covariances_m2) is not None])
+    shares = region_shares(np.concatenate([one.errors_m for one in errors]), covariances_m2)
+    expected_mm, worst = _MM * mean_lengths(covariances_m2), int(apart_mm.argmax())
+    return float(expected_mm.mean()), shares.nees, float(apart_mm[worst]), float(expected_mm[worst])
 
 
 def _some(seen: KnownSightings) -> KnownSightings:

@@ -41,6 +41,9 @@ Mask = NDArray[np.bool_]
 _COVERED_M = 0.35
 # Smaller gaps are not reported.
 _LEAST_GAP_M2 = 0.1
+# So many nodes at once have modes of a few dozen megabytes, in a hall of 24 cameras.
+_AT_ONCE = 1000
+_ALL = slice(None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,13 +79,22 @@ class ExpectedErrors:
     camera : its name.
     seen : (b * a,), mask of the nodes of the grid at which the image contains a whole marker.
     errors_m : (n,), expected 2D errors at the n seen nodes, by the calibration alone.
-    modes_m : (n, 2, m), the same as functions of the m normal numbers of the calibration.
+    model, view, length_m : the calibrated camera, the markers at these nodes, and their side.
     """
 
     camera: str
     seen: Mask
     errors_m: Array
-    modes_m: Array
+    model: JointModel
+    view: MarkerView
+    length_m: float
+
+    def modes_m(self, rows: slice = _ALL) -> Array:
+        """Return the errors at some nodes as functions of the m normal numbers of the calibration, (r, 2, m).
+
+        They are computed again in each call: those of all nodes of a hall take gigabytes.
+        """
+        return _modes_at(self.model, self.view, self.length_m, rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,8 +130,13 @@ def expect_errors(
     """
     expected = []
     for camera, model in models.items():
-        seen, modes_m = camera_modes(model, sizes_px[camera], grid.nodes_m, height_m, length_m)
-        expected.append(ExpectedErrors(camera, seen, mean_lengths(modes_m @ modes_m.swapaxes(1, 2)), modes_m))
+        view = see_markers(model, sizes_px[camera], grid.nodes_m, height_m, length_m)
+        errors_m = np.zeros(len(view.corners_px))
+        for first in range(0, len(errors_m), _AT_ONCE):
+            rows = slice(first, first + _AT_ONCE)
+            modes_m = _modes_at(model, view, length_m, rows)
+            errors_m[rows] = mean_lengths(modes_m @ modes_m.swapaxes(1, 2))
+        expected.append(ExpectedErrors(camera, view.seen, errors_m, model, view, length_m))
     return expected
 
 
@@ -131,15 +148,19 @@ def camera_modes(
     ``heights_m`` is a number or (p,).
     """
     view = see_markers(model, size_px, points_m, heights_m, length_m)
-    count = len(view.corners_px)
+    return view.seen, _modes_at(model, view, length_m, _ALL)
+
+
+def _modes_at(model: JointModel, view: MarkerView, length_m: float, rows: slice) -> Array:
+    """Return the modes (r, 2, m) of some of the seen markers."""
+    corners_px, heights_m = view.corners_px[rows], view.heights_m[rows]
+    count = len(corners_px)
     if not count:
-        return view.seen, np.zeros((0, 2, model.modes.shape[1]))
+        return np.zeros((0, 2, model.modes.shape[1]))
     exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
     lengths_m = np.full(count, length_m)
-    located = locate_markers(
-        model, view.corners_px, exact, view.heights_m, lengths_m, 0.0, tilt_sigma_rad=0.0
-    )
-    return view.seen, located.modes_m[:, :2]
+    located = locate_markers(model, corners_px, exact, heights_m, lengths_m, 0.0, tilt_sigma_rad=0.0)
+    return located.modes_m[:, :2]
 
 
 class MarkerView(NamedTuple):

@@ -70,7 +70,7 @@ def plan_joint_points(
     if not points:
         raise IpsysError("no camera sees a whole marker at these heights on the floor; give another height")
     updates = [None, *(point.update for point in points)]
-    maps_m = [_least(expected, update) for update in updates]
+    maps_m = _least(expected, updates)
     means_m = [float(np.nanmean(one)) for one in maps_m]
     places = tuple(
         PlannedPlace(np.append(point.point_m, point.height_m), point.cameras, before_m, after_m)
@@ -79,11 +79,16 @@ def plan_joint_points(
     return MeasurementPlan(places, maps_m[0], maps_m[-1], {one.camera: one.seen for one in expected})
 
 
-def _least(expected: Sequence[ExpectedErrors], update: Array | None) -> Array:
-    """Return the least expected error of the cameras at each node, (n,); NaN if no camera sees it."""
-    least_m = np.full(len(expected[0].seen), np.nan)
+def _least(expected: Sequence[ExpectedErrors], updates: Sequence[Array | None]) -> list[Array]:
+    """Return the least expected error of the cameras at each node, (n,), after each update of the modes.
+
+    The error is NaN if no camera sees the node.
+    """
+    maps_m = [np.full(len(expected[0].seen), np.nan) for _ in updates]
     for one in expected:
-        modes_m = one.modes_m if update is None else one.modes_m @ update
-        errors_m = mean_lengths(modes_m @ modes_m.swapaxes(1, 2))
-        least_m[one.seen] = np.fmin(least_m[one.seen], errors_m)
-    return least_m
+        modes_m = one.modes_m()
+        for least_m, update in zip(maps_m, updates, strict=True):
+            updated_m = modes_m if update is None else modes_m @ update
+            errors_m = mean_lengths(updated_m @ updated_m.swapaxes(1, 2))
+            least_m[one.seen] = np.fmin(least_m[one.seen], errors_m)
+    return maps_m

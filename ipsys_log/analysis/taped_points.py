@@ -105,8 +105,15 @@ def choose_points(
 
 def some_modes(expected: Sequence[ExpectedErrors]) -> Array:
     """Return the modes (n, 2, m) of enough camera-nodes for a mean over the floor."""
-    modes_m = np.concatenate([one.modes_m for one in expected])
-    return np.asarray(modes_m[:: max(1, len(modes_m) // _ENOUGH_NODES)])
+    counts = [len(one.errors_m) for one in expected]
+    every = max(1, sum(counts) // _ENOUGH_NODES)
+    firsts = np.cumsum([0, *counts[:-1]])
+    # Every n-th node of all cameras: the first one of a camera depends on the number of nodes before it.
+    parts = [
+        one.modes_m(slice(-first % every, None, every))
+        for one, first in zip(expected, firsts.tolist(), strict=True)
+    ]
+    return np.concatenate(parts)
 
 
 def mean_error(modes_m: Array) -> float:

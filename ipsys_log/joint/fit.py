@@ -16,10 +16,10 @@ from ipsys_log.joint.parameters import State, make_layout
 from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
 from ipsys_log.joint.problem import Problem, find_blocks
-from ipsys_log.joint.refusals import check_observations, check_spread
+from ipsys_log.joint.refusals import check_observations, check_spread, explain
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
-from ipsys_log.joint.solver import SHORT, Solution, solve
+from ipsys_log.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.joint.start import PlacedCamera, place_cameras
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
@@ -74,9 +74,17 @@ def fit_jointly(
     FitError
         The observations do not determine the cameras.
     """
-    settings = settings or JointSettings()
     check_observations(observations)
     observations = _without_unseen(observations)
+    try:
+        return _fit(observations, settings or JointSettings(), progress)
+    except ConvergenceError as error:
+        raise explain(error, observations) from error
+
+
+def _fit(
+    observations: Observations, settings: JointSettings, progress: Callable[[int, float], None]
+) -> JointFit:
     placed = place_cameras(observations)
     check_spread(observations, placed)
     problem, state = _build(observations, settings, placed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ _CANDIDATES = 12
 _LEAST_SIGHTINGS = 3
 # A camera without motion exceeds this chi2, with six degrees of freedom, once in a million sessions.
 _MOVED = 60.0
+# Unknowns of a pose: a turn and a shift.
+_POSE = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,8 +49,7 @@ def find_moved_cameras(fit: JointFit) -> list[CameraMotion]:
         times_s = _candidates(fit, camera)
         if not len(times_s):
             continue
-        steps = [_motion(fit, camera, time_s) for time_s in times_s.tolist()]
-        best = max(steps, key=lambda motion: motion.chi2)
+        best = max(_motions(fit, camera, times_s), key=lambda motion: motion.chi2)
         if best.chi2 > _MOVED:
             motions.append(best)
     return motions
@@ -68,33 +69,61 @@ def _candidates(fit: JointFit, camera: int) -> Array:
     return np.asarray((times_s[cuts - 1] + times_s[np.minimum(cuts, len(times_s) - 1)]) / 2)
 
 
-def _motion(fit: JointFit, camera: int, time_s: float) -> CameraMotion:
+def _motions(fit: JointFit, camera: int, times_s: Array) -> list[CameraMotion]:
+    """Return the motion of a camera at each of the times (k,)."""
+    extra, between = _add_motions(fit, camera, times_s)
+    factorisation = fit.solution.factorisation
+    mixed, pulled = factorisation.whiten(extra.coupling)
+    coupling = between[fit.problem.layout.free] - pulled
+    information = extra.dense - coupling.T @ factorisation.solve_reduced(coupling)
+    for own in mixed:
+        if own.shape[1]:
+            information -= own.T @ own
+    motions = []
+    for number, time_s in enumerate(times_s.tolist()):
+        part = slice(_POSE * number, _POSE * (number + 1))
+        gradient = extra.global_gradient[part]
+        step: Array = -np.linalg.pinv(information[part, part], rcond=1e-9, hermitian=True) @ gradient
+        turn_rad, chi2 = float(np.linalg.norm(step[:3])), float(-step @ gradient)
+        name = fit.observations.cameras[camera].name
+        motions.append(CameraMotion(name, time_s, turn_rad, step[3:], chi2))
+    return motions
+
+
+def _add_motions(fit: JointFit, camera: int, times_s: Array) -> tuple[NormalEquations, Array]:
+    """Return normal equations with six unknowns for each time, and their part with the global ones (g, 6 k).
+
+    Only the blocks in which the camera has sightings have columns for these unknowns. In a hall, these are
+    few, so the time for all cameras grows with the sightings and not with their square.
+    """
     problem, layout = fit.problem, fit.problem.layout
-    local, count = problem.trajectories.local_count, len(layout.mean)
-    extra = NormalEquations(local, 6, problem.trajectories.bandwidth)
-    between = np.zeros((count, 6))
+    count = _POSE * len(times_s)
+    blocks = tuple(
+        replace(block, columns=np.arange(count if seen else 0))
+        for block, seen in zip(fit.solution.factorisation.blocks, _blocks_with(fit, camera), strict=True)
+    )
+    trajectories = problem.trajectories
+    extra = NormalEquations(trajectories.local_count, count, trajectories.bandwidth, blocks)
+    between = np.zeros((len(layout.mean), count))
     for factors in problem.sightings:
         if factors.camera != camera:
             continue
-        rows = factors.weighted_rows(fit.state, layout, problem.trajectories)
-        after = factors.sightings.times_s > time_s
-        by_motion = rows.by_global[:, :, :6] * after[:, None, None]
-        extra.add_mixed(rows.starts, rows.by_local, slice(0, 6), by_motion)
-        extra.add_global(np.arange(6), by_motion, rows.residuals)
-        flat = by_motion.reshape(-1, 6)
+        rows = factors.weighted_rows(fit.state, layout, trajectories)
+        after = factors.sightings.times_s[:, None] > times_s
+        by_motion = after[:, None, :, None] * rows.by_global[:, :, None, :_POSE]
+        by_motion = by_motion.reshape(*rows.residuals.shape, count)
+        extra.add_mixed(rows.starts, rows.by_local, slice(0, count), by_motion)
+        extra.add_global(np.arange(count), by_motion, rows.residuals)
+        flat = by_motion.reshape(-1, count)
         between[factors.columns(layout)] += rows.by_global.reshape(len(flat), -1).T @ flat
         if rows.modes is not None and layout.floor.count:
             lifted = (by_motion * rows.by_height[:, :, None]).sum(axis=1)
             between[layout.modes] += rows.modes.T @ lifted
-    factorisation = fit.solution.factorisation
-    mixed = factorisation.forward(extra.mixed)
-    coupling = between[layout.free] - factorisation.pull(mixed)
-    information = extra.dense - mixed.T @ mixed - coupling.T @ factorisation.solve_reduced(coupling)
-    step: Array = -np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ extra.global_gradient
-    return CameraMotion(
-        fit.observations.cameras[camera].name,
-        time_s,
-        float(np.linalg.norm(step[:3])),
-        step[3:],
-        float(-step @ extra.global_gradient),
-    )
+    return extra, between
+
+
+def _blocks_with(fit: JointFit, camera: int) -> list[bool]:
+    """Return for each block of local unknowns whether the camera has sightings in it."""
+    layout = fit.problem.layout
+    column = int(layout.free[: layout.cameras[camera].start].sum())
+    return [bool((block.columns == column).any()) for block in fit.solution.factorisation.blocks]

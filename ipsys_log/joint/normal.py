@@ -66,6 +66,10 @@ class NormalEquations:
             mixed[block.rows, block.columns] = own
         return mixed
 
+    def expect(self, by_global: Array, by_local: Array) -> float:
+        """Return the decrease of twice the cost that the equations expect of a step."""
+        return -float(by_global @ self.global_gradient + by_local @ self.local_gradient)
+
     def add_local(self, starts: Indices, slopes: Array, residuals: Array) -> None:
         """Add factors of k consecutive local unknowns each.
 
@@ -222,6 +226,27 @@ class Factorisation:
         slopes = np.zeros((size, len(self.free)))
         slopes[:, self.free] = -self._pull_rows(own)
         return slopes, np.asarray(own.T @ own)
+
+    def whiten(self, coupling: list[Array]) -> tuple[list[Array], Array]:
+        """Divide columns (l, k) by the Cholesky factor of the local unknowns, block by block.
+
+        Parameters
+        ----------
+        coupling : the rows of each block, (b, k), or (b, 0) for a block in which all columns are zero.
+
+        Returns
+        -------
+        The whitened rows of each block, and the effect of all of them on the free global unknowns (f, k).
+        """
+        whitened = [
+            self._whiten(block, np.asfortranarray(own))
+            for block, own in zip(self.blocks, coupling, strict=True)
+        ]
+        total = np.zeros((len(self.units), max(own.shape[1] for own in coupling)))
+        for block, ours, own in zip(self.blocks, self.whitened, whitened, strict=True):
+            if own.shape[1]:
+                total[block.columns] += ours.T @ own
+        return whitened, total
 
     def pull(self, right: Array) -> Array:
         """Return the effect of whitened local values (l,) or (l, k) on the free global unknowns (f, ...)."""

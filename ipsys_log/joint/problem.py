@@ -43,6 +43,10 @@ class Problem:
         total += float((self.trajectories.acceleration_residuals(state) ** 2).sum()) / 2
         return total + float(self._prior_loss(state)[1].sum()) / 2
 
+    def permits(self, state: State) -> bool:
+        """Return whether all focal lengths are positive."""
+        return all((state.values[block.lens][:2] > 0).all() for block in self.layout.cameras)
+
     def prior_residuals(self, state: State) -> Array:
         """Return the differences from the prior, (g,), in standard deviations."""
         sigma = self.layout.sigma

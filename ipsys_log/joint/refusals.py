@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
 from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.solver import ConvergenceError
 from ipsys_log.joint.start import PlacedCamera
 
-__all__ = ["check_observations", "check_spread"]
+__all__ = ["check_observations", "check_spread", "explain"]
 
 Array = NDArray[np.float64]
 
@@ -63,6 +64,30 @@ def check_spread(observations: Observations, placed: list[PlacedCamera]) -> None
             f"camera {camera.name}: all {kind} that it saw are on one line; measure points beside the line, "
             "or drive a curve"
         )
+
+
+def explain(error: ConvergenceError, observations: Observations) -> FitError:
+    """Return the error of a fit that did not converge, with the cameras that nothing holds.
+
+    A camera whose sightings all count as outliers can move without limit.
+    """
+    problem, state = error.problem, error.state
+    counts = {camera: [0, 0] for camera in range(len(observations.cameras))}
+    for factors in problem.sightings:
+        chi2 = (factors.residuals(state, problem.layout, problem.trajectories) ** 2).sum(axis=1)
+        counts[factors.camera][0] += len(chi2)
+        counts[factors.camera][1] += int((chi2 <= factors.limit).sum())
+    lost = [
+        f"{observations.cameras[camera].name} ({seen} sightings)"
+        for camera, (seen, fitting) in counts.items()
+        if not fitting
+    ]
+    if not lost:
+        return error
+    return FitError(
+        f"the joint fit did not converge: no sighting of camera {', '.join(lost)} fits to the other "
+        "cameras; drive a robot through its field of view, or leave the camera out"
+    )
 
 
 def _beside_line_m(places_m: Array) -> float:

@@ -9,11 +9,12 @@ import numpy as np
 
 from ipsys_log.errors import FitError
 from ipsys_log.joint.anchoring import anchor
+from ipsys_log.joint.curved_valley import leap_along_valley
 from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 
-__all__ = ["SHORT", "Solution", "solve"]
+__all__ = ["SHORT", "ConvergenceError", "Solution", "solve"]
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
@@ -23,6 +24,24 @@ SHORT = 1e-3
 # Before the loss is strict, a step need not be so exact.
 _ROUGH = 0.3
 _TOLERABLE = 0.03
+# A relative change of the cost this small is no progress.
+_STALLED = 1e-9
+# In a hall, steps and motions of the whole lab that oppose each other may also alternate without end.
+_MOST_EASY_STEPS = 100
+# After the usual steps, long ones follow a curved valley.
+_MOST_LEAPS = 100
+_NOT_CONVERGED = (
+    f"the joint fit did not converge in {_MOST_STEPS} steps; look at the residuals of the sightings, and "
+    "remove wrong measurements"
+)
+
+
+class ConvergenceError(FitError):
+    """The method does not converge; ``problem`` and ``state`` are the last ones."""
+
+    def __init__(self, text: str, problem: Problem, state: State) -> None:
+        super().__init__(text)
+        self.problem, self.state = problem, state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,18 +87,21 @@ def solve(
     Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000.
     """
     state = anchor(problem, state) if patient else state
-    ease, damping = problem.ease(state), _FIRST_DAMPING
+    ease, damping, last_cost = problem.ease(state), _FIRST_DAMPING, np.inf
     normal = problem.linearise(state, ease)
     for step in range(_MOST_STEPS):
         state, cost, decrement, damping = _descend(problem, state, normal, damping, ease)
         progress(step + 1, cost)
+        # A step that only reverses the last motion of the whole lab is the last one before the limit falls.
+        stalled = patient and ease > 1.0
+        stalled &= step >= _MOST_EASY_STEPS or abs(last_cost - cost) <= _STALLED * cost
+        last_cost = cost
         if patient and ease > 1.0:
             state = anchor(problem, state)
         long = short if ease == 1.0 else _ROUGH
-        settled = decrement <= long**2
+        settled = stalled or decrement <= long**2
         if settled and ease == 1.0:
-            normal = problem.linearise(state, ease)
-            return Solution(state, cost, normal, _factorise(problem, normal), step + 1)
+            return _finish(problem, state, cost, step + 1)
         if ease > 1.0 and (settled or (step % 3 == 2 and not patient)):
             ease = min(ease, problem.ease(state))
             # The last stage is strict, even if more than half of the sightings have errors above the noise.
@@ -88,11 +110,35 @@ def solve(
         normal = problem.linearise(state, ease)
     if ease == 1.0 and decrement <= _TOLERABLE**2:
         # Outliers at the limit of the loss slow the last steps, without an effect on the result.
-        return Solution(state, cost, normal, _factorise(problem, normal), _MOST_STEPS)
-    raise FitError(
-        f"the joint fit did not converge in {_MOST_STEPS} steps; look at the residuals of the sightings, and "
-        "remove wrong measurements"
-    )
+        return _finish(problem, state, cost, _MOST_STEPS)
+    if ease == 1.0:
+        return _follow_valley(problem, state, normal, progress, short)
+    raise ConvergenceError(_NOT_CONVERGED, problem, state)
+
+
+def _follow_valley(
+    problem: Problem,
+    state: State,
+    normal: NormalEquations,
+    progress: Callable[[int, float], None],
+    short: float,
+) -> Solution:
+    """Continue with long steps along a curved valley of the cost, where the usual steps are too short."""
+    for step in range(_MOST_STEPS, _MOST_STEPS + _MOST_LEAPS):
+        leap = leap_along_valley(problem, state, normal)
+        if leap is None:
+            break
+        state, cost, decrement = leap
+        progress(step + 1, cost)
+        if decrement <= short**2:
+            return _finish(problem, state, cost, step + 1)
+        normal = problem.linearise(state, 1.0)
+    raise ConvergenceError(_NOT_CONVERGED, problem, state)
+
+
+def _finish(problem: Problem, state: State, cost: float, steps: int) -> Solution:
+    normal = problem.linearise(state, 1.0)
+    return Solution(state, cost, normal, _factorise(problem, normal), steps)
 
 
 def _descend(
@@ -105,10 +151,10 @@ def _descend(
         except np.linalg.LinAlgError:
             damping = _more(damping)
             continue
-        expected = -float(by_global @ normal.global_gradient + by_local @ normal.local_gradient)
+        expected = normal.expect(by_global, by_local)
         trial = state.moved(problem.layout, by_global, by_local)
         with np.errstate(all="ignore"):
-            cost = problem.cost(trial, ease) if _possible(problem, trial) else np.inf
+            cost = problem.cost(trial, ease) if problem.permits(trial) else np.inf
         if np.isfinite(cost) and cost <= normal.cost:
             # A short step by strong damping is no sign of a minimum.
             decrement = expected if damping <= _FIRST_DAMPING else np.inf
@@ -119,10 +165,6 @@ def _descend(
             # Rounding errors hide the decrease: this is the minimum.
             return state, normal.cost, 0.0, damping
         damping = _more(damping)
-
-
-def _possible(problem: Problem, state: State) -> bool:
-    return all((state.values[block.lens][:2] > 0).all() for block in problem.layout.cameras)
 
 
 def _more(damping: float) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ipsys_log.analysis.drive_plan import choose_drive
-from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors, see_markers
+from ipsys_log.analysis.expected_error import (
+    ExpectedErrors,
+    FloorGrid,
+    MarkerView,
+    expect_errors,
+    see_markers,
+)
 from ipsys_log.analysis.joint_plan import plan_joint_points
 from ipsys_log.analysis.taped_points import choose_points, mean_error, posterior_root, some_modes
 from ipsys_log.errors import IpsysError
@@ -44,6 +52,16 @@ def expected(models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]]
 
 def tape_m2(points_m: Array) -> Array:
     return np.broadcast_to(0.003**2 * np.eye(2), (len(points_m), 2, 2))
+
+
+def test_some_modes_are_those_of_every_nth_node(expected: list[ExpectedErrors]) -> None:
+    """The nodes of all cameras are counted together."""
+    few = [replace(one, view=MarkerView(one.view.seen, *(a[:301] for a in one.view[1:]))) for one in expected]
+    few = [replace(one, errors_m=one.errors_m[:301]) for one in few] * 5
+    every = sum(len(one.errors_m) for one in few) // 800
+    assert every > 1
+    modes_m = np.concatenate([one.modes_m() for one in few])[::every]
+    assert np.allclose(some_modes(few), modes_m, rtol=1e-9, atol=1e-15)
 
 
 @settings(max_examples=30, deadline=None)

@@ -125,3 +125,27 @@ def test_fit_twice_is_identical() -> None:
     first, second = (fit_jointly(observations, COARSE) for _ in range(2))
     assert first.state.values.tobytes() == second.state.values.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+@pytest.mark.slow
+def test_short_drive_without_chessboard_converges() -> None:
+    """Four cameras, nominal intrinsics, three points and 10 s; the last camera saw one marker alone.
+
+    Focal lengths, distortions and heights then have a curved valley, in which straight steps are too short.
+    """
+    cameras = ("a", "b", "c", "d")
+    settings = LabSettings(seed=6, rate_hz=10.0, drive_s=10.0, markers=1, cameras=cameras)
+    lab = build_lab(GeometricSettings(lab=settings, points=3, intrinsics="nominal", clock_offset_s=0.025))
+    observations = observe(lab)
+    nominal = replace(
+        observations, cameras=tuple(replace(camera, nominal=True) for camera in observations.cameras)
+    )
+    steps: list[int] = []
+    fit = fit_jointly(nominal, progress=lambda step, cost: steps.append(step))
+    assert max(steps) > 200
+    # The last camera is uncertain; the others are near their places.
+    for number, camera in enumerate(lab.cameras[:3]):
+        start = fit.problem.layout.cameras[number].start + 3
+        error_m = fit.state.values[start : start + 3] - camera.origin_m
+        covariance_m2 = fit.covariance[start : start + 3, start : start + 3]
+        assert error_m @ np.linalg.solve(covariance_m2, error_m) < 25.0

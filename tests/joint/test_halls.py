@@ -15,12 +15,13 @@ from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import build_models
+from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 from ipsys_log.joint.settings import JointSettings
-from ipsys_log.joint.solver import solve
+from ipsys_log.joint.solver import Solution, solve
 from ipsys_log.joint.start import place_cameras
 from ipsys_log.messages import Markers, Measurement, Rig
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
@@ -185,6 +186,38 @@ def test_fit_of_a_turned_hall_returns_to_its_points(
     turned = carry(problem, near.state, 0.05, np.array([0.3, 0.2, 0.0]))
     far = solve(problem, turned, short=0.3, patient=True)
     assert far.cost == pytest.approx(near.cost, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_fit_with_an_unusual_reading_leaves_the_easy_stage(
+    started: tuple[GeometricLab, Observations, Problem, State], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The motion of the whole hall gives an unusual reading less weight than the steps: they undo it."""
+    _, observations, _, _ = started
+    point = observations.points[0]
+    longer = replace(point, distances_m=point.distances_m + np.array([0.02, 0.0]))
+    changed = replace(observations, points=(longer, *observations.points[1:]))
+    problem, state = joint_fit._build(changed, JointSettings(), place_cameras(changed))
+    monkeypatch.setattr("ipsys_log.joint.solver._MOST_EASY_STEPS", 10)
+    assert solve(problem, state, short=0.3, patient=True).steps > 10
+
+
+def test_blocks_give_the_same_motions_of_cameras(
+    started: tuple[GeometricLab, Observations, Problem, State],
+) -> None:
+    _, observations, problem, state = started
+    motions = []
+    for one in (problem, problem_without_blocks(problem)):
+        normal = one.linearise(state, 1.0)
+        factors = Factorisation(normal, one.layout.free)
+        solution = Solution(state, normal.cost, normal, factors, 1)
+        fit = JointFit(observations, JointSettings(), one, solution, np.zeros((0, 0)))
+        motions.append(find_moved_cameras(fit))
+    ours, dense = motions
+    assert len(dense) > 5
+    assert [one.camera for one in ours] == [one.camera for one in dense]
+    assert [one.time_s for one in ours] == [one.time_s for one in dense]
+    assert [one.chi2 for one in ours] == pytest.approx([one.chi2 for one in dense], rel=1e-6)
 
 
 def floor_errors_m(lab: GeometricLab, fit: JointFit) -> Array:

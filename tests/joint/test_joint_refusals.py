@@ -10,6 +10,8 @@ import pytest
 from ipsys_log.errors import FitError
 from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.observations import Observations, marker_body
+from ipsys_log.joint.refusals import explain
+from ipsys_log.joint.solver import ConvergenceError
 from tests.joint.small_lab import make_lab
 
 
@@ -74,3 +76,16 @@ def test_camera_without_sightings_is_refused() -> None:
     empty = second.select(np.zeros(len(second), dtype=bool))
     with pytest.raises(FitError, match="camera c1: it saw no marker"):
         fit_jointly(replace(observations, sightings=(first, empty)))
+
+
+def test_camera_that_nothing_holds_is_named() -> None:
+    """All sightings of the camera count as outliers, so the fit can move it without limit."""
+    observations, _ = make_lab(1, points=8)
+    fit = fit_jointly(observations)
+    values = fit.state.values.copy()
+    values[fit.problem.layout.cameras[1].start + 3] += 1000.0
+    error = ConvergenceError("no convergence", fit.problem, replace(fit.state, values=values))
+    count = len(observations.sightings[1])
+    assert f"no sighting of camera c1 ({count} sightings) fits" in str(explain(error, observations))
+    held = ConvergenceError("no convergence", fit.problem, fit.state)
+    assert str(explain(held, observations)) == "no convergence"

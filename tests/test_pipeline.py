@@ -31,6 +31,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.pipeline import replay
 from ipsys_log.rig.file import load_rig
+from ipsys_log.runs.execute import run_stage
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.stream import in_threads, run
@@ -382,7 +383,6 @@ def test_log_that_is_replaced_between_stages_gets_nothing(
     """The next stage would find no input in the new file, and append an empty run to it."""
     paper = ROOT / "sample_logs" / "paper_lab.mcap"
     log = Path(shutil.copy(paper, tmp_path / "paper.mcap"))
-    run_stage = pipeline.run_stage
 
     def run_and_replace(*arguments: Any) -> Any:
         outcome = run_stage(*arguments)

@@ -354,7 +354,7 @@ def test_link_without_a_file_fails_alone(
     Path("logs/text.mcap").write_text("no log")
 
     def perform_here(task: BatchTask, paths: list[Path], _: WorkerSettings) -> list[LogResult]:
-        return [perform(task, path) for path in paths]  # type: ignore[misc]
+        return [perform(task, path) for path in paths]
 
     monkeypatch.setattr(batch_command, "_collect", perform_here)
     done = ipsys("batch", command[0], "logs", *command[1:], "--json")

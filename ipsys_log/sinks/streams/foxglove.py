@@ -171,7 +171,7 @@ class FoxgloveStream:
             sock=self._listening,
             backlog=_BACKLOG,
             process_request=self._check,
-            create_connection=self._connect,
+            create_connection=self._connect,  # type: ignore[arg-type] # any factory, as its text says
             subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
             max_size=_LARGEST_MESSAGE,
             compression=None,

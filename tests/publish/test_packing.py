@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import shutil
 import subprocess
 import zipfile
@@ -336,5 +337,7 @@ def test_fault_of_an_own_model_is_named(
     monkeypatch.chdir(tmp_path)
     done = ipsys("score", packed / "dataset", "--model", name)
     assert done.code == 1
-    assert text in done.err
-    assert len(done.err.splitlines()) == 1
+    *steps, fault = done.err.splitlines()
+    assert fault.startswith("ipsys: ")
+    assert text in fault
+    assert all(re.fullmatch(r"[a-z-]+( \w+)?: (\d+) of \2", step) for step in steps), steps

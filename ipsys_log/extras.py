@@ -26,6 +26,7 @@ LIBRARIES = {
     "jinja2": Library("Jinja2", ("report",)),
     "starlette": Library("Starlette", ("web",)),
     "uvicorn": Library("Uvicorn", ("web",)),
+    "h11": Library("h11", ("web",)),
     "pymavlink": Library("pymavlink", ("mavlink",)),
     "zenoh": Library("Zenoh", ("nodes", "ros2")),
     "rosbags": Library("rosbags", ("ros2",)),

@@ -50,7 +50,7 @@ for command in commands:
     results.append([code, out.getvalue(), err.getvalue()])
 print(json.dumps(results))
 """
-HIDDEN = [*LIBRARIES, "PIL", "fastcrc", "lxml", "anyio", "h11", "markupsafe", "pyarrow"]
+HIDDEN = [*LIBRARIES, "PIL", "fastcrc", "lxml", "anyio", "markupsafe", "pyarrow"]
 
 RIG = """name = "lab"
 dictionary = "DICT_4X4_100"

@@ -90,12 +90,12 @@ def describe_cameras(
     """
     names = [] if fit is None else [camera.name for camera in fit.observations.cameras]
     cameras = []
-    for payload in model.cameras:
-        name, size_px = payload.camera, sizes_px.get(payload.camera)
+    for name, joint in restore_joint(model).items():
+        size_px = sizes_px.get(name)
         residuals = None
         if fit is not None and size_px is not None and name in names:
             residuals = _residuals(fit, names.index(name), size_px)
-        cameras.append(_describe(name, restore_joint(payload), size_px, residuals))
+        cameras.append(_describe(name, joint, size_px, residuals))
     return tuple(cameras)
 
 

@@ -157,8 +157,7 @@ def _whitened_slopes(
     by_height = now.by_pose[:, :, 2:3]
     by_pose = now.by_pose[:, :, _FLAT]
     by_pose[:, :, :2] += by_height * floor_slopes[:, None]
-    flat = model.modes.shape[0] - floor_modes.shape[1]
-    by_modes = now.by_camera @ model.modes[:flat] + by_height * (floor_modes @ model.modes[flat:])[:, None]
+    by_modes = model.error_modes(now.by_camera, by_height, floor_modes)
     tilts = now.by_pose[:, :, 3:5] * settings.wobble_sigma_rad
     noise_px2 = _CORNER_SIGMA_PX**2 * np.eye(8)
     whitening = np.linalg.inv(np.linalg.cholesky(noise_px2 + tilts @ tilts.swapaxes(1, 2)))

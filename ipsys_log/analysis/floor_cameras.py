@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from ipsys_log.geometry.poses import rotation
 from ipsys_log.messages import CameraCalibration, CameraModel, Floor, Model
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import reads_corners
+
+if TYPE_CHECKING:
+    from ipsys_log.joint.model import JointModel
 
 __all__ = [
     "FloorCamera",
@@ -65,25 +69,32 @@ def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) ->
     IpsysError
         The model of a camera is not complete, or its intrinsics are not valid.
     """
-    cameras = {}
+    cameras, joints = {}, _joint_models(model)
     for camera in model.cameras:
         if camera.camera not in lenses:
             continue
         lens = check_calibration(lenses[camera.camera], f"calibration of {camera.camera}")
-        own = (_joint_camera if reads_corners(model.name) else _rigid_camera)(camera, lens)
+        joint = joints.get(camera.camera)
+        own = _rigid_camera(camera, lens) if joint is None else _joint_camera(camera.camera, joint, lens)
         if own is not None and np.isfinite(own.camera_from_world).all() and np.isfinite(own.origin_m).all():
             cameras[own.name] = own
     return cameras
 
 
-def _joint_camera(camera: CameraModel, lens: CameraCalibration) -> FloorCamera:
+def _joint_models(model: Model) -> Mapping[str, JointModel]:
+    """Return the joint models of a model by camera; none if it is another model."""
+    if not reads_corners(model.name):
+        return {}
     # Late: scipy takes 1 s, and most commands need no joint model.
     from ipsys_log.joint.payload import restore_joint
 
-    joint = restore_joint(camera)
+    return restore_joint(model)
+
+
+def _joint_camera(name: str, joint: JointModel, lens: CameraCalibration) -> FloorCamera:
     own = joint.calibration
     lens = replace(lens, distortion_model=own.distortion_model, K=own.K, D=own.D)
-    return FloorCamera(camera.camera, lens, joint.camera_from_world, joint.origin_m)
+    return FloorCamera(name, lens, joint.camera_from_world, joint.origin_m)
 
 
 def _rigid_camera(camera: CameraModel, lens: CameraCalibration) -> FloorCamera | None:

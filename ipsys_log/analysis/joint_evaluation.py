@@ -60,7 +60,7 @@ def evaluate_joint(
     progress : called with the number of steps done, and the number of all steps.
     """
     study = replace(study, pairs=_located(observations, study.pairs))
-    cameras: Mapping[str, JointModel] = {camera.camera: restore_joint(camera) for camera in model.cameras}
+    cameras: Mapping[str, JointModel] = restore_joint(model)
     used = {pair.measurement for camera in model.cameras for pair in camera.pairs}
     if study.seed is None:
         rows = _held_out_rows(model, cameras, observations, study, used)

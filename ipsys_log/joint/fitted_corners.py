@@ -45,7 +45,7 @@ class FittedCornerModel:
     def __init__(self, model: Model) -> None:
         self.name = model.name
         self.cameras = tuple(camera.camera for camera in model.cameras)
-        self._cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
+        self._cameras = restore_joint(model)
 
     def __repr__(self) -> str:
         return f"<FittedCornerModel {self.name} of {', '.join(self.cameras)}>"

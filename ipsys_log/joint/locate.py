@@ -97,9 +97,7 @@ def locate_markers(
     gains = lift @ gains[:, :2]
     by_height = -(gains @ by_height)
     by_height[:, 2] += 1.0
-    flat = model.modes.shape[0] - floor_modes.shape[1]
-    modes_m = -(gains @ now.by_camera) @ model.modes[:flat]
-    modes_m += by_height * (floor_modes @ model.modes[flat:])[:, None]
+    modes_m = model.error_modes(-(gains @ now.by_camera), by_height, floor_modes)
     noise_m2 = lift @ spread[:, :2, :2] @ lift.swapaxes(1, 2)
     covariances = noise_m2 + modes_m @ modes_m.swapaxes(1, 2)
     by_height = by_height * np.reshape(height_sigmas_m, (-1, 1, 1))

@@ -73,8 +73,7 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
         change = (gains @ now.residuals[:, :, None])[:, :, 0]
         points_m, turns = points_m - change[:, :3], rotate(-change[:, 3:]) @ turns
     left = now.residuals[:, :, None] - now.by_pose @ change[:, :, None]
-    count = now.by_camera.shape[2]
-    modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes[:count]
+    modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes
     noise_m2 = np.asarray(spread[:, :3, :3], dtype=np.float64)
     heading_noise_rad: Array = np.sqrt(spread[:, 5, 5])
     return Poses(

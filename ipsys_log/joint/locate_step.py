@@ -61,7 +61,7 @@ class LocateCorners:
 
     def __init__(self, model: Model) -> None:
         self._name = model.name
-        self._cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
+        self._cameras = restore_joint(model)
         self._rig: Rig | None = None
 
     def __call__(self, message: Message) -> Iterator[Any]:

@@ -45,16 +45,14 @@ def mend_poses(model: Model, changes: Mapping[str, PoseChange], time_ns: int) ->
         The model is not complete.
     """
     moved = [camera.camera for camera in model.cameras if camera.camera in changes]
-    cameras = []
-    for camera in model.cameras:
-        joint = restore_joint(camera)
+    joints = restore_joint(model)
+    for name, joint in joints.items():
         more = np.zeros((len(joint.modes), _POSE * len(moved)))
-        if camera.camera in changes:
-            motion, covariance = changes[camera.camera]
-            first = _POSE * moved.index(camera.camera)
+        if name in changes:
+            motion, covariance = changes[name]
+            first = _POSE * moved.index(name)
             more[:_POSE, first : first + _POSE] = np.linalg.cholesky(covariance)
             turned = rotation(motion[:3]) @ joint.camera_from_world
-            joint = replace(joint, camera_from_world=turned, origin_m=joint.origin_m + motion[3:])
-        joint = replace(joint, modes=np.hstack([joint.modes, more]))
-        cameras.append(replace(camera, parameters=store_joint(joint)))
-    return replace(model, timestamp=time_ns, cameras=tuple(cameras))
+            joints[name] = replace(joint, camera_from_world=turned, origin_m=joint.origin_m + motion[3:])
+        joints[name] = replace(joints[name], modes=np.hstack([joint.modes, more]))
+    return replace(store_joint(model, joints), timestamp=time_ns)

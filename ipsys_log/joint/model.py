@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 _LEAST_SHARE = 1e-10
 # Clock offsets and row times of fewer standard deviations than this may be 0.
 _SIGNIFICANT = 3.0
+# The unknowns of a camera beside its intrinsics: turn, origin, edge offset, clock, row time and scale.
+_BESIDE_LENS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,8 +43,9 @@ class JointModel:
         time between rows. Both times are 0 if the estimate does not differ significantly from 0.
     scale : factor on the nominal size of a marker: the mean of all bodies.
     floor : the field of the floor, and ``amplitudes`` (f,) of its modes.
-    modes : (6 + q + 3 + 1 + f, m), by turn (3), origin (3), lens (q), edge offset, clock, row time, scale,
-        amplitudes of the floor.
+    modes : (6 + q + 3 + 1, m), by turn (3), origin (3), lens (q), edge offset, clock, row time, scale.
+    floor_modes : (f, k), by the amplitudes of the floor, with k <= m. They do not depend on the other m - k
+        numbers.
     corner_floor_px : repeatable part of the error of a corner.
     """
 
@@ -57,6 +60,7 @@ class JointModel:
     floor: FloorField
     amplitudes: Array
     modes: Array
+    floor_modes: Array
     corner_floor_px: float
 
     @property
@@ -65,6 +69,23 @@ class JointModel:
         fx, fy, cx, cy = self.lens[:4].tolist()
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return CameraCalibration(0, "", 0, 0, self.lens_model.distortion_model, self.lens[4:], K)
+
+    def without_modes(self) -> JointModel:
+        """Return the model without its covariance: positions do not depend on it, and take less time."""
+        return replace(self, modes=self.modes[:, :0], floor_modes=self.floor_modes[:, :0])
+
+    def error_modes(self, by_camera: Array, by_height: Array, floor_at: Array) -> Array:
+        """Return the errors (n, r, m) of n results with r components by the modes.
+
+        Parameters
+        ----------
+        by_camera : (n, r, 6 + q + 3 + 1), derivatives by the unknowns of the camera.
+        by_height : (n, r, 1), derivatives by the height of the floor.
+        floor_at : (n, f), this height by the amplitudes of the floor.
+        """
+        errors: Array = by_camera @ self.modes
+        errors[:, :, : self.floor_modes.shape[1]] += by_height * (floor_at @ self.floor_modes)[:, None]
+        return errors
 
     def to_arrays(self) -> dict[str, Array]:
         """Return the model as named arrays of floats."""
@@ -79,6 +100,7 @@ class JointModel:
             "floor_along_y": self.floor.along_y,
             "floor_pairs": self.floor.pairs.astype(np.float64),
             "floor_amplitudes": self.amplitudes,
+            "floor_modes": self.floor_modes,
             "modes": self.modes,
         }
 
@@ -94,6 +116,11 @@ class JointModel:
             arrays["floor_pairs"].astype(np.intp).reshape(-1, 2),
         )
         edge_px, clock_s, row_s, scale = arrays["offsets"].tolist()
+        # Logs of older versions have the rows of the floor after those of the camera.
+        own, floor_modes = np.split(arrays["modes"], [len(arrays["lens"]) + _BESIDE_LENS])
+        floor_modes = arrays.get("floor_modes", floor_modes)
+        if len(own) != len(arrays["lens"]) + _BESIDE_LENS or len(floor_modes) != floor.count:
+            raise ValueError(f"modes have {len(own)} and {len(floor_modes)} rows")
         return cls(
             lens_model_of(lens),
             arrays["camera_from_world"],
@@ -105,7 +132,8 @@ class JointModel:
             scale,
             floor,
             arrays["floor_amplitudes"],
-            arrays["modes"],
+            own,
+            floor_modes,
             float(arrays["corner_floor_px"][0]),
         )
 
@@ -113,12 +141,14 @@ class JointModel:
 def build_models(fit: JointFit) -> dict[str, JointModel]:
     """Return the model of each camera, by its name."""
     layout, state = fit.problem.layout, fit.state
-    modes = covariance_modes(fit.covariance)
+    modes = _floor_first(covariance_modes(fit.covariance), layout.modes)
+    # A copy: a view would keep the zeros beside it.
+    floor_modes = modes[layout.modes, : layout.floor.count].copy()
     models = {}
     for number, (camera, block) in enumerate(zip(fit.observations.cameras, layout.cameras, strict=True)):
         edge_px = float(state.values[block.edge])
         clock_s, row_s = (_significant(fit, column) for column in range(block.edge + 1, block.stop))
-        own = [modes[block.start : block.stop], modes[layout.scales].mean(axis=0)[None], modes[layout.modes]]
+        own = [modes[block.start : block.stop], modes[layout.scales].mean(axis=0)[None]]
         models[camera.name] = JointModel(
             block.model,
             state.camera_turns[number],
@@ -131,6 +161,7 @@ def build_models(fit: JointFit) -> dict[str, JointModel]:
             layout.floor,
             state.values[layout.modes],
             np.concatenate(own),
+            floor_modes,
             fit.settings.corner_floor_px,
         )
     return models
@@ -140,6 +171,18 @@ def _significant(fit: JointFit, column: int) -> float:
     """Return a global unknown, or 0 if it may be 0: synchronised cameras then have common instants."""
     value, sigma = float(fit.state.values[column]), float(np.sqrt(fit.covariance[column, column]))
     return value if abs(value) > _SIGNIFICANT * sigma else 0.0
+
+
+def _floor_first(modes: Array, floor: slice) -> Array:
+    """Return modes (g, m) of the same covariance, whose first numbers are those of the floor.
+
+    An orthogonal map of the numbers keeps every product of modes. The f rows ``floor`` become a lower
+    triangle in the first f columns, so that the floor of a hall is no larger than its own covariance.
+    """
+    axes, triangle = np.linalg.qr(modes[floor].T, mode="complete")
+    turned: Array = modes @ axes
+    turned[floor] = triangle.T
+    return turned
 
 
 def covariance_modes(covariance: Array) -> Array:

@@ -1,10 +1,12 @@
-"""The joint model as the payload of a log: named arrays for each camera."""
+"""The joint model as the payload of a log: named arrays of each camera, and of the floor."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import DISTORTION_MODELS
@@ -17,34 +19,66 @@ __all__ = ["JOINT", "joint_payload", "restore_joint", "store_joint"]
 # The name of the model in commands and logs.
 JOINT = "joint"
 
+Array = NDArray[np.float64]
+
+# The floor belongs to all cameras. Its modes are most of the model of a hall.
+_FLOOR = (
+    "floor_amplitudes",
+    "floor_along_x",
+    "floor_along_y",
+    "floor_grid_m",
+    "floor_modes",
+    "floor_pairs",
+)
 _LENSES = {count: name for name, count in DISTORTION_MODELS.items()}
 
 
 def joint_payload(fit: JointFit, pairs: Mapping[str, Sequence[Pair]], time_ns: int) -> Model:
     """Return the payload of a joint calibration, with the calibration points that each camera saw."""
-    cameras = [
-        CameraModel(camera, store_joint(model), pairs=tuple(pairs.get(camera, ())))
-        for camera, model in build_models(fit).items()
-    ]
-    return Model(time_ns, JOINT, tuple(cameras))
+    models = build_models(fit)
+    cameras = tuple(CameraModel(camera, (), pairs=tuple(pairs.get(camera, ()))) for camera in models)
+    return store_joint(Model(time_ns, JOINT, cameras), models)
 
 
-def store_joint(model: JointModel) -> tuple[Parameter, ...]:
-    """Return the parameters of the payload of a camera's model, sorted by name."""
-    arrays = sorted(model.to_arrays().items())
-    return tuple(Parameter(name, array.shape, array.reshape(-1)) for name, array in arrays)
+def store_joint(payload: Model, models: Mapping[str, JointModel]) -> Model:
+    """Return a payload with the parameters of its cameras' models, sorted by name.
+
+    Parameters of the floor that all cameras have in common are stored once.
+    """
+    arrays = [models[camera.camera].to_arrays() for camera in payload.cameras]
+    shared = {
+        name: arrays[0][name]
+        for name in (_FLOOR if arrays else ())
+        if all(np.array_equal(own[name], arrays[0][name]) for own in arrays)
+    }
+    cameras = tuple(
+        replace(camera, parameters=_parameters({name: own[name] for name in own.keys() - shared.keys()}))
+        for camera, own in zip(payload.cameras, arrays, strict=True)
+    )
+    return replace(payload, cameras=cameras, shared=_parameters(shared))
 
 
-def restore_joint(camera: CameraModel) -> JointModel:
-    """Return the joint model of a camera from its payload.
+def _parameters(arrays: Mapping[str, Array]) -> tuple[Parameter, ...]:
+    return tuple(Parameter(name, array.shape, array.reshape(-1)) for name, array in sorted(arrays.items()))
+
+
+def restore_joint(payload: Model) -> dict[str, JointModel]:
+    """Return the joint model of each camera from a payload, by the name of the camera.
 
     Raises
     ------
     IpsysError
         A parameter is missing, or has the wrong shape.
     """
+    return {camera.camera: _restore(camera, payload.shared) for camera in payload.cameras}
+
+
+def _restore(camera: CameraModel, shared: Sequence[Parameter]) -> JointModel:
     try:
-        arrays = {p.name: np.asarray(p.values, dtype=np.float64).reshape(p.shape) for p in camera.parameters}
+        arrays = {
+            p.name: np.asarray(p.values, dtype=np.float64).reshape(p.shape)
+            for p in (*shared, *camera.parameters)
+        }
         # The number of coefficients names the lens model.
         name = _LENSES[len(arrays["lens"]) - 4]
         return JointModel.from_arrays(

@@ -71,9 +71,12 @@ class CameraModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
+    """A fitted model. The parameters ``shared`` belong to each camera that has none of the same name."""
+
     timestamp: TimeNs
     name: str
     cameras: tuple[CameraModel, ...]
+    shared: tuple[Parameter, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

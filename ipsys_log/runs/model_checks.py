@@ -12,7 +12,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraModel
+from ipsys_log.messages import Model
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
@@ -161,8 +161,8 @@ def check_models(
     with Session([request.model_from]) as other:
         for name in models:
             model, _ = fitted_in(other, name)
-            for camera in model.cameras if {EVALUATION, POSITIONS} & {*written} else ():
-                _restore(model.name, camera)
+            if {EVALUATION, POSITIONS} & {*written}:
+                _restore(model)
             fitted = {camera.camera for camera in model.cameras}
             if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(
@@ -172,12 +172,12 @@ def check_models(
                 )
 
 
-def _restore(name: str, camera: CameraModel) -> object:
-    if not reads_corners(name):
-        return AppliedModel(name, camera)
+def _restore(model: Model) -> object:
+    if not reads_corners(model.name):
+        return [AppliedModel(model.name, camera) for camera in model.cameras]
     from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
 
-    return restore_joint(camera)
+    return restore_joint(model)
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:

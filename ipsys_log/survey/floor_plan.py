@@ -151,7 +151,7 @@ def _plan_corner_model(
     from ipsys_log.analysis.joint_plan import expect_on_floor, plan_joint_points
     from ipsys_log.joint.payload import restore_joint
 
-    models = {camera.camera: restore_joint(camera) for camera in model.cameras if camera.camera in lenses}
+    models = {camera: joint for camera, joint in restore_joint(model).items() if camera in lenses}
     if not models:
         raise IpsysError(f"run {run}: no camera of its model has a calibration; give one with --calibration")
     sizes_px = {name: (lenses[name].width, lenses[name].height) for name in models}

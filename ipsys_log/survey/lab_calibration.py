@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -273,11 +273,12 @@ def _places(fit: JointFit, models: Mapping[str, JointModel]) -> list[Array]:
             for body, point in zip(sightings.body.tolist(), sightings.point.tolist(), strict=True)
         ]
         lengths_m = np.array([bodies[body].length_m for body in sightings.body.tolist()])
-        model = models[camera.name]
-        # Positions do not depend on the modes, which take most of the time.
-        model = replace(model, modes=model.modes[:, :0])
         located = locate_markers(
-            model, sightings.pixels, sightings.covariances_px2, np.array(heights_m), lengths_m
+            models[camera.name].without_modes(),
+            sightings.pixels,
+            sightings.covariances_px2,
+            np.array(heights_m),
+            lengths_m,
         )
         places_m = located.points_m[:, :2]
         places.append(places_m[np.isfinite(places_m).all(axis=1)])

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraModel, Model, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.tracking.bias_modes import BiasModes, Grid, NodeModes, reduce_modes
+
+if TYPE_CHECKING:
+    from ipsys_log.joint.model import JointModel
 
 __all__ = ["MODES", "calibration_modes"]
 
@@ -40,7 +46,8 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     -------
     BiasModes : without modes if the model has no covariance.
     """
-    grid = _grid(model)
+    joints = _joint_models(model)
+    grid = _grid(model, joints)
     if grid is None:
         return BiasModes.none()
     heights_m = [rig.height_of(marker.id) for marker in rig.markers] if rig else []
@@ -52,7 +59,7 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     in_view = len(grid.points_m) * len(model.cameras) > _MOST_NODES
     if reads_corners(model.name):
         nodes = {
-            camera.camera: _joint_nodes(camera, grid, height_m, sigma_m, in_view) for camera in model.cameras
+            name: _joint_nodes(joint, grid, height_m, sigma_m, in_view) for name, joint in joints.items()
         }
     else:
         separate = {
@@ -70,11 +77,20 @@ def _height_sigma(rig: Rig | None) -> float | None:
     return float(np.median(known_m)) if known_m else None
 
 
-def _grid(model: Model) -> Grid | None:
+def _joint_models(model: Model) -> Mapping[str, JointModel]:
+    """Return the joint models of a model by camera; none if it is another model."""
+    if not reads_corners(model.name):
+        return {}
+    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
+
+    return restore_joint(model)
+
+
+def _grid(model: Model, joints: Mapping[str, JointModel]) -> Grid | None:
     """Return a grid over the calibration points, or around the cameras of a joint model without points."""
     points_m = [pair.world_m[:2] for camera in model.cameras for pair in camera.pairs]
-    if reads_corners(model.name):
-        points_m += _below_cameras(model)
+    if joints:
+        points_m += _below_cameras([joint.origin_m for joint in joints.values()])
     if not points_m:
         return None
     low_m = np.min(points_m, axis=0) - _MARGIN_M
@@ -82,11 +98,8 @@ def _grid(model: Model) -> Grid | None:
     return Grid(low_m, _SPACING_M, (int(sizes[0]), int(sizes[1])))
 
 
-def _below_cameras(model: Model) -> list[Array]:
+def _below_cameras(origins_m: Sequence[Array]) -> list[Array]:
     """Return points of the floor around each camera of a joint model, which it sees."""
-    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
-
-    origins_m = [restore_joint(camera).origin_m for camera in model.cameras]
     reaches_m = [reach * origin_m[2] for origin_m in origins_m for reach in (-1.0, 1.0)]
     return [
         origin_m[:2] + reach_m
@@ -95,7 +108,7 @@ def _below_cameras(model: Model) -> list[Array]:
 
 
 def _joint_nodes(
-    camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None, in_view: bool
+    model: JointModel, grid: Grid, height_m: float, sigma_m: float | None, in_view: bool
 ) -> NodeModes:
     """Return the modes of a joint model: those of level markers at the nodes, and the error of the height.
 
@@ -107,11 +120,10 @@ def _joint_nodes(
     from ipsys_log.geometry.markers import marker_corners
     from ipsys_log.geometry.rotations import level_turns
     from ipsys_log.joint.locate import locate_markers
-    from ipsys_log.joint.payload import restore_joint
     from ipsys_log.joint.settings import JointSettings
 
     sigma_m = JointSettings().robot_height_sigma_m if sigma_m is None else sigma_m
-    model, flat_m, rows = restore_joint(camera), grid.points_m, None
+    flat_m, rows = grid.points_m, None
     if in_view:
         rays = (np.insert(flat_m, 2, height_m, axis=1) - model.origin_m) @ model.camera_from_world.T
         # The principal point is near the middle of the image, whose size the model does not have.
@@ -129,7 +141,7 @@ def _joint_nodes(
     modes_m = np.full((count, 3, model.modes.shape[1] + 1), np.nan)
     corners_px[~steep] = corners_px[steep][:1]
     located = locate_markers(model, corners_px, variances, heights_m, lengths_m)
-    higher = locate_markers(model, corners_px, variances, heights_m + sigma_m, lengths_m)
+    higher = locate_markers(model.without_modes(), corners_px, variances, heights_m + sigma_m, lengths_m)
     modes_m[steep, :, :-1] = located.modes_m[steep]
     modes_m[steep, :, -1] = (higher.points_m - located.points_m)[steep]
     clock = len(model.lens) + 7

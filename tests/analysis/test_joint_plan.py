@@ -123,9 +123,9 @@ def test_effect_of_a_drive_is_that_of_all_its_unknowns(
         now = linearise_corners(model, view.corners_px, inward, view.centres_m, view.turns, sizes_m)
         _, floor_slopes, floor_modes = model.floor.evaluate(view.centres_m, model.amplitudes)
         by_height = now.by_pose[0, :, 2]
-        flat = len(model.modes) - floor_modes.shape[1]
-        by_modes = now.by_camera[0] @ model.modes[:flat]
-        by_modes += np.outer(by_height, floor_modes[0] @ model.modes[flat:])
+        by_modes = now.by_camera[0] @ model.modes
+        by_floor = floor_modes[0] @ model.floor_modes
+        by_modes[:, : len(by_floor)] += np.outer(by_height, by_floor)
         by_place = now.by_pose[0, :, :2] + np.outer(by_height, floor_slopes[0])
         slopes = np.column_stack([by_modes, 0.001 * by_height, by_place, now.by_pose[0, :, 5]])
         tilts = 0.004 * now.by_pose[0, :, 3:5]

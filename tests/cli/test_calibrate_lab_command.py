@@ -91,7 +91,7 @@ def true_error_m(lab: GeometricLab, log: Path) -> tuple[float, float]:
     """Return the mean 2D error over the floor, and that after the best rigid alignment."""
     with Session([log]) as session:
         (model,) = session.payloads(session.topics(MODEL, "joint"))
-    cameras = {camera.camera: restore_joint(camera) for camera in model.cameras}
+    cameras = restore_joint(model)
     settings = lab.settings.lab
     length_m = settings.marker_length_m
 

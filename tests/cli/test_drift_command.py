@@ -163,7 +163,7 @@ def _errors_mm(log: Path) -> float:
     with Session([log]) as session:
         topics = [t for run in ("joint", "joint_mended") for t in session.topics(MODEL, run)]
         model: Model = session.payloads([topics[-1]])[-1]
-    joint = restore_joint(next(one for one in model.cameras if one.camera == KNOCK.camera))
+    joint = restore_joint(model)[KNOCK.camera]
     nodes = grid_nodes(
         own.lens,
         own.camera_from_world,

@@ -88,6 +88,7 @@ def test_locate_covariance_is_that_of_calibration_and_noise(fit: JointFit, model
             layout.floor,
             state.values[layout.modes],
             model.modes[:, :1],
+            model.floor_modes[:, :1],
             0.0,
         )
         moved_px = corners_px + rng.normal(0.0, 0.02, corners_px.shape)

@@ -121,8 +121,7 @@ def test_joint_modes_are_the_covariance_of_located_markers(joint: Model, sigma_m
     modes = calibration_modes(joint, rig)
     assert modes.count == 12 + 3 * len(joint.cameras)
     rng = np.random.default_rng(5)
-    for camera in joint.cameras:
-        model = restore_joint(camera)
+    for camera, model in restore_joint(joint).items():
         places_m = model.origin_m[:2] + rng.uniform(-0.9, 0.9, (20, 2))
         headings = rng.uniform(-3, 3, 20)
         corners_px = level_corners(model, places_m, headings)
@@ -130,7 +129,7 @@ def test_joint_modes_are_the_covariance_of_located_markers(joint: Model, sigma_m
         sizes = np.full(20, 0.1), np.full(20, LENGTH_M)
         located = locate_markers(model, corners_px, noise, *sizes, sigma_m or 0.001)
         wanted = (located.covariances_m2 - located.noise_m2)[:, :2, :2]
-        sensitivities = modes.at(camera.camera, located.points_m, located.headings_rad)
+        sensitivities = modes.at(camera, located.points_m, located.headings_rad)
         total = sensitivities[:, :2] @ sensitivities[:, :2].swapaxes(1, 2)
         ratio = np.trace(total, axis1=1, axis2=2) / np.trace(wanted, axis1=1, axis2=2)
         assert np.abs(ratio - 1).max() < 0.1
@@ -151,7 +150,7 @@ def test_camera_of_a_hall_has_nodes_in_its_view_only(joint: Model, monkeypatch: 
     """The table continues outside of the view with the values of its edge."""
     monkeypatch.setattr(table_module, "_MOST_NODES", 0)
     monkeypatch.setattr(table_module, "_VIEW_MARGIN", 0.5)
-    modes, model = calibration_modes(joint, rig_with(None)), restore_joint(joint.cameras[0])
+    modes, model = calibration_modes(joint, rig_with(None)), restore_joint(joint)[joint.cameras[0].camera]
     edges = [model.origin_m[:2] + np.array([reach_m, 0.0]) for reach_m in (1.6, 1.8)]
     near, far = (modes.at(joint.cameras[0].camera, np.array([place_m]), np.zeros(1)) for place_m in edges)
     np.testing.assert_array_equal(near[:, 0], far[:, 0])

@@ -117,7 +117,7 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
 
 STAGE = Stage(
     name="fuse",
-    versions={"fuse": 4},
+    versions={"fuse": 5},
     reads=TRACK_READS,
     writes=(TRACKS, POSES),
     plan=_plan,

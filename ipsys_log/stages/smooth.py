@@ -70,7 +70,7 @@ def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:
 
 STAGE = Stage(
     name="smooth",
-    versions={"smooth": 2},
+    versions={"smooth": 3},
     reads=TRACK_READS,
     writes=(SMOOTHED_TRACKS,),
     plan=_plan,

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LOCAL_M", "BiasModes", "Grid", "NodeModes", "reduce_modes"]
+__all__ = ["FLATTEST", "LOCAL_M", "BiasModes", "CameraNodes", "Grid", "NodeModes", "reduce_modes"]
 
 Array = NDArray[np.float64]
 
@@ -22,8 +23,10 @@ Array = NDArray[np.float64]
 _CLOCK_S = 0.001
 # Local errors change over this distance: the correlation length of a floor. Tracks are alike with 0.3 to 1 m.
 LOCAL_M = 0.5
-# Numbers of one product of matrices (80 MB), and nodes whose distances are computed together.
-_MOST_NUMBERS, _NODES_AT_ONCE = 10_000_000, 1000
+# Rays that are flatter than this (cosine with the vertical) do not belong to positions.
+FLATTEST = 0.2
+# Nodes whose distances are computed together.
+_NODES_AT_ONCE = 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,24 +46,45 @@ class Grid:
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
+class CameraNodes(Protocol):
+    """The sensitivities of one camera at n nodes of a grid, before their reduction."""
+
+    @property
+    def rest_m2(self) -> Array:
+        """Covariances (n, 3, 3) of local errors."""
+
+    @property
+    def clock_s(self) -> Array:
+        """The error (M,) of the camera's clock by the amplitudes."""
+
+    @property
+    def rows(self) -> NDArray[np.intp] | None:
+        """The nodes (n,) by their number in the grid; the camera cannot see the others. None: all nodes."""
+
+    @property
+    def columns(self) -> NDArray[np.intp] | None:
+        """The amplitudes (c,) on which the errors depend. None: all M amplitudes."""
+
+    def errors(self) -> Array:
+        """Return the errors (n, 3, c) by these amplitudes; NaN at a node that the camera cannot see."""
+
+    def project(self, axes: Array) -> Array:
+        """Return the errors (n, 3, k) by combinations (M, k) of the amplitudes."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeModes:
-    """The sensitivities of one camera at n nodes of a grid, before their reduction.
-
-    Attributes
-    ----------
-    modes_m : (n, 3, c), errors by the amplitudes in ``columns``; NaN at a node that the camera cannot see.
-    rest_m2 : (n, 3, 3), covariances of local errors.
-    clock_s : (M,), error of the camera's clock by the amplitudes.
-    rows : (n,), the nodes by their number in the grid; the camera cannot see the others. None: all nodes.
-    columns : (c,), the amplitudes on which the errors depend. None: all M amplitudes.
-    """
+    """Stored sensitivities of one camera; ``modes_m`` (n, 3, c) are the errors, see :class:`CameraNodes`."""
 
     modes_m: Array
     rest_m2: Array
     clock_s: Array
     rows: NDArray[np.intp] | None = None
     columns: NDArray[np.intp] | None = None
+
+    def errors(self) -> Array:
+        """Return the errors (n, 3, c) by the amplitudes in ``columns``."""
+        return self.modes_m
 
     def project(self, axes: Array) -> Array:
         """Return the errors (n, 3, k) by combinations (M, k) of the amplitudes."""
@@ -75,7 +99,8 @@ class BiasModes:
     Attributes
     ----------
     grid : the nodes; between them, the sensitivities are bilinear. Outside, they keep the value at the edge.
-    tables : by camera, (nx, ny, 3, c) in m, by the amplitudes in ``columns``.
+    tables : by camera, (r, 3, c) in m, at the r nodes that it can see, by the amplitudes in ``columns``.
+    rows : by camera, (nx * ny,), the row of its table for each node: its own, or that of the nearest node.
     clock_s : by camera, (m,), error of its clock.
     fade_m : (m,), distance after which a robot meets other amplitudes; infinite for the common ones.
     columns : by camera, (c,), the amplitudes on which its errors depend: the common ones, and its own.
@@ -83,6 +108,7 @@ class BiasModes:
 
     grid: Grid
     tables: Mapping[str, Array]
+    rows: Mapping[str, NDArray[np.intp]]
     clock_s: Mapping[str, Array]
     fade_m: Array
     columns: Mapping[str, NDArray[np.intp]]
@@ -95,7 +121,7 @@ class BiasModes:
     @classmethod
     def none(cls) -> BiasModes:
         """Return no modes: for models without a covariance."""
-        return cls(Grid(np.zeros(2), 1.0, (2, 2)), {}, {}, np.zeros(0), {})
+        return cls(Grid(np.zeros(2), 1.0, (2, 2)), {}, {}, {}, np.zeros(0), {})
 
     def at(self, camera: str, points_m: Array, headings_rad: Array) -> Array:
         """Return the sensitivities of poses that a camera measured.
@@ -121,7 +147,7 @@ class BiasModes:
         corners[0] = i * row + j
         corners[1], corners[2], corners[3] = corners[0] + row, corners[0] + 1, corners[0] + (row + 1)
         columns = self.columns[camera]
-        near, right, above, far = self.tables[camera].reshape(-1, 3, len(columns)).take(corners, axis=0)
+        near, right, above, far = self.tables[camera].take(self.rows[camera].take(corners), axis=0)
         own = np.empty((count, 4, len(columns)))
         own[:, :3] = (near * u + right * s) * v + (above * u + far * s) * t
         near, right, above, far = near[:, :2], right[:, :2], above[:, :2], far[:, :2]
@@ -152,7 +178,7 @@ def _turns(by_x: Array, by_y: Array, headings_rad: Array) -> Array:
     return turns
 
 
-def reduce_modes(grid: Grid, cameras: Mapping[str, NodeModes], count: int) -> BiasModes:
+def reduce_modes(grid: Grid, cameras: Mapping[str, CameraNodes], count: int) -> BiasModes:
     """Return the tables with the ``count`` strongest combinations of the amplitudes of all cameras.
 
     The other combinations become local errors, so that the variance of each position is kept.
@@ -160,48 +186,54 @@ def reduce_modes(grid: Grid, cameras: Mapping[str, NodeModes], count: int) -> Bi
     if not cameras:
         return BiasModes.none()
     # The right singular vectors, from the small matrix of all amplitudes: ascending order.
-    _, axes = np.linalg.eigh(_products(cameras.values()))
-    kept, others = axes[:, ::-1][:, :count], axes[:, ::-1][:, count:]
+    products, totals_m2 = _products(cameras.values())
+    _, axes = np.linalg.eigh(products)
+    kept = axes[:, ::-1][:, :count]
     size = kept.shape[1]
-    total, tables, clock_s, columns = size + 3 * len(cameras), {}, {}, {}
+    total, tables, rows, clock_s, columns = size + 3 * len(cameras), {}, {}, {}, {}
     for number, (name, node) in enumerate(cameras.items()):
-        left, modes_m = node.project(others), np.empty((len(node.modes_m), 3, size + 3))
-        modes_m[:, :, :size] = node.project(kept)
-        modes_m[:, :, size:] = _roots(node.rest_m2 + left @ left.swapaxes(1, 2))
-        tables[name] = _fill(grid, modes_m, node.rows)
+        strong_m = node.project(kept)
+        # A product with the hundreds of other combinations would take most of the time in a hall.
+        others_m2 = totals_m2[number] - _squares(strong_m)
+        modes_m = np.concatenate([strong_m, _roots(node.rest_m2 + others_m2)], axis=2)
+        tables[name], rows[name] = _tabulate(grid, modes_m, node.rows)
         clock_s[name] = np.append(node.clock_s @ kept, np.zeros(total - size))
         columns[name] = np.append(np.arange(size), size + 3 * number + np.arange(3))
     fade_m = np.where(np.arange(total) < size, np.inf, LOCAL_M)
-    return BiasModes(grid, tables, clock_s, fade_m, columns)
+    return BiasModes(grid, tables, rows, clock_s, fade_m, columns)
 
 
-def _products(nodes: Iterable[NodeModes]) -> Array:
+def _squares(modes_m: Array) -> Array:
+    """Return the covariances (n, 3, 3) of modes (n, 3, c)."""
+    product: Array = modes_m @ modes_m.swapaxes(1, 2)
+    return product
+
+
+def _products(nodes: Iterable[CameraNodes]) -> tuple[Array, list[Array]]:
     """Return the sums (M, M) of the products of the errors of all nodes by all amplitudes.
 
-    The errors of a lab are one product of matrices. Those of a hall are several: they need too much memory.
+    The second part are the covariances (n, 3, 3) of these errors at the nodes of each camera.
     """
-    products: Array | None = None
-    waiting: list[Array] = []
-    for number, node in enumerate(nodes := list(nodes)):
-        waiting.append(_rows(node))
-        if number + 1 == len(nodes) or sum(rows.size for rows in waiting) > _MOST_NUMBERS:
-            together = np.concatenate(waiting)
-            own = together.T @ together
-            products, waiting = own if products is None else products + own, []
-    assert products is not None
-    return products
+    products: Array = np.zeros(())
+    totals_m2 = []
+    for node in nodes:
+        # One camera after the other: the errors of all nodes of a hall need too much memory.
+        errors, clock = node.errors(), node.clock_s / _CLOCK_S
+        totals_m2.append(_squares(errors))
+        products = products + np.outer(clock, clock)
+        rows = _rows(errors)
+        columns = np.arange(len(clock)) if node.columns is None else node.columns
+        products[np.ix_(columns, columns)] += rows.T @ rows
+    return products, totals_m2
 
 
-def _rows(node: NodeModes) -> Array:
-    """Return the errors of all nodes as rows (r, M). All nodes have the same weight, and all cameras."""
-    seen = np.isfinite(node.modes_m).all(axis=(1, 2))
-    modes_m = node.modes_m[seen]
-    sizes_m = np.sqrt((modes_m**2).sum(axis=(1, 2), keepdims=True))
-    flat = (modes_m / np.maximum(sizes_m, 1e-12)).reshape(-1, modes_m.shape[2]) / np.sqrt(max(seen.sum(), 1))
-    if node.columns is not None:
-        own, flat = flat, np.zeros((len(flat), len(node.clock_s)))
-        flat[:, node.columns] = own
-    return np.concatenate([flat, node.clock_s[None] / _CLOCK_S])
+def _rows(errors: Array) -> Array:
+    """Return errors (n, 3, c) as rows (r, c). All nodes have the same weight, and all cameras."""
+    seen = np.isfinite(errors).all(axis=(1, 2))
+    rows = errors[seen].reshape(3 * int(seen.sum()), -1)
+    sizes_m = np.sqrt(np.einsum("rc,rc->r", rows, rows).reshape(-1, 3).sum(axis=1))
+    rows *= np.repeat(1 / np.maximum(sizes_m, 1e-12), 3)[:, None] / np.sqrt(max(seen.sum(), 1))
+    return rows
 
 
 def _roots(covariances: Array) -> Array:
@@ -213,17 +245,36 @@ def _roots(covariances: Array) -> Array:
     return roots
 
 
-def _fill(grid: Grid, own: Array, rows: NDArray[np.intp] | None) -> Array:
-    """Return values of nodes as a table; a node without a value gets that of the nearest one with a value."""
-    points_m = grid.points_m
-    values = np.full((len(points_m), *own.shape[1:]), np.nan)
-    values[slice(None) if rows is None else rows] = own
+def _tabulate(grid: Grid, values: Array, rows: NDArray[np.intp] | None) -> tuple[Array, NDArray[np.intp]]:
+    """Return the finite values (r, 3, c) of nodes, and for each node of the grid the row of the nearest one.
+
+    Without finite values, all are 0.
+    """
     seen = np.isfinite(values).all(axis=(1, 2))
-    if seen.any():
-        known_m, known = points_m[seen], values[seen]
-        for some in np.array_split(np.flatnonzero(~seen), 1 + len(points_m) // _NODES_AT_ONCE):
-            x_m, y_m = (points_m[some, None, axis] - known_m[:, axis] for axis in (0, 1))
-            values[some] = known[(x_m**2 + y_m**2).argmin(axis=1)]
-    else:
-        values = np.zeros_like(values)
-    return values.reshape(*grid.shape, *values.shape[1:])
+    known = np.flatnonzero(seen) if rows is None else rows[seen]
+    count = grid.shape[0] * grid.shape[1]
+    if not len(known):
+        return np.zeros((1, *values.shape[1:])), np.zeros(count, dtype=np.intp)
+    row_of = np.full(count, -1)
+    row_of[known] = np.arange(len(known))
+    unseen = np.flatnonzero(row_of < 0)
+    if len(unseen):
+        row_of[unseen] = row_of[_nearest(grid.points_m, unseen, _edge(row_of.reshape(grid.shape) >= 0))]
+    return values[seen], row_of
+
+
+def _nearest(points_m: Array, nodes: NDArray[np.intp], others: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the nearest one of ``others`` for each of ``nodes``."""
+    others_m = points_m[others]
+    nearest = []
+    for some in np.array_split(nodes, 1 + len(nodes) // _NODES_AT_ONCE):
+        x_m, y_m = (points_m[some, None, axis] - others_m[:, axis] for axis in (0, 1))
+        nearest.append(others[(x_m**2 + y_m**2).argmin(axis=1)])
+    return np.concatenate(nearest)
+
+
+def _edge(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the nodes in a mask (nx, ny) beside a node outside: only they are the nearest ones of others."""
+    padded = np.pad(seen, 1, constant_values=True)
+    inner = padded[2:, 1:-1] & padded[:-2, 1:-1] & padded[1:-1, 2:] & padded[1:-1, :-2]
+    return np.flatnonzero(seen & ~inner)

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraModel, Model, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
-from ipsys_log.tracking.bias_modes import BiasModes, Grid, NodeModes, reduce_modes
+from ipsys_log.tracking.bias_modes import FLATTEST, BiasModes, CameraNodes, Grid, NodeModes, reduce_modes
 
 if TYPE_CHECKING:
     from ipsys_log.joint.model import JointModel
+    from ipsys_log.tracking.joint_nodes import JointNodes
 
 __all__ = ["MODES", "calibration_modes"]
 
@@ -23,14 +24,8 @@ Array = NDArray[np.float64]
 MODES = 12
 _SPACING_M, _MARGIN_M = 0.2, 0.5
 _ROBOT_HEIGHT_M = 0.1
-# The sensitivity of a centre hardly depends on the side of its marker.
-_MARKER_M = 0.2
-# Standard deviation of a corner of detect: a weight of corners without noise.
-_USUAL_PX = 0.012
 # With more nodes of all cameras together, each camera has only the nodes in its view, with this factor.
 _MOST_NODES, _VIEW_MARGIN = 100_000, 1.2
-# Rays that are flatter than this (cosine with the vertical) do not belong to positions.
-_FLATTEST = 0.2
 
 
 def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> BiasModes:
@@ -57,6 +52,7 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     sigma_m = _height_sigma(rig)
     # In a small lab, each camera sees most nodes.
     in_view = len(grid.points_m) * len(model.cameras) > _MOST_NODES
+    nodes: Mapping[str, CameraNodes]
     if reads_corners(model.name):
         nodes = {
             name: _joint_nodes(joint, grid, height_m, sigma_m, in_view) for name, joint in joints.items()
@@ -109,18 +105,15 @@ def _below_cameras(origins_m: Sequence[Array]) -> list[Array]:
 
 def _joint_nodes(
     model: JointModel, grid: Grid, height_m: float, sigma_m: float | None, in_view: bool
-) -> NodeModes:
+) -> JointNodes:
     """Return the modes of a joint model: those of level markers at the nodes, and the error of the height.
 
     ``sigma_m`` is the standard deviation of the height; None for the usual one. ``in_view``: only
     of the nodes in the view of the camera.
     """
     # Late: scipy takes 1 s.
-    from ipsys_log.geometry.lenses import project
-    from ipsys_log.geometry.markers import marker_corners
-    from ipsys_log.geometry.rotations import level_turns
-    from ipsys_log.joint.locate import locate_markers
     from ipsys_log.joint.settings import JointSettings
+    from ipsys_log.tracking.joint_nodes import make_joint_nodes
 
     sigma_m = JointSettings().robot_height_sigma_m if sigma_m is None else sigma_m
     flat_m, rows = grid.points_m, None
@@ -129,23 +122,7 @@ def _joint_nodes(
         # The principal point is near the middle of the image, whose size the model does not have.
         rows = _rows_in_view(rays, model.lens[2:4] / model.lens[:2])
         flat_m = flat_m[rows]
-    count = len(flat_m)
-    floor_m, _ = model.floor.heights(flat_m, model.amplitudes)
-    centres_m = np.column_stack([flat_m, floor_m + height_m])
-    arms_m = marker_corners(1.0) * _MARKER_M @ level_turns(np.zeros(count)).swapaxes(1, 2)
-    corners_c = (arms_m + (centres_m - model.origin_m)[:, None]) @ model.camera_from_world.T
-    steep = (corners_c[..., 2] > _FLATTEST * np.linalg.norm(corners_c, axis=2)).all(axis=1)
-    corners_px = project(corners_c.reshape(-1, 3), model.calibration).reshape(count, 4, 2)
-    variances = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (count, 8, 8))
-    lengths_m, heights_m = np.full(count, _MARKER_M), np.full(count, height_m)
-    modes_m = np.full((count, 3, model.modes.shape[1] + 1), np.nan)
-    corners_px[~steep] = corners_px[steep][:1]
-    located = locate_markers(model, corners_px, variances, heights_m, lengths_m)
-    higher = locate_markers(model.without_modes(), corners_px, variances, heights_m + sigma_m, lengths_m)
-    modes_m[steep, :, :-1] = located.modes_m[steep]
-    modes_m[steep, :, -1] = (higher.points_m - located.points_m)[steep]
-    clock = len(model.lens) + 7
-    return NodeModes(modes_m, np.zeros((count, 3, 3)), np.append(model.modes[clock], 0.0), rows)
+    return make_joint_nodes(model, flat_m, height_m, sigma_m, rows)
 
 
 def _rows_in_view(points_c: Array, most: Array) -> NDArray[np.intp]:
@@ -175,7 +152,7 @@ def _table_nodes(
     if in_view:
         rows = _rows_in_view(points_m, np.abs(fitted_m[:, :2] / fitted_m[:, 2:]).max(axis=0))
         flat_m, points_m = flat_m[rows], points_m[rows]
-    steep = points_m[:, 2] > _FLATTEST * np.linalg.norm(points_m, axis=1)
+    steep = points_m[:, 2] > FLATTEST * np.linalg.norm(points_m, axis=1)
     points_m[~steep] = fitted_m[0]
     sigmas_m = None if sigma_m is None else np.full(len(flat_m), sigma_m)
     parts = applied.error_modes(points_m, np.full(len(flat_m), height_m), sigmas_m)

@@ -108,7 +108,6 @@ def size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str
     """Let a small lab count as a hall, whose cameras have nodes in their views only."""
     if request.param == "hall":
         monkeypatch.setattr(table_module, "_MOST_NODES", 0)
-        monkeypatch.setattr(modes_module, "_MOST_NUMBERS", 100)
         monkeypatch.setattr(modes_module, "_NODES_AT_ONCE", 7)
     return str(request.param)
 

@@ -230,7 +230,7 @@ def _products(nodes: Iterable[CameraNodes]) -> tuple[Array, list[Array]]:
 def _rows(errors: Array) -> Array:
     """Return errors (n, 3, c) as rows (r, c). All nodes have the same weight, and all cameras."""
     seen = np.isfinite(errors).all(axis=(1, 2))
-    rows = errors[seen].reshape(3 * int(seen.sum()), -1)
+    rows = errors[seen].reshape(-1, errors.shape[2])
     sizes_m = np.sqrt(np.einsum("rc,rc->r", rows, rows).reshape(-1, 3).sum(axis=1))
     rows *= np.repeat(1 / np.maximum(sizes_m, 1e-12), 3)[:, None] / np.sqrt(max(seen.sum(), 1))
     return rows

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import project
@@ -80,6 +82,27 @@ def test_node_that_a_camera_cannot_see_has_the_nearest_value() -> None:
     modes = reduce_modes(GRID, {"red": NodeModes(values, np.zeros((20, 3, 3)), np.zeros(1))}, 1)
     sensitivities = modes.at("red", np.array([[1.0, 1.0], [40.0, 1.0], [-1.0, 0.5]]), np.zeros(3))
     np.testing.assert_allclose(np.abs(sensitivities[:, 0, 0]), [1.0, 1.0, 5.0])
+
+
+@given(
+    st.lists(st.booleans(), min_size=20, max_size=20),
+    st.lists(st.integers(0, 19), min_size=1, unique=True),
+)
+def test_nodes_outside_of_a_view_have_the_nearest_value(seen: list[bool], nodes: list[int]) -> None:
+    """A camera with any part of the nodes, of which it sees any part: compared with all distances."""
+    rows = np.array(sorted(nodes))
+    values = np.random.default_rng(6).uniform(1.0, 2.0, (len(rows), 3, 1))
+    values[~np.array(seen)[rows]] = np.nan
+    modes = reduce_modes(GRID, {"red": NodeModes(values, np.zeros((len(rows), 3, 3)), np.zeros(1), rows)}, 1)
+    known = np.isfinite(values[:, 0, 0])
+    sensitivities = np.abs(modes.at("red", GRID.points_m, np.zeros(20))[:, :3, 0])
+    apart_m = np.linalg.norm(GRID.points_m[:, None] - GRID.points_m[rows[known]], axis=2)
+    if not known.any():
+        assert not sensitivities.any()
+        return
+    for distances_m, found in zip(apart_m, sensitivities, strict=True):
+        nearest = np.flatnonzero(distances_m <= distances_m.min() + 1e-9)
+        assert any(np.allclose(found, values[known][row, :, 0]) for row in nearest)
 
 
 def test_unknown_camera_has_no_errors() -> None:

@@ -72,7 +72,8 @@ class JointNodes:
         combined = replace(
             self.model, modes=modes @ axes[:-1], floor_modes=floor_modes @ axes[: floor_modes.shape[1]]
         )
-        return self._spread(combined) + self.by_height_m[:, :, None] * axes[-1]
+        errors: Array = self._spread(combined) + self.by_height_m[:, :, None] * axes[-1]
+        return errors
 
     def _spread(self, model: JointModel) -> Array:
         errors = _locate(model, self.corners_px, self.height_m).modes_m

@@ -37,7 +37,9 @@ from ipsys_log.analysis.floor_error import (
 )
 from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.start import PlacedCamera, place_cameras
+from ipsys_log.log.codec import encode
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings
 from ipsys_log.simulation.hall import hall_settings
 
@@ -49,7 +51,7 @@ _GRIDS = ((3, 1), (3, 2), (4, 3), (6, 4))
 _POINTS, _RATE_HZ, _CLOCK_S = 8, 10.0, 0.025
 # The nodes are 0.1 m apart; a prime number takes some of each row.
 _EVERY_NODE = 11
-_MM, _KB_PER_MB = 1000.0, 1024
+_MM, _KB_PER_MB, _BYTES_PER_MB = 1000.0, 1024, 1_000_000
 _MOST_EXPONENT = 1.2
 
 
@@ -57,11 +59,12 @@ _MOST_EXPONENT = 1.2
 class Figures:
     """The figures of one hall.
 
-    ``unmeasured`` cameras see no taped point. ``start_s`` and ``fit_s`` are processor times of the rough
-    poses, and of the whole calibration. ``start_mm`` is the largest error of a rough origin. The other
-    errors are those over the floor; ``aligned_mm`` is the mean after the best rigid alignment. ``stated_mm``
-    is the mean expected error by the covariance, and ``nees`` the normalised squared error per degree of
-    freedom. ``worst_mm`` is the largest error of a node, ``worst_stated_mm`` the expected error there.
+    ``message_mb`` is the size of the message of the model. ``unmeasured`` cameras see no taped point.
+    ``start_s`` and ``fit_s`` are processor times of the rough poses, and of the whole calibration.
+    ``start_mm`` is the largest error of a rough origin. The other errors are those over the floor;
+    ``aligned_mm`` is the mean after the best rigid alignment. ``stated_mm`` is the mean expected error by
+    the covariance, and ``nees`` the normalised squared error per degree of freedom. ``worst_mm`` is the
+    largest error of a node, ``worst_stated_mm`` the expected error there.
     """
 
     cameras: int
@@ -71,6 +74,7 @@ class Figures:
     fit_s: float
     steps: int
     memory_mb: float
+    message_mb: float
     start_mm: float
     mean_mm: float
     p95_mm: float
@@ -112,12 +116,12 @@ def _exponent(halls: Sequence[Figures], times_s: Sequence[float]) -> float:
 
 
 def _table(halls: Sequence[Figures]) -> str:
-    lines = ["cameras  sightings  no point  steps   start    fit   MB  start mm  mean mm   p95"]
+    lines = ["cameras  sightings  no point  steps   start    fit   MB  model  start mm  mean mm   p95"]
     for one in halls:
         times = f"{one.start_s:>6.2f} s{one.fit_s:>5.0f} s"
         errors = f"{one.start_mm:>10.0f}{one.mean_mm:>9.2f}{one.p95_mm:>6.2f}"
         counts = f"{one.cameras:>7}{one.sightings:>11}{one.unmeasured:>10}{one.steps:>7}"
-        lines.append(f"{counts}{times}{one.memory_mb:>5.0f}{errors}")
+        lines.append(f"{counts}{times}{one.memory_mb:>5.0f}{one.message_mb:>7.1f}{errors}")
     return "\n".join(lines)
 
 
@@ -155,6 +159,7 @@ def calibrate_hall(grid: tuple[int, int], seed: int, drive_s: float, floor_mm: f
         fit_s,
         len(steps),
         memory_mb,
+        len(encode(joint_payload(fit, session.pairs, 0))) / _BYTES_PER_MB,
         _MM * _largest_miss_m(session.lab, observations, placed),
         _MM * error.mean_m,
         _MM * error.p95_m,

@@ -287,7 +287,7 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "joint.from_messages._point": _CHECKED,
     "joint.from_messages.gather_observations": _CHECKED,
     "joint.locate_step.LocateCorners._positions": _CHECKED,
-    "joint.payload.restore_joint": _CHECKED,
+    "joint.payload._restore": _CHECKED,
     "joint.refusals.check_observations": _JOINT,
     "joint.refusals.check_spread": _JOINT,
     "joint.solver._factorise": _JOINT,

@@ -29,7 +29,7 @@ from ipsys_log.runs.piece_folder import (
     store_piece,
 )
 from ipsys_log.runs.superseded import outdated_runs
-from ipsys_log.soundness.finding import BROKEN, SOUND, LogCheck
+from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck
 
 __all__ = [
     "FAILED",
@@ -68,7 +68,7 @@ class LogResult:
     ----------
     log : the path of the log, as the user gave it.
     state : ``computed``, ``up to date``, ``not outdated``, ``identical``, ``different``, ``sound``,
-        ``readable``, ``broken``, ``exported`` or ``failed``.
+        ``readable``, ``unread``, ``broken``, ``exported`` or ``failed``.
     good : False if the user must look at the log.
     text : the reason of a failure, or remarks; one line.
     runs : the runs that were computed, compared or exported.
@@ -331,7 +331,7 @@ def check_log(path: LogLocation, folder: Path | None = None) -> LogResult:
     logs = [path] if derived is None else [path, derived]
     checks = api.check(*logs)
     state = LogCheck.worst(checks)
-    if state != BROKEN and derived is not None:
+    if state not in (BROKEN, UNREAD) and derived is not None:
         check_source([path], derived)
     return LogResult(str(path), state, state == SOUND, _worst_text(checks), derived=name_derived(logs))
 
@@ -345,8 +345,8 @@ def _worst_text(checks: Sequence[LogCheck]) -> str:
     ]
     if not remarks:
         return ""
-    broken = (remark for remark in remarks if remark[0].level == BROKEN)
-    finding, log = next(broken, remarks[0])
+    faults = [remark for level in (BROKEN, UNREAD) for remark in remarks if remark[0].level == level]
+    finding, log = (faults or remarks)[0]
     place = f"{finding.topic}: " if finding.topic else ""
     more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
     return f"{log}{place}{finding.text}{more}"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, TypeVar
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogState, LogUrl
 from ipsys_log.plain_text import plain_text
@@ -119,7 +119,7 @@ def open_object(url: LogUrl) -> RemoteObject:
     entry, read = _repeat(url, lambda: open_pinned(filesystem, path))
     size = entry.get("size")
     if entry.get("type") == "directory":
-        raise LogError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
+        raise UnreadError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
     if size is None or entry.get("partial") is False:
         raise _failure(url, _NoRangesError())
     version, changed_ns = _version_of(entry), _changed_ns(entry)
@@ -231,14 +231,14 @@ def _filesystem(url: LogUrl) -> tuple[Any, str]:
         reason = plain_text(str(known.get("err", "its package is missing")), longest=_LONGEST_REASON)
         package = _PACKAGES.get(url.scheme)
         advice = f"pip install {package}" if package else reason
-        raise LogError(f"{url}: logs at {url.scheme}:// need another package: {advice}") from None
+        raise UnreadError(f"{url}: logs at {url.scheme}:// need another package: {advice}") from None
     except ValueError as error:
         if not known:
-            raise LogError(
+            raise UnreadError(
                 f"{url}: the protocol {url.scheme}:// is not known; use a path, or a URL such as "
                 "s3://bucket/log.mcap or https://host/log.mcap"
             ) from None
-        raise LogError(f"{url} cannot be opened: {_reason(url, error)}") from None
+        raise UnreadError(f"{url} cannot be opened: {_reason(url, error)}") from None
     return filesystem, url.key or path
 
 
@@ -381,23 +381,23 @@ def _may_pass(error: BaseException) -> bool:
     return not isinstance(error, _FINAL) and type(error).__name__ != _NO_CREDENTIALS
 
 
-def _failure(url: LogUrl, error: BaseException) -> LogError:
+def _failure(url: LogUrl, error: BaseException) -> UnreadError:
     if _is_changed(error):
-        return LogError(f"{url} changed while it was read: run the command again")
+        return UnreadError(f"{url} changed while it was read: run the command again")
     if isinstance(error, _NoRangesError):
-        return LogError(f"{url}: the server ignores byte ranges: download the log, and read the file")
+        return UnreadError(f"{url}: the server ignores byte ranges: download the log, and read the file")
     status = _status_of(error)
     if status in _DENIED_STATUS or isinstance(error, PermissionError):
-        return LogError(
+        return UnreadError(
             f"{url} cannot be read: the store denies access; check the credentials of {url.scheme}://"
         )
     if status == 404 or (isinstance(error, FileNotFoundError) and not _may_pass(error)):
-        return LogError(f"{url} does not exist")
+        return UnreadError(f"{url} does not exist")
     if type(error).__name__ == _NO_CREDENTIALS:
-        return LogError(f"{url} cannot be read: there are no credentials for {url.scheme}://; give some")
+        return UnreadError(f"{url} cannot be read: there are no credentials for {url.scheme}://; give some")
     tried = f" after {len(_pauses_s(url)) + 1} attempts" if _may_pass(error) else ""
     cause = error.__cause__ if isinstance(error, FileNotFoundError) and error.__cause__ else error
-    return LogError(
+    return UnreadError(
         f"{url} cannot be read{tried}: {_reason(url, cause)}; check the address and the connection"
     )
 

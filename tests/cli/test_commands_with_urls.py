@@ -160,6 +160,14 @@ def test_command_that_reads_logs_reads_a_url(line: str, here: Path, ipsys: Ipsys
     assert text.startswith(f"{SHOWN[HTTPS]} cannot be read after 2 attempts: "), text
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_check_of_an_unreachable_url_does_not_call_it_broken(here: Path, ipsys: Ipsys) -> None:
+    done = ipsys("check", HTTPS)
+    assert done.code == 3
+    assert done.out.startswith(f"{SHOWN[HTTPS]}: unread: cannot be read after 2 attempts: ")
+    assert "broken" not in done.out
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # s3fs closes its connections after the test
 @pytest.mark.parametrize("line", READ_LOGS)

@@ -124,13 +124,21 @@ class BatchTask:
     work : one of the functions of this module.
     version, stage_versions : of the program that gives the work to the workers.
     divides : True if the work may divide a long log into pieces.
+    targets : by log, the option ``target`` of its work; the driver gives a worker only that of its log.
     """
 
     work: Work
     options: Mapping[str, Any] = field(default_factory=dict)
     divides: bool = False
+    targets: Mapping[LogLocation, Path] = field(default_factory=dict)
     version: str = __version__
     stage_versions: Mapping[str, int] = field(default_factory=lambda: dict(VERSIONS))
+
+    def of_log(self, path: LogLocation) -> BatchTask:
+        """Return the task of one log."""
+        if path not in self.targets:
+            return self
+        return replace(self, options={**self.options, "target": self.targets[path]}, targets={})
 
 
 def perform(task: BatchTask, path: LogLocation) -> LogResult:

@@ -134,7 +134,11 @@ _EXPORT: dict[str, tuple[Any, Any]] = {
         Annotated[
             Path,
             typer.Option(
-                "--output", "-o", metavar="FOLDER", help="The folder for the files, named as the logs."
+                "--output",
+                "-o",
+                metavar="FOLDER",
+                help="The folder for the files, named as the logs. They keep the folders of the logs below "
+                "the folder or pattern that you name.",
             ),
         ],
         inspect.Parameter.empty,
@@ -193,7 +197,11 @@ def add_commands(app: typer.Typer) -> None:
     text = "Compute every run of each log again, and compare it byte for byte." + _MORE
     add("verify", text, _verify, {"run": _RUN, "derived": _DERIVED})
     add("check", "Read each log completely and check it." + _MORE, _check, {"derived": _DERIVED})
-    text = "Export each log to a file of its name in a folder." + _MORE + _REPEAT
+    text = (
+        "Export each log to a file of its name in a folder, which keeps the folders of the logs."
+        + _MORE
+        + _REPEAT
+    )
     add("export", text, _export, _EXPORT)
     app.add_typer(group, name="batch")
 
@@ -252,21 +260,13 @@ def _export(
     overwrite: bool,
     **batch: Any,
 ) -> None:
-    from ipsys_log.batch.exports import check_exports, export_log
+    from ipsys_log.batch.exports import export_log, plan_exports
     from ipsys_log.batch.tasks import BatchTask
-    from ipsys_log.log.log_files import expand_folders
 
     wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
-    paths = expand_folders(logs)
-    suffix = check_exports(paths, output, **wishes)
-    options = {
-        "folder": output.absolute(),
-        "suffix": suffix,
-        "overwrite": overwrite,
-        "derived": _result_folder(derived, "--derived"),
-        **wishes,
-    }
-    _run(BatchTask(export_log, options), logs=logs, paths=paths, **batch)
+    targets = {log: file.absolute() for log, file in plan_exports(logs, output, **wishes).items()}
+    options = {"overwrite": overwrite, "derived": _result_folder(derived, "--derived"), **wishes}
+    _run(BatchTask(export_log, options, targets=targets), logs=logs, paths=[*targets], **batch)
 
 
 def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -331,8 +331,12 @@ def _run(
     paths = expand_folders(logs) if paths is None else paths
     check_present(logs)
     if workers.scheduler is not None:  # its workers have other working directories
-        paths = [path.absolute() if isinstance(path, Path) else path for path in paths]
-        task = replace(task, options={name: _absolute(value) for name, value in task.options.items()})
+        paths = [_absolute(path) for path in paths]
+        task = replace(
+            task,
+            options={name: _absolute(value) for name, value in task.options.items()},
+            targets={_absolute(path): target for path, target in task.targets.items()},
+        )
     results = _collect(task, paths, workers)
     _print(results, table, as_json)
     if not all(result.good for result in results):

@@ -39,8 +39,9 @@ def check(
 ) -> None:
     """Read logs completely and check them: file, channels, times, rates, references and runs.
 
-    The exit code is 0 if all logs are sound, 1 if they are readable with remarks, 2 if one is broken, and 3 if
-    none is broken, but one could not be read, such as a URL without a connection. Runs may have their inputs in another of the given logs."""
+    The exit code is 0 if all logs are sound, 1 if they are readable with remarks, and 2 if one is broken.
+    It is 3 if none is broken, but one could not be read, such as a URL without a connection. Runs may have
+    their inputs in another of the given logs."""
     from ipsys_log.report.soundness import check_json, check_lines
     from ipsys_log.soundness.check import check_logs
     from ipsys_log.soundness.finding import READABLE, SOUND, UNREAD, LogCheck

@@ -46,7 +46,7 @@ class LogCheck:
 
     @property
     def state(self) -> str:
-        """Return ``sound``, ``readable`` (with remarks), ``unread`` (the check could not read it) or ``broken``."""
+        """Return ``sound``, ``readable`` (with remarks), ``unread`` or ``broken``."""
         levels = {finding.level for finding in self.findings}
         for fault in (BROKEN, UNREAD):
             if fault in levels:

@@ -116,7 +116,7 @@ def test_export_of_a_derived_log_follows_its_changes(bucket: Any, derived: Path,
 
     def export() -> LogResult:
         options: dict[str, Any] = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
-        return export_log(url, target.parent, ".csv", derived=derived.parent, **options)
+        return export_log(url, target, derived=derived.parent, **options)
 
     assert export().state == "exported"
     with api.open(PAPER_LAB, derived) as log:
@@ -131,11 +131,13 @@ def test_export_of_a_derived_log_follows_its_changes(bucket: Any, derived: Path,
 
 def test_derived_log_of_another_object_fails(bucket: Any, derived: Path, tmp_path: Path) -> None:
     url = LogUrl(put(bucket, "lab.mcap", (ROOT / "sample_logs" / "small_lab.mcap").read_bytes()))
-    options = {"table": "tracks", "run": None, "robot": None, "format": "csv", "suffix": ".csv"}
+    options = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
     tasks = (
         BatchTask(verify_log, {"folder": derived.parent}),
         BatchTask(check_log, {"folder": derived.parent}),
-        BatchTask(export_log, {"folder": tmp_path / "tables", "derived": derived.parent, **options}),
+        BatchTask(
+            export_log, {"target": tmp_path / "tables" / "lab.csv", "derived": derived.parent, **options}
+        ),
     )
     for task in tasks:
         result = perform(task, url)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
+from itertools import takewhile
 from pathlib import Path, PurePath, PurePosixPath
 
 from ipsys_log.errors import IpsysError
@@ -86,7 +86,8 @@ def _place(location: LogLocation, log: LogLocation) -> PurePath:
 def _below_common_folder(logs: list[LogLocation]) -> dict[LogLocation, PurePath]:
     """Return the paths of logs below their common folder; none of a log that would leave the folder."""
     parts = {log: _parts(log) for log in logs}
-    common = len(os.path.commonprefix([list(of_log) for of_log in parts.values()]))
+    levels = zip(*parts.values(), strict=False)  # of the shortest path
+    common = sum(1 for _ in takewhile(lambda names: len(set(names)) == 1, levels))
     rest = {log: PurePath(*of_log[common:]) for log, of_log in parts.items()}
     return {log: path for log, path in rest.items() if not path.is_absolute() and ".." not in path.parts}
 

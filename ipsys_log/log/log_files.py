@@ -79,8 +79,9 @@ def name_places(logs: Iterable[LogLocation]) -> dict[LogLocation, PurePath]:
 def _place(location: LogLocation, log: LogLocation) -> PurePath:
     if isinstance(log, LogUrl):
         return log.below_pattern
-    is_below = isinstance(location, Path) and location != log
-    return log.relative_to(location) if is_below else PurePath(log.name)
+    if isinstance(location, Path) and location != log:
+        return log.relative_to(location)
+    return PurePath(log.name)
 
 
 def _below_common_folder(logs: list[LogLocation]) -> dict[LogLocation, PurePath]:
@@ -152,7 +153,7 @@ def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogSta
         for path in logs_below(folder):
             yield str(path.relative_to(folder)), path, _state_of_file(path)
         return
-    from ipsys_log.log.remote_object import list_states
+    from ipsys_log.log.remote_listing import list_states
 
     pattern = folder if folder.is_pattern else _all_below(folder)
     for log, state in list_states(pattern).items():
@@ -173,7 +174,8 @@ def _all_below(folder: LogUrl) -> LogUrl:
 
 def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
     if isinstance(location, LogUrl):
-        from ipsys_log.log.remote_object import check_protocol, list_objects
+        from ipsys_log.log.remote_listing import list_objects
+        from ipsys_log.log.remote_requests import check_protocol
 
         if location.is_pattern or location.is_folder:
             yield from list_objects(location if location.is_pattern else _all_below(location))

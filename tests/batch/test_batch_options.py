@@ -187,7 +187,7 @@ def test_exports_keep_the_folders_below_the_named_one(tmp_path: Path) -> None:
     assert files([tmp_path / "logs" / "tue"], tmp_path / "out") == ["am/lab.csv", "lab.csv"]
     assert files([tmp_path / "logs" / "tue/am/lab.mcap"], tmp_path / "out") == ["lab.csv"]
     # A shell gives the files of a pattern one by one.
-    named: list[LogLocation] = sorted((tmp_path / "logs").glob("*/lab.mcap"))
+    named: list[LogLocation] = [*sorted((tmp_path / "logs").glob("*/lab.mcap"))]
     assert files([*named, tmp_path / "logs/a.mcap"], tmp_path / "out") == [
         "mon/lab.csv",
         "tue/lab.csv",

@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from ipsys_log.cli.app import app
-from ipsys_log.log import remote_object
+from ipsys_log.log import remote_requests
 from tests.cli.test_output_names import RIG
 from tests.conftest import ROOT, Ipsys
 from tests.s3_server import put
@@ -119,7 +119,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.copy(PAPER_LAB, tmp_path / "log.mcap")
     (tmp_path / "lab.toml").write_text(RIG)
     (tmp_path / "red.yaml").write_text(lens_yaml(640, 480))
-    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,))
+    monkeypatch.setattr(remote_requests, "_PAUSES_S", (0.0,))
     monkeypatch.chdir(tmp_path)
     before = contents(tmp_path)
     yield tmp_path

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.batch.tasks import UP_TO_DATE, LogResult, name_derived
+from ipsys_log.batch.log_work import UP_TO_DATE, name_derived
+from ipsys_log.batch.tasks import LogResult
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.log_files import name_places, read_log_state

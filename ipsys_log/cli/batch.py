@@ -69,7 +69,8 @@ def _evaluate(**given: Any) -> None:
 
 
 def _replay_each(given: dict[str, Any], **further: Any) -> None:
-    from ipsys_log.batch.tasks import BatchTask, replay_log
+    from ipsys_log.batch.log_work import replay_log
+    from ipsys_log.batch.tasks import BatchTask
 
     options, batch = _divide(given)
     folder = _result_folder(options.pop("output"), "-o")
@@ -87,13 +88,15 @@ def _result_folder(folder: Path | None, option: str) -> Path:
 
 
 def _verify(run: str | None, derived: Path | None, **batch: Any) -> None:
-    from ipsys_log.batch.tasks import BatchTask, verify_log
+    from ipsys_log.batch.log_work import verify_log
+    from ipsys_log.batch.tasks import BatchTask
 
     _run(BatchTask(verify_log, {"run": run, "folder": _result_folder(derived, "--derived")}), **batch)
 
 
 def _check(derived: Path | None, **batch: Any) -> None:
-    from ipsys_log.batch.tasks import BatchTask, check_log
+    from ipsys_log.batch.log_work import check_log
+    from ipsys_log.batch.tasks import BatchTask
 
     _run(BatchTask(check_log, {"folder": _result_folder(derived, "--derived")}), **batch)
 

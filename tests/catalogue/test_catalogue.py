@@ -285,7 +285,7 @@ def test_rows_of_parquet_come_back(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_outdated_runs_are_replayed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ipsys_log.batch.tasks import replay_log
+    from ipsys_log.batch.log_work import replay_log
 
     log = Path(shutil.copy(PAPER_LAB, tmp_path / "log.mcap"))
     options: dict[str, Any] = {"outdated": True, "models": ("rigid",)}

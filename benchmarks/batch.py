@@ -30,17 +30,16 @@ from rounds import Row
 from scenes import CACHE, drawn
 
 from ipsys_log.batch.execution import run_batch
+from ipsys_log.batch.log_work import check_log, replay_log
 from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import (
     BatchTask,
     LogPieces,
     LogResult,
     PieceState,
-    check_log,
     perform,
     perform_or_divide,
     perform_piece,
-    replay_log,
 )
 from ipsys_log.batch.workers import Workers, open_workers
 from ipsys_log.simulation.settings import LabSettings

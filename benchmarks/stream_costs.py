@@ -104,9 +104,9 @@ def _delays_ms(count: int, is_queued: bool) -> list[float]:
 
 def _all_streams() -> StreamSettings:
     """Return two streams of UDP, and one each of MAVLink, VRPN and ROS 2."""
-    vrpn, ros2, mavlink, *udp = free_ports(5)
+    ros2, mavlink, *udp = free_ports(4)
     targets = tuple(f"127.0.0.1:{port}" for port in udp)
-    return StreamSettings(udp=targets, mavlink=(f"{ROBOT}=127.0.0.1:{mavlink}",), vrpn=vrpn, ros2=ros2)
+    return StreamSettings(udp=targets, mavlink=(f"{ROBOT}=127.0.0.1:{mavlink}",), vrpn=0, ros2=ros2)
 
 
 def hand_over_rows(rounds: int, count: int) -> list[Row]:
@@ -132,13 +132,13 @@ def cost_rows(rounds: int) -> list[Row]:
 
     Unlike latencies, it does not depend on other programs.
     """
-    *ports, udp, mavlink = free_ports(5)
+    ros2, udp, mavlink = free_ports(3)
     streams = {
         "UDP": StreamSettings(udp=(f"127.0.0.1:{udp}",)),
         "MAVLink": StreamSettings(mavlink=(f"{ROBOT}=127.0.0.1:{mavlink}",)),
-        "VRPN": StreamSettings(vrpn=ports[0]),
-        "ROS 2": StreamSettings(ros2=ports[1]),
-        "Foxglove": StreamSettings(foxglove=ports[2]),
+        "VRPN": StreamSettings(vrpn=0),
+        "ROS 2": StreamSettings(ros2=ros2),
+        "Foxglove": StreamSettings(foxglove=0),
     }
     return [
         Row(f"processor time, {name}", tuple(_cost_ms(settings) for _ in range(rounds)), "ms/message")

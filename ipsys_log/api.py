@@ -220,7 +220,7 @@ def check(
 
     Returns
     -------
-    A result for each log: its ``state`` is ``sound``, ``readable`` (with remarks) or ``broken``.
+    A result for each log: its ``state`` is ``sound``, ``readable`` (with remarks), ``unread`` or ``broken``.
 
     Examples
     --------

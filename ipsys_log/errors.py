@@ -8,6 +8,7 @@ __all__ = [
     "IpsysError",
     "LogError",
     "SizeError",
+    "UnreadError",
     "WriteError",
     "disk_advice",
     "is_full",
@@ -26,6 +27,10 @@ class IpsysError(Exception):
 
 class LogError(IpsysError):
     """A log file that cannot be read or written."""
+
+
+class UnreadError(LogError):
+    """A log whose bytes cannot be read now: its content is unknown, and not known to be damaged."""
 
 
 class WriteError(LogError):

@@ -150,11 +150,12 @@ class _Batch:
         key = (self._name, self._submitted)
         self._submitted += 1
         log, submit = attempt.log, self._workers.client.submit
+        task = self._task.of_log(log.path)
         if attempt.piece is None:
             work = perform_or_divide if self._task.divides and log.is_divided else perform
-            future = submit(work, self._task, log.path, key=key, pure=False)
+            future = submit(work, task, log.path, key=key, pure=False)
         else:
-            future = submit(perform_piece, self._task, log.path, attempt.piece, key=key, pure=False)
+            future = submit(perform_piece, task, log.path, attempt.piece, key=key, pure=False)
         self._running[future] = attempt
         future.add_done_callback(self._arrived.put)
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ipsys_log.analysis.frame_gaps import find_gaps
 from ipsys_log.api import ModelEvaluation
 from ipsys_log.errors import IpsysError, os_error_text, reason_without
-from ipsys_log.exchange.parquet_rows import Columns
+from ipsys_log.exchange.parquet_rows import Columns, escape_surrogates
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation, LogState
+from ipsys_log.log.log_files import read_log_state
 from ipsys_log.messages.channels import EVALUATION, EVENTS, MEASUREMENTS
+from ipsys_log.runs.output import check_source
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.units import NS_PER_S
@@ -25,6 +28,9 @@ COLUMNS: Columns = {
     "bytes": "int64",
     "changed_ns": "int64",
     "object_version": "string",
+    "derived": "string",
+    "derived_bytes": "int64",
+    "derived_changed_ns": "int64",
     "error": "string",
     "start_utc": "time",
     "end_utc": "time",
@@ -81,19 +87,27 @@ class Baseline:
 
 
 def read_row(
-    path: LogLocation, name: str, state: LogState | None, baseline: Baseline | None
+    path: LogLocation,
+    name: str,
+    columns: Mapping[str, Any],
+    baseline: Baseline | None,
+    derived: Path | None = None,
 ) -> dict[str, Any]:
     """Return the row of a log; the row of a log that cannot be read has its error instead of contents.
 
     Parameters
     ----------
     name : of the log in the catalogue.
-    state : of the log before it is read, so that a later change is noticed; None: there was no such file.
+    columns : those of :func:`state_columns` before the log is read, so that a later change is noticed.
     baseline : for the drift of the cameras since then; None: no drift.
+    derived : the derived log of the log, which is read, too; None: there is none.
     """
-    row: dict[str, Any] = {"log": name, **state_columns(state)}
+    row: dict[str, Any] = {"log": name, **columns}
+    logs = [path] if derived is None else [path, derived]
     try:
-        with Session([path]) as session:
+        if derived is not None:
+            check_source([path], derived)
+        with Session(logs) as session:
             row |= _contents(session)
     except IpsysError as error:
         return row | {"error": reason_without(path, error).partition("\n")[0]}
@@ -102,14 +116,22 @@ def read_row(
     return row | (_drift(path, baseline) if baseline is not None else {})
 
 
-def state_columns(state: LogState | None) -> dict[str, Any]:
-    """Return the columns that show a change of a log: a log with the same ones is not read again."""
-    if state is None:
-        return dict.fromkeys(("bytes", "changed_ns", "object_version"))
+def state_columns(state: LogState | None, derived: Path | None = None) -> dict[str, Any]:
+    """Return the columns that show a change of a log: a log with the same ones is not read again.
+
+    Parameters
+    ----------
+    state : of the log; None: there is no such file.
+    derived : the derived log of the log; None: there is none.
+    """
+    of_derived = None if derived is None else read_log_state(derived)
     return {
-        "bytes": state.size,
-        "changed_ns": state.changed_ns,
-        "object_version": state.version or None,
+        "bytes": None if state is None else state.size,
+        "changed_ns": None if state is None else state.changed_ns,
+        "object_version": None if state is None else state.version or None,
+        "derived": None if derived is None else escape_surrogates(str(derived)),
+        "derived_bytes": None if of_derived is None else of_derived.size,
+        "derived_changed_ns": None if of_derived is None else of_derived.changed_ns,
     }
 
 

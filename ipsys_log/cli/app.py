@@ -153,7 +153,7 @@ ipsys info monday.mcap
 ipsys info s3://lab/monday.mcap          # at a URL: docs/scale.md
 """,
     "check": """
-ipsys check monday.mcap                  # is it sound? exit code 0, 1 or 2
+ipsys check monday.mcap                  # is it sound? exit code 0 to 3
 ipsys check lab.mcap derived.mcap        # derived.mcap has runs of lab.mcap
 ipsys check *.mcap --json                # also notes, for programs
 """,

@@ -2,174 +2,27 @@
 
 from __future__ import annotations
 
-import inspect
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+from ipsys_log.cli.batch_options import DERIVED, EXPORT, FOLDER, LOGS, OUTDATED, RUN, WORKERS
+from ipsys_log.cli.batch_progress import batch_bar
 from ipsys_log.cli.console import console, remarks, say
-from ipsys_log.cli.options import AsJson, LogList, check_present, log_argument
+from ipsys_log.cli.options import check_present
 from ipsys_log.cli.stages import build_command, options_until, replay_options
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
-
     from ipsys_log.batch.settings import WorkerSettings
     from ipsys_log.batch.tasks import BatchTask, LogResult
     from ipsys_log.log.location import LogLocation
 
 __all__ = ["add_commands"]
 
-_Path = Optional[Path]  # noqa: UP045
-_Text = Optional[str]  # noqa: UP045
-# A task can take minutes: the rate is that of the last half hour.
-_RATE_PERIOD_S = 1800.0
-
-_LOGS = (
-    Annotated[
-        LogList,
-        log_argument(
-            help="Logs, files or URLs, each one on its own. A folder, or a URL that ends with /, stands for "
-            "all logs below it."
-        ),
-    ],
-    inspect.Parameter.empty,
-)
-_FOLDER = (
-    Annotated[
-        _Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FOLDER",
-            help="The folder for the results of logs that cannot be appended to: URLs and read-only files. "
-            "Default: the working folder.",
-        ),
-    ],
-    None,
-)
-_DERIVED_HELP = (
-    "The folder of -o in ipsys batch replay, with the results of logs that cannot be appended to. Each log "
-    "is read together with its derived log. Default: the working folder."
-)
-_DERIVED = (
-    Annotated[_Path, typer.Option("--derived", "-o", metavar="FOLDER", help=_DERIVED_HELP)],
-    None,
-)
-# The options of the workers and of the result, which all commands of the group have.
-_WORKERS: dict[str, tuple[Any, Any]] = {
-    "scheduler": (
-        Annotated[
-            _Text,
-            typer.Option(
-                metavar="ADDRESS",
-                help="Use the workers of this Dask scheduler, such as tls://head:8786. Access to a scheduler "
-                "means code execution on its workers, so it must use certificates. Default: processes on "
-                "this machine.",
-            ),
-        ],
-        None,
-    ),
-    "workers": (
-        Annotated[
-            Optional[int],  # noqa: UP045
-            typer.Option(
-                min=1, metavar="N", help="Worker processes on this machine. Default: one for each core."
-            ),
-        ],
-        None,
-    ),
-    "memory_limit": (
-        Annotated[
-            _Text,
-            typer.Option(
-                metavar="SIZE", help="Memory of each worker process, such as 2GB. Default: an equal share."
-            ),
-        ],
-        None,
-    ),
-    "tls_ca": (
-        Annotated[_Path, typer.Option(metavar="FILE", help="Certificate of the authority, for --scheduler.")],
-        None,
-    ),
-    "tls_cert": (
-        Annotated[_Path, typer.Option(metavar="FILE", help="Your certificate, for --scheduler.")],
-        None,
-    ),
-    "tls_key": (
-        Annotated[_Path, typer.Option(metavar="FILE", help="The key of your certificate, for --scheduler.")],
-        None,
-    ),
-    "insecure": (
-        Annotated[
-            bool,
-            typer.Option(
-                "--insecure",
-                help="Permit a scheduler without certificates: each program that reaches it can run code.",
-            ),
-        ],
-        False,
-    ),
-    "table": (
-        Annotated[
-            _Path,
-            typer.Option(metavar="FILE", help="Write the results to a Parquet file: a row for each log."),
-        ],
-        None,
-    ),
-    "as_json": (AsJson, False),
-}
-_OUTDATED = (
-    Annotated[bool, typer.Option("--outdated", help="Replay only logs that hold outdated runs.")],
-    False,
-)
-_RUN = (Annotated[_Text, typer.Option("--run", metavar="NAME", help="Use only this run.")], None)
-_EXPORT: dict[str, tuple[Any, Any]] = {
-    "output": (
-        Annotated[
-            Path,
-            typer.Option(
-                "--output", "-o", metavar="FOLDER", help="The folder for the files, named as the logs."
-            ),
-        ],
-        inspect.Parameter.empty,
-    ),
-    "format_": (
-        Annotated[
-            str,
-            typer.Option("--format", metavar="NAME", help="csv, parquet, tum, kitti, ros2, mp4 or coco."),
-        ],
-        "csv",
-    ),
-    "channel": (
-        Annotated[
-            str,
-            typer.Option(
-                metavar="NAME",
-                help="The table to export: tracks, positions, markers, camera_points, measurements, events, "
-                "latency or truth.",
-            ),
-        ],
-        "tracks",
-    ),
-    "run": (
-        Annotated[
-            _Text, typer.Option("--run", metavar="NAME", help="Export this run instead of the newest.")
-        ],
-        None,
-    ),
-    "robot": (Annotated[_Text, typer.Option(metavar="NAME", help="Export only this robot.")], None),
-    "derived": (Annotated[_Path, typer.Option("--derived", metavar="FOLDER", help=_DERIVED_HELP)], None),
-    "overwrite": (
-        Annotated[bool, typer.Option("--overwrite", help="Export all logs, also those with a newer file.")],
-        False,
-    ),
-}
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
 _REPEAT = " After a failure or an interrupt, repeat the command: it computes only what is missing."
 
@@ -182,19 +35,23 @@ def add_commands(app: typer.Typer) -> None:
     )
 
     def add(name: str, text: str, work: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> None:
-        options = {"logs": _LOGS, **options, **_WORKERS}
+        options = {"logs": LOGS, **options, **WORKERS}
         group.command(name, help=text)(build_command(options, work))
 
     text = "Run the missing stages of each log, and append their results to it." + _MORE + _REPEAT
-    add("replay", text, _replay, {**_stage_options(None), "output": _FOLDER, "outdated": _OUTDATED})
+    add("replay", text, _replay, {**_stage_options(None), "output": FOLDER, "outdated": OUTDATED})
     text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
     text += _MORE + _REPEAT
-    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _FOLDER})
+    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": FOLDER})
     text = "Compute every run of each log again, and compare it byte for byte." + _MORE
-    add("verify", text, _verify, {"run": _RUN, "derived": _DERIVED})
-    add("check", "Read each log completely and check it." + _MORE, _check, {"derived": _DERIVED})
-    text = "Export each log to a file of its name in a folder." + _MORE + _REPEAT
-    add("export", text, _export, _EXPORT)
+    add("verify", text, _verify, {"run": RUN, "derived": DERIVED})
+    add("check", "Read each log completely and check it." + _MORE, _check, {"derived": DERIVED})
+    text = (
+        "Export each log to a file of its name in a folder, which keeps the folders of the logs."
+        + _MORE
+        + _REPEAT
+    )
+    add("export", text, _export, EXPORT)
     app.add_typer(group, name="batch")
 
 
@@ -212,7 +69,8 @@ def _evaluate(**given: Any) -> None:
 
 
 def _replay_each(given: dict[str, Any], **further: Any) -> None:
-    from ipsys_log.batch.tasks import BatchTask, replay_log
+    from ipsys_log.batch.log_work import replay_log
+    from ipsys_log.batch.tasks import BatchTask
 
     options, batch = _divide(given)
     folder = _result_folder(options.pop("output"), "-o")
@@ -230,13 +88,15 @@ def _result_folder(folder: Path | None, option: str) -> Path:
 
 
 def _verify(run: str | None, derived: Path | None, **batch: Any) -> None:
-    from ipsys_log.batch.tasks import BatchTask, verify_log
+    from ipsys_log.batch.log_work import verify_log
+    from ipsys_log.batch.tasks import BatchTask
 
     _run(BatchTask(verify_log, {"run": run, "folder": _result_folder(derived, "--derived")}), **batch)
 
 
 def _check(derived: Path | None, **batch: Any) -> None:
-    from ipsys_log.batch.tasks import BatchTask, check_log
+    from ipsys_log.batch.log_work import check_log
+    from ipsys_log.batch.tasks import BatchTask
 
     _run(BatchTask(check_log, {"folder": _result_folder(derived, "--derived")}), **batch)
 
@@ -252,26 +112,18 @@ def _export(
     overwrite: bool,
     **batch: Any,
 ) -> None:
-    from ipsys_log.batch.exports import check_exports, export_log
+    from ipsys_log.batch.exports import export_log, plan_exports
     from ipsys_log.batch.tasks import BatchTask
-    from ipsys_log.log.log_files import expand_folders
 
     wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
-    paths = expand_folders(logs)
-    suffix = check_exports(paths, output, **wishes)
-    options = {
-        "folder": output.absolute(),
-        "suffix": suffix,
-        "overwrite": overwrite,
-        "derived": _result_folder(derived, "--derived"),
-        **wishes,
-    }
-    _run(BatchTask(export_log, options), logs=logs, paths=paths, **batch)
+    targets = {log: file.absolute() for log, file in plan_exports(logs, output, **wishes).items()}
+    options = {"overwrite": overwrite, "derived": _result_folder(derived, "--derived"), **wishes}
+    _run(BatchTask(export_log, options, targets=targets), logs=logs, paths=[*targets], **batch)
 
 
 def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the options of the work, and those of the batch."""
-    of_batch = {"logs", *_WORKERS}
+    of_batch = {"logs", *WORKERS}
     return (
         {name: value for name, value in given.items() if name not in of_batch},
         {name: value for name, value in given.items() if name in of_batch},
@@ -331,8 +183,12 @@ def _run(
     paths = expand_folders(logs) if paths is None else paths
     check_present(logs)
     if workers.scheduler is not None:  # its workers have other working directories
-        paths = [path.absolute() if isinstance(path, Path) else path for path in paths]
-        task = replace(task, options={name: _absolute(value) for name, value in task.options.items()})
+        paths = [_absolute(path) for path in paths]
+        task = replace(
+            task,
+            options={name: _absolute(value) for name, value in task.options.items()},
+            targets={_absolute(path): target for path, target in task.targets.items()},
+        )
     results = _collect(task, paths, workers)
     _print(results, table, as_json)
     if not all(result.good for result in results):
@@ -350,7 +206,7 @@ def _collect(task: BatchTask, paths: Sequence[LogLocation], settings: WorkerSett
     by_log: dict[str, LogResult] = {}
     with open_workers(settings, most_tasks(paths) if task.divides else len(paths)) as workers:
         say(f"dashboard: {workers.dashboard}")
-        with _batch_bar(len(paths)) as (show, show_pieces):
+        with batch_bar(len(paths)) as (show, show_pieces):
             for result in run_batch(workers, task, paths, show_pieces):
                 by_log[result.log] = result
                 show(result)
@@ -371,43 +227,3 @@ def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> N
     if table is not None:
         write_results(table, results)
         say(f"{table} written: a row for each log")
-
-
-@contextmanager
-def _batch_bar(
-    count: int,
-) -> Iterator[tuple[Callable[[LogResult], None], Callable[[LogLocation, int, int], None]]]:
-    """Yield functions that show a result, and the pieces of a log, as bars with rate and remaining time."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    if not remarks.is_terminal:
-        yield lambda result: None, lambda log, done, total: None
-        return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=None),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}", justify="right"),
-        TextColumn("{task.fields[failures]}", justify="right"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=remarks, transient=True, speed_estimate_period=_RATE_PERIOD_S) as bar:
-        task, failures = bar.add_task("logs", total=count, rate="", failures="0 failed"), 0
-        of_log: dict[str, TaskID] = {}
-
-        def show(result: LogResult) -> None:
-            nonlocal failures
-            failures += not result.good
-            speed = bar.tasks[0].speed
-            rate = f"{60 * speed:,.1f} logs/min" if speed else ""
-            bar.update(task, advance=1, rate=rate, failures=f"{failures} failed")
-            if result.log in of_log:
-                bar.remove_task(of_log.pop(result.log))
-
-        def show_pieces(log: LogLocation, done: int, total: int) -> None:
-            name = str(log)
-            if name not in of_log:
-                of_log[name] = bar.add_task(f"pieces of {log.name}", rate="", failures="")
-            bar.update(of_log[name], completed=done, total=total)
-
-        yield show, show_pieces

@@ -51,6 +51,15 @@ def catalogue(
             "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
         ),
     ] = None,
+    derived: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--derived",
+            metavar="FOLDER",
+            help="The folder of -o in ipsys batch replay, with the results of logs that cannot be appended "
+            "to. They count with their log. Default: the working folder.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a table with a row for each log: cameras, times, runs, versions, errors of models, gaps, drift.
@@ -69,6 +78,8 @@ def catalogue(
     check_installed("catalogue needs", "pyarrow")
     check_parquet_name(output, "-o")
     check_file(output, "-o", [])
+    if derived is not None and not derived.is_dir():
+        raise IpsysError(f"--derived {derived}: is not a folder; name the folder of the derived logs")
     if model_from is not None and baseline is None:
         raise IpsysError("--model-from: has an effect only with --baseline; give the log before all moves")
     since = None
@@ -77,7 +88,9 @@ def catalogue(
         since = Baseline(log, log if model_from is None else _log("--model-from", model_from))
     place = parse_location(folder)
     with progress_bar(()) as progress:
-        update = update_catalogue(place, output, since, lambda done, total: progress("logs", done, total))
+        update = update_catalogue(
+            place, output, since, derived, lambda done, total: progress("logs", done, total)
+        )
     if as_json:
         print(json.dumps(asdict(update), indent=2))  # noqa: T201
         return

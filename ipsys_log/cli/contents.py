@@ -40,10 +40,11 @@ def check(
     """Read logs completely and check them: file, channels, times, rates, references and runs.
 
     The exit code is 0 if all logs are sound, 1 if they are readable with remarks, and 2 if one is broken.
-    Runs may have their inputs in another of the given logs."""
+    It is 3 if none is broken, but one could not be read, such as a URL without a connection. Runs may have
+    their inputs in another of the given logs."""
     from ipsys_log.report.soundness import check_json, check_lines
     from ipsys_log.soundness.check import check_logs
-    from ipsys_log.soundness.finding import READABLE, SOUND, LogCheck
+    from ipsys_log.soundness.finding import READABLE, SOUND, UNREAD, LogCheck
 
     with progress_bar(()) as progress:
         checks = check_logs(logs, progress)
@@ -53,7 +54,7 @@ def check(
         for one in checks:
             for line in check_lines(one, details):
                 console.print(line)
-    code = {SOUND: 0, READABLE: 1}.get(LogCheck.worst(checks), 2)
+    code = {SOUND: 0, READABLE: 1, UNREAD: 3}.get(LogCheck.worst(checks), 2)
     if code:
         raise typer.Exit(code)
 

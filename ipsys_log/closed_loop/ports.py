@@ -22,7 +22,7 @@ class Ports:
 
     Attributes
     ----------
-    wheels : the simulated wheels.
+    wheels : the simulated wheels; 0: they bind any free port themselves.
     server : the server of VRPN or ROS 2; None with UDP.
     positions : by number of the robot, the port that its program gets.
     relays : by number of the robot, the port of its relay; empty without relays.
@@ -50,7 +50,9 @@ def find_ports(first: int, robots: int, has_server: bool, has_relay: bool) -> Po
         A port is in use.
     """
     own = 0 if has_server and not has_relay else robots
-    wheels, *free = _bindable(first, 1 + has_server + own + (robots if has_relay else 0))
+    count = has_server + own + (robots if has_relay else 0)
+    # A port that is bound later may be taken before, so the wheels choose their own.
+    wheels, *free = _bindable(first, 1 + count) if first else (0, *_bindable(0, count))
     server = free.pop(0) if has_server else None
     shared = () if server is None else (server,) * robots
     return Ports(wheels, server, tuple(free[:own]) or shared, tuple(free[own:]))

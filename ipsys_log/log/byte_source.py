@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import BoundError, ReadLimits
 from ipsys_log.log.location import LogLocation
 
@@ -178,14 +178,14 @@ def file_identity(fd: int) -> tuple[object, object]:
 
 
 def open_for_reading(path: Path) -> int:
-    """Open a file for reading; return its file descriptor, or raise a one-line `LogError`."""
+    """Open a file for reading; return its file descriptor, or raise a one-line `UnreadError`."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
-        raise LogError(f"{path} does not exist") from None
+        raise UnreadError(f"{path} does not exist") from None
     except OSError as error:
-        raise LogError(f"{path} cannot be opened: {error.strerror}") from None
+        raise UnreadError(f"{path} cannot be opened: {error.strerror}") from None
     if not stat.S_ISREG(os.fstat(fd).st_mode):
         os.close(fd)
-        raise LogError(f"{path} cannot be read as a log: it is not a file")
+        raise UnreadError(f"{path} cannot be read as a log: it is not a file")
     return fd

@@ -151,7 +151,7 @@ def find_logs(texts: Iterable[str | os.PathLike[str] | LogUrl]) -> list[LogLocat
     found: list[LogLocation] = []
     for location in map(parse_location, texts):
         if isinstance(location, LogUrl) and location.is_pattern:
-            from ipsys_log.log.remote_object import list_objects
+            from ipsys_log.log.remote_listing import list_objects
 
             found += list_objects(location)
         else:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
+from itertools import takewhile
+from pathlib import Path, PurePath, PurePosixPath
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogState, LogUrl
 
-__all__ = ["expand_folders", "logs_below", "read_log_state", "states_below"]
+__all__ = ["expand_folders", "logs_below", "name_places", "read_log_state", "states_below"]
 
 _ALL_BELOW = "**/*.mcap"
 
@@ -46,10 +47,64 @@ def expand_folders(logs: Iterable[LogLocation]) -> list[LogLocation]:
     >>> expand_folders([Path("b.mcap"), Path("a.mcap"), Path("./b.mcap")])
     [PosixPath('b.mcap'), PosixPath('a.mcap')]
     """
-    found: dict[object, LogLocation] = {}
+    return [log for log, _ in _expand(logs)]
+
+
+def name_places(logs: Iterable[LogLocation]) -> dict[LogLocation, PurePath]:
+    """Return the logs of some locations, each with a relative path for its results.
+
+    It is the path below the folder or the pattern that names the log. Logs with the same path get the path
+    below their common folder.
+
+    Raises
+    ------
+    IpsysError
+        As :func:`expand_folders`.
+
+    Examples
+    --------
+    >>> [str(path) for path in name_places([Path("mon/lab.mcap"), Path("tue/lab.mcap")]).values()]
+    ['mon/lab.mcap', 'tue/lab.mcap']
+    """
+    places = {log: _place(location, log) for log, location in _expand(logs)}
+    same: dict[PurePath, list[LogLocation]] = {}
+    for log, place in places.items():
+        same.setdefault(place, []).append(log)
+    for group in same.values():
+        if len(group) > 1:
+            places |= _below_common_folder(group)
+    return places
+
+
+def _place(location: LogLocation, log: LogLocation) -> PurePath:
+    if isinstance(log, LogUrl):
+        return log.below_pattern
+    if isinstance(location, Path) and location != log:
+        return log.relative_to(location)
+    return PurePath(log.name)
+
+
+def _below_common_folder(logs: list[LogLocation]) -> dict[LogLocation, PurePath]:
+    """Return the paths of logs below their common folder; none of a log that would leave the folder."""
+    parts = {log: _parts(log) for log in logs}
+    levels = zip(*parts.values(), strict=False)  # of the shortest path
+    common = sum(1 for _ in takewhile(lambda names: len(set(names)) == 1, levels))
+    rest = {log: PurePath(*of_log[common:]) for log, of_log in parts.items()}
+    return {log: path for log, path in rest.items() if not path.is_absolute() and ".." not in path.parts}
+
+
+def _parts(log: LogLocation) -> tuple[str, ...]:
+    if isinstance(log, LogUrl):
+        return PurePosixPath(str(log).partition("://")[2]).parts
+    return log.absolute().parts
+
+
+def _expand(logs: Iterable[LogLocation]) -> list[tuple[LogLocation, LogLocation]]:
+    """Return each log once, with the location that names it."""
+    found: dict[object, tuple[LogLocation, LogLocation]] = {}
     for location in logs:
         for log in _logs_of(location):
-            found.setdefault(_identity(log), log)
+            found.setdefault(_identity(log), (log, location))
     return list(found.values())
 
 
@@ -98,7 +153,7 @@ def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogSta
         for path in logs_below(folder):
             yield str(path.relative_to(folder)), path, _state_of_file(path)
         return
-    from ipsys_log.log.remote_object import list_states
+    from ipsys_log.log.remote_listing import list_states
 
     pattern = folder if folder.is_pattern else _all_below(folder)
     for log, state in list_states(pattern).items():
@@ -119,7 +174,8 @@ def _all_below(folder: LogUrl) -> LogUrl:
 
 def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
     if isinstance(location, LogUrl):
-        from ipsys_log.log.remote_object import check_protocol, list_objects
+        from ipsys_log.log.remote_listing import list_objects
+        from ipsys_log.log.remote_requests import check_protocol
 
         if location.is_pattern or location.is_folder:
             yield from list_objects(location if location.is_pattern else _all_below(location))

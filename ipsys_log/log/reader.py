@@ -15,7 +15,7 @@ import numpy as np
 from mcap import records as mcap
 from numpy.typing import NDArray
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import ReadLimits
 from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
@@ -401,7 +401,7 @@ def _open_file(path: Path) -> tuple[FileBytes, Contents]:
             break
         time.sleep(_PAUSE_S)
     if fault is None or (isinstance(fault, NoFooterError) and is_being_written(path)):
-        raise LogError(f"{path} is being recorded or written now: try again when this has ended")
+        raise UnreadError(f"{path} is being recorded or written now: try again when this has ended")
     raise fault
 
 

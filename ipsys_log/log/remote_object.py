@@ -1,63 +1,31 @@
-"""Objects in stores and on servers: exact byte ranges of one version, with fsspec.
+"""Objects in stores and on servers: exact byte ranges of one version.
 
 Each request asks for the version that was opened: by its ETag where the protocol can do this (S3, HTTP), else
-by a look at size and time after the request. A request that fails for a reason that may pass is repeated.
+by a look at size and time after the request.
 """
 
 from __future__ import annotations
 
-import re
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import datetime
-from typing import Any, TypeVar
+from typing import Any
 
-from ipsys_log.errors import LogError
-from ipsys_log.extras import check_installed
+from ipsys_log.errors import UnreadError
 from ipsys_log.log.location import LogState, LogUrl
-from ipsys_log.plain_text import plain_text
-from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "RemoteObject",
-    "check_protocol",
-    "list_objects",
-    "list_states",
-    "open_object",
-    "read_state",
-]
-
-_PAUSES_S = (0.1, 0.4, 1.6, 4.0)
-_SELF_REPEATING = ("s3", "s3a", "gs", "gcs")  # their file systems repeat a request some times themselves
-_LONGEST_REASON = 200
-# HTTP status codes of requests that may succeed when they are repeated.
-_PASSING_STATUS = (408, 425, 429)
-_CHANGED_STATUS = 412
-_DENIED_STATUS = (401, 403)
-# Errors that a repetition does not change. A file system may raise any other error for a lost connection.
-_FINAL = (
-    *(PermissionError, IsADirectoryError, NotADirectoryError, NotImplementedError, ImportError, LookupError),
-    ValueError,
-)
-_NO_CREDENTIALS = "NoCredentialsError"  # of botocore, which is imported only for its URLs
-_FLAT = ("s3", "s3a", "gs", "gcs")  # stores without folders, whose file systems list by a prefix
-_BUGS = (TypeError, AttributeError, NameError, AssertionError)
-# The fields of an entry of fsspec that tell a version; each file system has some of them.
-_VERSION_FIELDS = (
-    *("ETag", "etag", "generation", "Last-Modified", "LastModified", "last_modified", "mtime"),
-    *("modified", "created", "md5Hash", "content_md5"),
+from ipsys_log.log.remote_requests import (
+    ChangedError,
+    NoRangesError,
+    changed_ns_of,
+    failure_of,
+    open_filesystem,
+    repeat_request,
+    version_of,
 )
 
-T = TypeVar("T")
+__all__ = ["RemoteObject", "open_object", "read_state"]
 
-
-class _ChangedError(Exception):
-    """An object that is not the one that was opened."""
-
-
-class _NoRangesError(ValueError):
-    """A server that sends whole objects only."""
+Read = Callable[[int, int], bytes]
+Opened = tuple[Mapping[str, Any], Read]  # the entry of an object, and the function that reads its version
 
 
 @dataclass(slots=True)
@@ -95,12 +63,12 @@ class RemoteObject:
         def ask() -> bytes:
             data = self.read_pinned(start, end)
             if len(data) > end - start:
-                raise _NoRangesError
+                raise NoRangesError
             if len(data) < end - start:
                 raise ConnectionError(f"{len(data)} of {end - start} bytes arrived")
             return data
 
-        data = _repeat(self.url, ask)
+        data = repeat_request(self.url, ask)
         self.requests += 1
         self.bytes_fetched += len(data)
         return data
@@ -114,38 +82,16 @@ def open_object(url: LogUrl) -> RemoteObject:
     LogError
         The protocol is not known, its package is missing, or the object cannot be found.
     """
-    filesystem, path = _filesystem(url)
+    filesystem, path = open_filesystem(url)
     open_pinned = _OPENERS.get(url.scheme, _open_and_look)
-    entry, read = _repeat(url, lambda: open_pinned(filesystem, path))
+    entry, read = repeat_request(url, lambda: open_pinned(filesystem, path))
     size = entry.get("size")
     if entry.get("type") == "directory":
-        raise LogError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
+        raise UnreadError(f"{url} cannot be read as a log: it is a folder; to read its logs: {url}/*.mcap")
     if size is None or entry.get("partial") is False:
-        raise _failure(url, _NoRangesError())
-    version, changed_ns = _version_of(entry), _changed_ns(entry)
+        raise failure_of(url, NoRangesError())
+    version, changed_ns = version_of(entry), changed_ns_of(entry)
     return RemoteObject(url, filesystem, path, int(size), version, read, changed_ns)
-
-
-def list_objects(pattern: LogUrl) -> list[LogUrl]:
-    """Return the objects that match a pattern, by name.
-
-    Raises
-    ------
-    LogError
-        Nothing matches, or the store cannot be listed.
-    """
-    return list(_list_entries(pattern))
-
-
-def list_states(pattern: LogUrl) -> dict[LogUrl, LogState | None]:
-    """Return the objects that match a pattern, by name, with their states; None if the list has no sizes.
-
-    Raises
-    ------
-    LogError
-        As :func:`list_objects`.
-    """
-    return {url: _state(entry) for url, entry in _list_entries(pattern).items()}
 
 
 def read_state(url: LogUrl) -> LogState:
@@ -158,107 +104,6 @@ def read_state(url: LogUrl) -> LogState:
     """
     source = open_object(url)
     return LogState(source.size, source.changed_ns, "; ".join(source.version))
-
-
-def check_protocol(url: LogUrl) -> None:
-    """Check that the protocol of a URL is known, and its package installed; there is no request.
-
-    Raises
-    ------
-    LogError
-        As :func:`open_object`.
-    """
-    _filesystem(url)
-
-
-def _list_entries(pattern: LogUrl) -> dict[LogUrl, Mapping[str, Any]]:
-    filesystem, path = _filesystem(pattern)
-    find = _find_flat if pattern.scheme in _FLAT else _find_by_folder
-    matches = _repeat(pattern, lambda: find(filesystem, path))
-    if not matches:
-        raise LogError(f"{pattern}: no object matches; check the pattern and the permission to list")
-    return {LogUrl(pattern.url, name): entry for name, entry in sorted(matches.items())}
-
-
-def _find_by_folder(filesystem: Any, path: str) -> dict[str, Mapping[str, Any]]:
-    return _as_entries(filesystem.glob(path, detail=True))
-
-
-def _find_flat(filesystem: Any, path: str) -> dict[str, Mapping[str, Any]]:
-    """List all objects that begin as the pattern does, page by page, and select those that match.
-
-    A glob of fsspec would list each folder of such a store, with three requests for each of them.
-    """
-    from fsspec.utils import glob_translate
-
-    folder, _, start = re.split(r"[*?\[]", path, maxsplit=1)[0].rpartition("/")
-    matches = re.compile(glob_translate(path)).fullmatch
-    entries = _as_entries(filesystem.find(folder, prefix=start, detail=True))
-    return {name: entry for name, entry in entries.items() if matches(name)}
-
-
-def _as_entries(found: Mapping[Any, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    return {str(name): entry for name, entry in found.items() if entry.get("type") != "directory"}
-
-
-def _state(entry: Mapping[str, Any]) -> LogState | None:
-    size = entry.get("size")
-    if size is None:
-        return None
-    return LogState(int(size), _changed_ns(entry), "; ".join(_version_of(entry)))
-
-
-def _changed_ns(entry: Mapping[str, Any]) -> int | None:
-    """Return the time of the last change; file systems give it as a time, as seconds, or not at all."""
-    for name in ("LastModified", "last_modified", "mtime", "modified", "updated"):
-        value = entry.get(name)
-        if isinstance(value, datetime):
-            return int(value.timestamp() * NS_PER_S)
-        if isinstance(value, int | float):
-            return int(value * NS_PER_S)
-    return None
-
-
-def _filesystem(url: LogUrl) -> tuple[Any, str]:
-    check_installed(f"{url}: a log at a URL needs", "fsspec")
-    from fsspec.core import url_to_fs
-    from fsspec.registry import known_implementations
-
-    known = known_implementations.get(url.scheme, {})
-    try:
-        filesystem, path = url_to_fs(url.url, use_listings_cache=False)
-    except ImportError:
-        reason = plain_text(str(known.get("err", "its package is missing")), longest=_LONGEST_REASON)
-        package = _PACKAGES.get(url.scheme)
-        advice = f"pip install {package}" if package else reason
-        raise LogError(f"{url}: logs at {url.scheme}:// need another package: {advice}") from None
-    except ValueError as error:
-        if not known:
-            raise LogError(
-                f"{url}: the protocol {url.scheme}:// is not known; use a path, or a URL such as "
-                "s3://bucket/log.mcap or https://host/log.mcap"
-            ) from None
-        raise LogError(f"{url} cannot be opened: {_reason(url, error)}") from None
-    return filesystem, url.key or path
-
-
-# The package of a protocol, for the advice; other protocols get the advice of fsspec.
-_PACKAGES = {
-    **dict.fromkeys(("s3", "s3a"), "s3fs"),
-    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
-    **dict.fromkeys(("az", "abfs", "abfss", "adl"), "adlfs"),
-    **dict.fromkeys(("ssh", "sftp"), "paramiko"),
-    **dict.fromkeys(("http", "https"), "aiohttp"),
-}
-
-
-def _version_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
-    fields = [f"{name}={entry[name]}" for name in _VERSION_FIELDS if entry.get(name)]
-    return (f"size={entry.get('size')}", *fields)
-
-
-Read = Callable[[int, int], bytes]
-Opened = tuple[Mapping[str, Any], Read]  # the entry of an object, and the function that reads its version
 
 
 def _open_s3(filesystem: Any, path: str) -> Opened:
@@ -283,7 +128,7 @@ def _open_http(filesystem: Any, path: str) -> Opened:
         try:
             return _reader_of(file)(start, end)
         except ValueError as error:  # the whole object is coming
-            raise _NoRangesError from error
+            raise NoRangesError from error
 
     return entry, read if is_strong else _looking_after(read, filesystem, path, entry)
 
@@ -310,12 +155,12 @@ def _reader_of(file: Any) -> Read:
 
 def _looking_after(read: Read, filesystem: Any, path: str, entry: Mapping[str, Any]) -> Read:
     """Return a function that compares the version of the object after each request."""
-    version = _version_of(entry)
+    version = version_of(entry)
 
     def read_and_look(start: int, end: int) -> bytes:
         data = read(start, end)
-        if _version_of(filesystem.info(path)) != version:
-            raise _ChangedError
+        if version_of(filesystem.info(path)) != version:
+            raise ChangedError
         return data
 
     return read_and_look
@@ -325,85 +170,3 @@ _OPENERS: dict[str, Callable[[Any, str], Opened]] = {
     **dict.fromkeys(("s3", "s3a"), _open_s3),
     **dict.fromkeys(("http", "https"), _open_http),
 }
-
-
-def _repeat(url: LogUrl, ask: Callable[[], T]) -> T:
-    """Return the answer to a request; repeat it some times if its failure may pass.
-
-    Raises
-    ------
-    LogError
-        One line: the failure, and what to do.
-    """
-    pauses_s = _pauses_s(url)
-    for pause_s in (*pauses_s, None):
-        try:
-            return ask()
-        except (LogError, *_BUGS):
-            raise
-        except Exception as error:  # each file system of fsspec has errors of its own
-            if pause_s is None or not _may_pass(error):
-                raise _failure(url, error) from error
-        time.sleep(pause_s)
-    raise AssertionError("the last attempt returns or raises")
-
-
-def _pauses_s(url: LogUrl) -> tuple[float, ...]:
-    return _PAUSES_S[:1] if url.scheme in _SELF_REPEATING else _PAUSES_S
-
-
-def _status_of(error: BaseException) -> int | None:
-    """Return the HTTP status of an error, or of its cause; None without one."""
-    for one in (error, error.__cause__):
-        status = getattr(one, "status", None)
-        if isinstance(status, int):
-            return status
-        response = getattr(one, "response", None)
-        if isinstance(response, dict):
-            code = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
-            return code if isinstance(code, int) else None
-    return None
-
-
-def _is_changed(error: BaseException) -> bool:
-    expired = type(error).__name__ == "FileExpired"  # s3fs, which is imported only for its URLs
-    return expired or isinstance(error, _ChangedError) or _status_of(error) == _CHANGED_STATUS
-
-
-def _may_pass(error: BaseException) -> bool:
-    if _is_changed(error):
-        return False
-    status = _status_of(error)
-    if status is not None:
-        return status >= 500 or status in _PASSING_STATUS
-    if isinstance(error, FileNotFoundError):
-        return error.__cause__ is not None  # HTTP: a HEAD request that was not answered
-    return not isinstance(error, _FINAL) and type(error).__name__ != _NO_CREDENTIALS
-
-
-def _failure(url: LogUrl, error: BaseException) -> LogError:
-    if _is_changed(error):
-        return LogError(f"{url} changed while it was read: run the command again")
-    if isinstance(error, _NoRangesError):
-        return LogError(f"{url}: the server ignores byte ranges: download the log, and read the file")
-    status = _status_of(error)
-    if status in _DENIED_STATUS or isinstance(error, PermissionError):
-        return LogError(
-            f"{url} cannot be read: the store denies access; check the credentials of {url.scheme}://"
-        )
-    if status == 404 or (isinstance(error, FileNotFoundError) and not _may_pass(error)):
-        return LogError(f"{url} does not exist")
-    if type(error).__name__ == _NO_CREDENTIALS:
-        return LogError(f"{url} cannot be read: there are no credentials for {url.scheme}://; give some")
-    tried = f" after {len(_pauses_s(url)) + 1} attempts" if _may_pass(error) else ""
-    cause = error.__cause__ if isinstance(error, FileNotFoundError) and error.__cause__ else error
-    return LogError(
-        f"{url} cannot be read{tried}: {_reason(url, cause)}; check the address and the connection"
-    )
-
-
-def _reason(url: LogUrl, error: BaseException) -> str:
-    """Return the text of an error on one line, without the secrets of the URL."""
-    text = " ".join((str(error) or type(error).__name__).split()).replace(url.url, str(url))
-    query = url.url.partition("?")[2]
-    return plain_text(text.replace(query, "...") if query else text, longest=_LONGEST_REASON)

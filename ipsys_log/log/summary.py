@@ -9,7 +9,7 @@ from typing import NamedTuple
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
@@ -116,7 +116,7 @@ def read_intact_summary(view: LogBytes) -> Summary | None:
     """
     try:
         return read_summary(view)
-    except BoundError:
+    except (BoundError, UnreadError):
         raise
     except LogError:
         return None

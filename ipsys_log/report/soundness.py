@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ipsys_log.plain_text import plain_text
-from ipsys_log.soundness.finding import BROKEN, SOUND, LogCheck, LogFinding
+from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
 from ipsys_log.units import format_time
 
 __all__ = ["check_json", "check_lines"]
@@ -48,13 +48,13 @@ def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
 
 
 def _first_fault(check: LogCheck) -> LogFinding | None:
-    return next((finding for finding in check.findings if finding.level == BROKEN), None)
+    return next((finding for finding in check.findings if finding.level in (BROKEN, UNREAD)), None)
 
 
 def _answer(check: LogCheck) -> str:
     fault = _first_fault(check)
     if fault is not None:
-        return f"broken: {plain_text(fault.text)}"
+        return f"{check.state}: {plain_text(fault.text)}"
     number = len(check.remarks)
     return SOUND if not number else f"readable, {number} remark{'s' if number > 1 else ''}"
 

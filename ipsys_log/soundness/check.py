@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 
-from ipsys_log.errors import IpsysError, reason_without
+from ipsys_log.errors import IpsysError, UnreadError, reason_without
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.contents import StoredChannel, camera_of_topic
 from ipsys_log.log.damage.findings import Watch
@@ -24,7 +24,7 @@ from ipsys_log.soundness.channels import (
     image_topics,
 )
 from ipsys_log.soundness.clocks import check_clocks
-from ipsys_log.soundness.finding import BROKEN, REMARK, LogCheck, LogFinding
+from ipsys_log.soundness.finding import BROKEN, REMARK, UNREAD, LogCheck, LogFinding
 from ipsys_log.soundness.provenance import check_runs, find_input_logs
 from ipsys_log.soundness.references import check_cameras, check_intrinsics, check_measurements, check_rigs
 from ipsys_log.soundness.times import MessageTimes
@@ -67,6 +67,8 @@ def _check_log(path: LogLocation, others: Sequence[LogLocation], progress: Progr
         findings += _check_file(path, progress)
         if not any(finding.level == BROKEN for finding in findings):
             findings += _check_contents(path, others, progress)
+    except UnreadError as error:
+        findings.append(LogFinding("file", UNREAD, reason_without(path, error)))
     except IpsysError as error:
         findings.append(LogFinding("file", BROKEN, reason_without(path, error)))
     return LogCheck(path, tuple(findings))
@@ -132,7 +134,7 @@ def _findings(kind: str, part: Iterator[LogFinding]) -> Iterator[LogFinding]:
     """Yield the findings of a part of the check; a fault that stops it is one more finding."""
     try:
         yield from part
-    except BoundError:
+    except (BoundError, UnreadError):
         raise
     except IpsysError as error:
         yield LogFinding(kind, REMARK, str(error), "later messages of this kind are not checked")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from ipsys_log.log.location import LogLocation
 
-__all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "LogCheck", "LogFinding"]
+__all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "UNREAD", "LogCheck", "LogFinding"]
 
-# The levels of a finding.
-BROKEN, REMARK, NOTE = "broken", "remark", "note"
-# The states of a log without a fault of the level BROKEN.
+# The levels of a finding. After the level UNREAD, nothing is known of the log.
+BROKEN, UNREAD, REMARK, NOTE = "broken", "unread", "remark", "note"
+# The states of a log without a fault of the levels BROKEN and UNREAD, which are states, too.
 SOUND, READABLE = "sound", "readable"
 
 
@@ -22,7 +22,7 @@ class LogFinding:
     Attributes
     ----------
     kind : ``file``, ``schema``, ``message``, ``time``, ``rate``, ``event``, ``reference`` or ``run``.
-    level : ``broken``, ``remark``, or ``note``; a log with notes only is sound.
+    level : ``broken``, ``unread``, ``remark``, or ``note``; a log with notes only is sound.
     text : the fault, without its place.
     advice : the next step of the user; "" if there is none.
     topic, time_ns, count : its place: the topic, the first log time in ns, and the number of messages.
@@ -46,10 +46,11 @@ class LogCheck:
 
     @property
     def state(self) -> str:
-        """Return ``sound``, ``readable`` (with remarks), or ``broken``."""
+        """Return ``sound``, ``readable`` (with remarks), ``unread`` or ``broken``."""
         levels = {finding.level for finding in self.findings}
-        if BROKEN in levels:
-            return BROKEN
+        for fault in (BROKEN, UNREAD):
+            if fault in levels:
+                return fault
         return READABLE if REMARK in levels else SOUND
 
     @property
@@ -60,5 +61,5 @@ class LogCheck:
     @staticmethod
     def worst(checks: Iterable[LogCheck]) -> str:
         """Return the worst state of several logs."""
-        order = (SOUND, READABLE, BROKEN)
+        order = (SOUND, READABLE, UNREAD, BROKEN)
         return max((check.state for check in checks), key=order.index, default=SOUND)

@@ -57,7 +57,7 @@ class CameraResult:
     rmse_px : root mean square of the reprojection errors per coordinate, without outliers.
     covered : share of the seen floor where the camera saw a marker; ``gaps`` are the other parts.
     places_m : (k, 2), positions of the markers that it saw.
-    clock_s : the clock offset; None without drives.
+    clock_s : the clock offset of the stored model, in s: 0 if it is not significant; None without drives.
     nominal : the intrinsics were nominal.
     """
 
@@ -213,7 +213,15 @@ def describe_fit(
             "marker_height_m in lab.toml"
         )
     cameras = tuple(
-        _describe_camera(fit, number, one, grid, places_m[number], nominal=is_nominal(lenses[one.camera]))
+        _describe_camera(
+            fit,
+            number,
+            one,
+            grid,
+            places_m[number],
+            models[one.camera].clock_s,
+            nominal=is_nominal(lenses[one.camera]),
+        )
         for number, one in enumerate(expected)
     )
     gap = _choose_gap(cameras, goal_m)
@@ -304,15 +312,27 @@ def _usual_marker(rig: Rig, fit: JointFit) -> tuple[float, float]:
 
 
 def _describe_camera(
-    fit: JointFit, number: int, expected: ExpectedErrors, grid: FloorGrid, places_m: Array, nominal: bool
+    fit: JointFit,
+    number: int,
+    expected: ExpectedErrors,
+    grid: FloorGrid,
+    places_m: Array,
+    clock_s: float,
+    nominal: bool,
 ) -> CameraResult:
-    sightings, layout = fit.observations.sightings[number], fit.problem.layout
+    sightings = fit.observations.sightings[number]
     moving = int((sightings.point < 0).sum())
     covered, gaps = find_gaps(expected, grid, places_m)
-    clock_s = float(fit.state.values[layout.cameras[number].edge + 1]) if moving else None
     counts = len(sightings) - moving, moving
     return CameraResult(
-        expected, counts, _rmse_px(fit, number), covered, tuple(gaps), places_m, clock_s, nominal
+        expected,
+        counts,
+        _rmse_px(fit, number),
+        covered,
+        tuple(gaps),
+        places_m,
+        clock_s if moving else None,
+        nominal,
     )
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.batch import tasks
-from ipsys_log.batch.tasks import LogResult, replay_log
+from ipsys_log.batch.log_work import replay_log
+from ipsys_log.batch.tasks import LogResult
 from ipsys_log.log.location import LogLocation
 from ipsys_log.runs import pieces
 from ipsys_log.runs.piece_folder import PieceTask, store_piece

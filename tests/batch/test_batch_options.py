@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
 
-from ipsys_log.batch.exports import check_exports
+from ipsys_log.batch.exports import plan_exports
 from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import BatchTask, LogResult, perform
 from ipsys_log.batch.workers import most_tasks, open_workers
@@ -19,7 +20,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.log_files import expand_folders
 from ipsys_log.report.batch import write_results
-from tests.conftest import Ipsys
+from tests.conftest import ROOT, Ipsys
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
 
@@ -148,7 +149,7 @@ def test_link_without_a_file_fails_alone(
     Path("logs/text.mcap").write_text("no log")
 
     def perform_here(task: BatchTask, paths: list[Path], _: WorkerSettings) -> list[LogResult]:
-        return [perform(task, path) for path in paths]
+        return [perform(task.of_log(path), path) for path in paths]
 
     monkeypatch.setattr(batch_command, "_collect", perform_here)
     done = ipsys("batch", command[0], "logs", *command[1:], "--json")
@@ -168,11 +169,67 @@ def test_table_names_files_that_are_not_utf_8(tmp_path: Path) -> None:
     assert (row["log"], row["text"]) == ("red\\udcff.mcap", "run: ipsys repair red\\udcff.mcap")
 
 
+WISHES: dict[str, Any] = {"table": "tracks", "run": None, "robot": None}
+
+
+def files(logs: list[LogLocation], folder: Path) -> list[str]:
+    """Return the files of an export below its folder."""
+    targets = plan_exports(logs, folder, format="csv", **WISHES)
+    return [str(target.relative_to(folder)) for target in targets.values()]
+
+
+def test_exports_keep_the_folders_below_the_named_one(tmp_path: Path) -> None:
+    for name in ("a.mcap", "mon/lab.mcap", "tue/lab.mcap", "tue/am/lab.mcap"):
+        (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "logs" / name).write_text(name)
+    below = ["a.csv", "mon/lab.csv", "tue/am/lab.csv", "tue/lab.csv"]
+    assert files([tmp_path / "logs"], tmp_path / "out") == below
+    assert files([tmp_path / "logs" / "tue"], tmp_path / "out") == ["am/lab.csv", "lab.csv"]
+    assert files([tmp_path / "logs" / "tue/am/lab.mcap"], tmp_path / "out") == ["lab.csv"]
+    # A shell gives the files of a pattern one by one.
+    named: list[LogLocation] = [*sorted((tmp_path / "logs").glob("*/lab.mcap"))]
+    assert files([*named, tmp_path / "logs/a.mcap"], tmp_path / "out") == [
+        "mon/lab.csv",
+        "tue/lab.csv",
+        "a.csv",
+    ]
+
+
+def test_exports_of_urls_keep_the_folders_below_the_pattern(tmp_path: Path) -> None:
+    pattern = "s3://lab/2026-*/*.mcap"
+    logs: list[LogLocation] = [LogUrl(pattern, f"lab/2026-{day}/run.mcap") for day in ("05", "06")]
+    assert files(logs, tmp_path) == ["2026-05/run.csv", "2026-06/run.csv"]
+    two: list[LogLocation] = [LogUrl("s3://north/run.mcap"), LogUrl("s3://south/run.mcap")]
+    assert files(two, tmp_path) == ["north/run.csv", "south/run.csv"]
+    outside: list[LogLocation] = [LogUrl("s3://lab/../../run.mcap"), LogUrl("s3://lab/run.mcap")]
+    with pytest.raises(IpsysError, match="would both be exported"):
+        files(outside, tmp_path)
+
+
 def test_exports_that_would_have_one_file_are_refused(tmp_path: Path) -> None:
-    wishes: dict[str, Any] = {"table": "tracks", "run": None, "robot": None}
-    logs = [Path("a/monday.mcap"), Path("b/monday.mcap")]
-    with pytest.raises(IpsysError, match=r"a/monday.mcap and b/monday.mcap have the same name"):
-        check_exports(logs, tmp_path, format="csv", **wishes)
-    assert check_exports(logs[:1], tmp_path, format="tum", **wishes) == ".tum"
+    logs: list[LogLocation] = [Path("a/monday.mcap"), Path("a/monday.MCAP")]
+    with pytest.raises(
+        IpsysError, match=r"a/monday.mcap and a/monday.MCAP would both be exported to .*monday.csv"
+    ):
+        files(logs, tmp_path)
     with pytest.raises(IpsysError, match="--format xlsx: is not known"):
-        check_exports(logs, tmp_path, format="xlsx", **wishes)
+        plan_exports(logs, tmp_path, format="xlsx", **WISHES)
+
+
+def test_logs_of_one_name_are_exported_to_distinct_files(
+    tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("mon", "tue"):
+        Path("logs", name).mkdir(parents=True)
+        shutil.copy(ROOT / "sample_logs" / "paper_lab.mcap", Path("logs", name, "lab.mcap"))
+
+    def perform_here(task: BatchTask, paths: list[Path], _: WorkerSettings) -> list[LogResult]:
+        return [perform(task.of_log(path), path) for path in paths]
+
+    monkeypatch.setattr(batch_command, "_collect", perform_here)
+    done = ipsys("batch", "export", "logs", "-o", "out", "--channel", "measurements", "--json")
+    assert done.code == 0, done.out
+    tables = [Path("out", name, "lab.csv").read_bytes() for name in ("mon", "tue")]
+    assert tables[0] == tables[1]
+    assert sorted(path.name for path in Path("out").iterdir()) == ["mon", "tue"]

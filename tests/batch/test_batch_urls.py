@@ -15,17 +15,8 @@ import pytest
 
 from ipsys_log import api
 from ipsys_log.batch.exports import export_log
-from ipsys_log.batch.tasks import (
-    BatchTask,
-    LogPieces,
-    LogResult,
-    check_log,
-    perform,
-    perform_or_divide,
-    perform_piece,
-    replay_log,
-    verify_log,
-)
+from ipsys_log.batch.log_work import check_log, replay_log, verify_log
+from ipsys_log.batch.tasks import BatchTask, LogPieces, LogResult, perform, perform_or_divide, perform_piece
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Message, Tracks
@@ -116,7 +107,7 @@ def test_export_of_a_derived_log_follows_its_changes(bucket: Any, derived: Path,
 
     def export() -> LogResult:
         options: dict[str, Any] = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
-        return export_log(url, target.parent, ".csv", derived=derived.parent, **options)
+        return export_log(url, target, derived=derived.parent, **options)
 
     assert export().state == "exported"
     with api.open(PAPER_LAB, derived) as log:
@@ -131,11 +122,13 @@ def test_export_of_a_derived_log_follows_its_changes(bucket: Any, derived: Path,
 
 def test_derived_log_of_another_object_fails(bucket: Any, derived: Path, tmp_path: Path) -> None:
     url = LogUrl(put(bucket, "lab.mcap", (ROOT / "sample_logs" / "small_lab.mcap").read_bytes()))
-    options = {"table": "tracks", "run": None, "robot": None, "format": "csv", "suffix": ".csv"}
+    options = {"table": "tracks", "run": None, "robot": None, "format": "csv"}
     tasks = (
         BatchTask(verify_log, {"folder": derived.parent}),
         BatchTask(check_log, {"folder": derived.parent}),
-        BatchTask(export_log, {"folder": tmp_path / "tables", "derived": derived.parent, **options}),
+        BatchTask(
+            export_log, {"target": tmp_path / "tables" / "lab.csv", "derived": derived.parent, **options}
+        ),
     )
     for task in tasks:
         result = perform(task, url)

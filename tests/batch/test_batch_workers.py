@@ -19,7 +19,7 @@ import pytest
 
 from ipsys_log import api
 from ipsys_log.batch.execution import MOST_ENDED_WORKERS
-from ipsys_log.batch.tasks import replay_log
+from ipsys_log.batch.log_work import replay_log
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.soundness.finding import BROKEN
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, read_json, wait_for

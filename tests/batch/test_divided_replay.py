@@ -8,14 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.batch.tasks import (
-    BatchTask,
-    LogPieces,
-    LogResult,
-    perform_or_divide,
-    perform_piece,
-    replay_log,
-)
+from ipsys_log.batch.log_work import replay_log
+from ipsys_log.batch.tasks import BatchTask, LogPieces, LogResult, perform_or_divide, perform_piece
 from ipsys_log.errors import IpsysError, WriteError
 from ipsys_log.log.dataset import Session
 from ipsys_log.runs import output, pieces

@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.batch.tasks import LogResult, replay_log
+from ipsys_log.batch.log_work import replay_log
+from ipsys_log.batch.tasks import LogResult
 
 # A generous limit: a wait ends with an event.
 PATIENCE_S = 1800.0

@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,8 +19,10 @@ from ipsys_log.catalogue.table import update_catalogue
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.parquet_rows import Columns, read_rows, write_rows
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Event, Message
 from ipsys_log.messages.channels import EVALUATION, EVENTS_TOPIC
+from ipsys_log.runs import output
 from ipsys_log.runs.graph import VERSIONS
 from ipsys_log.runs.output import append_messages
 from tests.conftest import ROOT, Ipsys
@@ -183,6 +186,57 @@ def test_questions_of_the_documentation_have_answers(
     exec(pandas, {})
 
 
+def test_derived_log_counts_with_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ipsys: Ipsys
+) -> None:
+    """The question for runs of an older version names the log in the store, not its derived log."""
+    store = fsspec.filesystem("memory")
+    store.pipe_file("/lab/2026-05/a.mcap", PAPER_LAB.read_bytes())
+    store.pipe_file("/lab/2026-06/a.mcap", PAPER_LAB.read_bytes())
+    derived, target = tmp_path / "results" / "2026-05" / "a.derived.mcap", tmp_path / "catalogue.parquet"
+    derived.parent.mkdir(parents=True)
+    api.replay(PAPER_LAB, models=("rigid",), until="fit", output=derived)
+    command = ("catalogue", "memory:///lab/2026-*/a.mcap", "-o", target, "--derived", tmp_path / "results")
+
+    def rows() -> dict[str, dict[str, Any]]:
+        done = ipsys(*command)
+        assert done.code == 0, done.err
+        return rows_of(target)
+
+    found = rows()
+    assert [*found] == ["2026-05/a.mcap", "2026-06/a.mcap"]
+    assert found["2026-05/a.mcap"]["derived"] == str(derived)
+    assert pd.isna(found["2026-06/a.mcap"]["derived"])
+    has_run = {log: "rigid" in [run["run"] for run in row["runs"]] for log, row in found.items()}
+    assert has_run == {"2026-05/a.mcap": True, "2026-06/a.mcap": False}
+    assert "2 logs, 0 read" in ipsys(*command).out
+    monkeypatch.setitem(VERSIONS, "rigid", 2)
+    outdated = {log: list(row["outdated_runs"]) for log, row in rows().items()}
+    assert outdated == {"2026-05/a.mcap": ["rigid"], "2026-06/a.mcap": []}
+    derived.unlink()
+    assert "2 logs, 1 read" in ipsys(*command).out
+    assert list(rows_of(target)["2026-05/a.mcap"]["outdated_runs"]) == []
+
+
+def test_derived_log_in_the_folder_has_no_row(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = folder / "2026" / "golden.mcap"
+    derived = folder / "golden.derived.mcap"
+    api.replay(log, models=("rigid",), until="fit", run="again", output=derived)
+    monkeypatch.setattr(output, "_can_append", lambda path: path != log)  # also for root
+    update = update_catalogue(folder, tmp_path / "catalogue.parquet", derived=folder)
+    assert update.logs == 3
+    assert rows_of(tmp_path / "catalogue.parquet")["2026/golden.mcap"]["derived"] == str(derived)
+
+
+def test_derived_log_of_another_log_is_an_error_of_the_row(tmp_path: Path) -> None:
+    fsspec.filesystem("memory").pipe_file("/other/a.mcap", SMALL_LAB.read_bytes())
+    api.replay(PAPER_LAB, models=("rigid",), until="fit", output=tmp_path / "a.derived.mcap")
+    update = update_catalogue(LogUrl("memory:///other/*.mcap"), tmp_path / "c.parquet", derived=tmp_path)
+    assert "has results of another log than memory:///other/a.mcap" in update.errors["a.mcap"]
+
+
 def test_file_of_another_kind_is_not_overwritten(folder: Path, tmp_path: Path, ipsys: Ipsys) -> None:
     target = tmp_path / "notes.parquet"
     target.write_text("notes of a year")
@@ -231,7 +285,7 @@ def test_rows_of_parquet_come_back(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_outdated_runs_are_replayed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ipsys_log.batch.tasks import replay_log
+    from ipsys_log.batch.log_work import replay_log
 
     log = Path(shutil.copy(PAPER_LAB, tmp_path / "log.mcap"))
     options: dict[str, Any] = {"outdated": True, "models": ("rigid",)}

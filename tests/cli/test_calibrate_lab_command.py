@@ -141,6 +141,16 @@ def test_expected_error_agrees_with_the_ground_truth(ipsys: Ipsys, lab: Geometri
         assert camera["moving"] > 50
 
 
+def test_clock_offset_is_that_of_the_stored_model(ipsys: Ipsys, fitted: Path) -> None:
+    """The clocks of the lab are synchronised: their offsets are not significant, so the model stores 0."""
+    printed_ms = {camera["camera"]: camera["clock_ms"] for camera in described(ipsys, fitted)["cameras"]}
+    with Session([fitted]) as session:
+        (model,) = session.payloads(session.topics(MODEL, "joint"))
+    stored_ms = {camera.camera: restore_joint(camera).clock_s * 1000 for camera in model.cameras}
+    assert printed_ms == stored_ms
+    assert list(printed_ms.values()).count(0.0) >= 2
+
+
 def test_a_proposed_point_gives_the_predicted_error(
     ipsys: Ipsys, lab: GeometricLab, fitted: Path, tmp_path: Path
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from ipsys_log.cli.app import app
-from ipsys_log.log import remote_object
+from ipsys_log.log import remote_requests
 from tests.cli.test_output_names import RIG
 from tests.conftest import ROOT, Ipsys
 from tests.s3_server import put
@@ -119,7 +119,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.copy(PAPER_LAB, tmp_path / "log.mcap")
     (tmp_path / "lab.toml").write_text(RIG)
     (tmp_path / "red.yaml").write_text(lens_yaml(640, 480))
-    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,))
+    monkeypatch.setattr(remote_requests, "_PAUSES_S", (0.0,))
     monkeypatch.chdir(tmp_path)
     before = contents(tmp_path)
     yield tmp_path
@@ -158,6 +158,14 @@ def test_command_that_needs_a_file_refuses_a_url(line: str, url: str, here: Path
 def test_command_that_reads_logs_reads_a_url(line: str, here: Path, ipsys: Ipsys) -> None:
     text = run(ipsys, line, HTTPS)
     assert text.startswith(f"{SHOWN[HTTPS]} cannot be read after 2 attempts: "), text
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_check_of_an_unreachable_url_does_not_call_it_broken(here: Path, ipsys: Ipsys) -> None:
+    done = ipsys("check", HTTPS)
+    assert done.code == 3
+    assert done.out.startswith(f"{SHOWN[HTTPS]}: unread: cannot be read after 2 attempts: ")
+    assert "broken" not in done.out
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from ipsys_log.closed_loop.ports import Ports, find_ports
+from ipsys_log.closed_loop.wheels import Wheels
 from ipsys_log.errors import IpsysError
 
 
@@ -49,3 +50,13 @@ def test_robots_share_a_server_unless_they_have_relays() -> None:
     assert len({relayed.wheels, relayed.server, *relayed.positions, *relayed.relays}) == 6
     datagrams = find_ports(0, 2, has_server=False, has_relay=True)
     assert (datagrams.server, len(datagrams.positions), len(datagrams.relays)) == (None, 2, 2)
+
+
+def test_wheels_bind_any_free_port_and_name_it() -> None:
+    """No search gives their port, so no other program can take it before."""
+    ports = find_ports(0, 1, has_server=False, has_relay=False)
+    wheels = [Wheels(ports.wheels, ["ada"], lambda: None, print) for _ in range(2)]
+    numbers = {int(each.address.rpartition(":")[2]) for each in wheels}
+    for each in wheels:
+        each.close()
+    assert len(numbers - {0}) == 2

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from ipsys_log.catalogue import table
-from ipsys_log.catalogue.row import Baseline, state_columns
+from ipsys_log.catalogue.row import Baseline
 from ipsys_log.catalogue.table import CatalogueUpdate, update_catalogue
-from ipsys_log.log.location import LogLocation, LogState, find_logs, parse_location
+from ipsys_log.log.location import LogLocation, find_logs, parse_location
 
 # The import of the server takes seconds; s3fs closes its connections after the test.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
@@ -87,6 +87,6 @@ def test_requests_of_many_objects_are_those_of_pages(
 
 
 def row_without_reading(
-    path: LogLocation, name: str, state: LogState, baseline: Baseline | None
+    path: LogLocation, name: str, columns: dict[str, Any], baseline: Baseline | None, derived: Path | None
 ) -> dict[str, Any]:
-    return {"log": name, **state_columns(state)}
+    return {"log": name, **columns}

@@ -80,11 +80,6 @@ class NodeStream:
         )
 
     @property
-    def missing_count(self) -> int:
-        """The number of frames that have not arrived."""
-        return len(self._missing)
-
-    @property
     def _expected(self) -> int:
         return self._first if self._next is None else self._next
 

@@ -5,7 +5,7 @@ from collections import Counter
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunk_messages import chunk_entries
 from ipsys_log.log.contents import Contents
@@ -23,6 +23,8 @@ def disagreement(view: LogBytes, findings: Survey) -> str:
         loaded, summary = load_contents(view), read_summary(view)
         if summary is not None:
             _check_lengths(view, loaded.data_end + DATA_END.size)
+    except UnreadError:
+        raise
     except LogError as error:
         return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]
     surveyed = findings.contents

@@ -11,7 +11,7 @@ from itertools import islice
 
 from mcap.opcode import Opcode
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import parse_chunk_contents, unpack
 from ipsys_log.log.records import (
@@ -145,6 +145,8 @@ class Resync:
                     )
                 if record_at.opcode not in _IN_SUMMARY and record_at.opcode < PRIVATE:
                     return False
+        except UnreadError:
+            raise
         except LogError:
             pass
         return False
@@ -183,6 +185,8 @@ class Resync:
                     self.budget += steps if verdict else 0
                     return verdict
                 last, start, stop = record_at.opcode, record_at.offset, record_at.offset + record_at.length
+        except UnreadError:
+            raise
         except LogError:  # damage follows, or the end of the written data
             if last == Opcode.MESSAGE_INDEX:
                 return into_damage and self.is_chunk_head(stop)

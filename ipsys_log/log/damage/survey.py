@@ -5,7 +5,7 @@ from collections import ChainMap
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.chunks import ChunkContents, inner_records, parse_chunk_contents, unpack
@@ -134,6 +134,8 @@ def _behind_header(findings: Survey) -> tuple[int, str]:
             raise view.fault(start, f"the HEADER record claims {record_at.length} bytes")
         parse_exact(view, record_at, view.read(start, record_at.length))
         _check_length(findings, record_at)
+    except UnreadError:
+        raise
     except LogError as error:
         return 0, _reason(error)
     return record_at.offset + record_at.length, ""
@@ -152,7 +154,7 @@ def _take_records(findings: Survey, position: int) -> int:
             if position - findings.crc_at > _LAG:
                 findings.watch.progress(position)
                 _advance_crc(findings, position if findings.indexed is None else findings.indexed.start)
-    except BoundError:
+    except (BoundError, UnreadError):
         raise
     except LogError as error:
         return skip_damage(
@@ -351,6 +353,8 @@ def _take_index(findings: Survey, record: RecordAt) -> None:
         indexed.rows[channel] = rows
         if rows:
             indexed.offsets[channel] = record.offset
+    except UnreadError:
+        raise
     except LogError as error:
         indexed.sound = False
         findings.faults.append(_reason(error))

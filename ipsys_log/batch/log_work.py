@@ -1,0 +1,161 @@
+"""The works of a batch on one log: replay, verify and check, each with a small result.
+
+Each work can run twice: a log has its results as runs, and a run that exists is not computed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.batch.tasks import LogResult
+from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
+from ipsys_log.runs.output import check_source, choose_target, derived_log_of, logs_with_results
+from ipsys_log.runs.piece_folder import PieceFolder, StoredPieces
+from ipsys_log.runs.superseded import outdated_runs
+from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck
+
+__all__ = ["UP_TO_DATE", "check_log", "name_derived", "replay_log", "verify_log"]
+
+# States of a log after its work; the check of a log has its own ones.
+COMPUTED, UP_TO_DATE, NOT_OUTDATED = "computed", "up to date", "not outdated"
+IDENTICAL, DIFFERENT = "identical", "different"
+# Remarks of a log in its result; the rest is counted.
+_MOST_REMARKS = 3
+
+
+def replay_log(
+    path: LogLocation,
+    outdated: bool = False,
+    folder: Path | None = None,
+    divide: bool = False,
+    **options: Any,
+) -> LogResult:
+    """Compute the results that a log lacks in this process, as :func:`ipsys_log.api.replay` does.
+
+    Parameters
+    ----------
+    outdated : leave a log without outdated runs unchanged.
+    folder : for the results of a log that cannot be appended to; None: the working folder.
+    divide : do not detect markers in a long log here, but merge the stored results of its pieces.
+    options : those of the replay.
+
+    Raises
+    ------
+    PiecesMissingError
+        Some pieces are not stored yet; nothing is written.
+    """
+    from ipsys_log import api
+
+    logs, output = choose_target([path], None, folder)
+    if outdated and not _has_outdated_run(logs):
+        return LogResult(str(path), NOT_OUTDATED)
+    target = output or logs[-1]
+    assert isinstance(target, Path)  # the results are in a file, also those of a log at a URL
+    target.parent.mkdir(parents=True, exist_ok=True)
+    stored = StoredPieces(PieceFolder.beside(target))
+    remarks: list[str] = []
+    workers = stored if divide else None
+    try:
+        outcomes = api.replay(
+            *logs, output=output, say=remarks.append, jobs=1, workers=workers, **options
+        ).outcomes
+    except WriteError:
+        raise
+    except IpsysError:
+        if output is None and stored.is_complete:  # the log has their run already
+            stored.folder.clear(stored.keys)
+        raise
+    lost = stored.folder.clear(stored.keys)
+    new = [outcome for outcome in outcomes if outcome.fresh]
+    remarks += [f"{outcome.run}: {remark}" for outcome in new for remark in outcome.remarks]
+    return LogResult(
+        str(path),
+        COMPUTED if new else UP_TO_DATE,
+        text=_remarks_text(remarks),
+        runs=tuple(dict.fromkeys(outcome.run for outcome in new)),
+        messages=sum(outcome.messages for outcome in new),
+        pieces=stored.merged or None,
+        lost_attempts=lost if stored.merged else None,
+        derived=None if target == path else str(target),
+    )
+
+
+def _has_outdated_run(logs: Sequence[LogLocation]) -> bool:
+    with Session(logs) as session:
+        return bool(outdated_runs(session))
+
+
+def _remarks_text(remarks: Sequence[str]) -> str:
+    lines = [" ".join(remark.split()) for remark in dict.fromkeys(remarks)]
+    more = [f"and {len(lines) - _MOST_REMARKS} more remarks"] if len(lines) > _MOST_REMARKS else []
+    return "; ".join(lines[:_MOST_REMARKS] + more)
+
+
+def verify_log(path: LogLocation, run: str | None = None, folder: Path | None = None) -> LogResult:
+    """Repeat the runs of a log, and compare each channel, as :func:`ipsys_log.api.verify` does.
+
+    Parameters
+    ----------
+    run : only this run.
+    folder : of derived logs, whose runs are repeated, too; None: the working folder.
+    """
+    from ipsys_log import api
+
+    remarks: list[str] = []
+    logs = logs_with_results(path, folder)
+    comparisons = api.verify(*logs, run=run, say=remarks.append)
+    other = [comparison.topic for comparison in comparisons if not comparison.equal]
+    text = f"{len(other)} of {len(comparisons)} channels differ, such as {other[0]}" if other else ""
+    return LogResult(
+        str(path),
+        DIFFERENT if other else IDENTICAL,
+        not other,
+        text or _remarks_text(remarks),
+        messages=sum(comparison.left for comparison in comparisons),
+        derived=name_derived(logs),
+    )
+
+
+def check_log(path: LogLocation, folder: Path | None = None) -> LogResult:
+    """Read a log completely and check it, as :func:`ipsys_log.api.check` does.
+
+    Parameters
+    ----------
+    folder : of derived logs; the state is the worst of the log and its derived log. None: the working folder.
+    """
+    from ipsys_log import api
+
+    derived = derived_log_of(path, folder)
+    if derived is not None and not derived.exists():
+        derived = None
+    logs = [path] if derived is None else [path, derived]
+    checks = api.check(*logs)
+    state = LogCheck.worst(checks)
+    if state not in (BROKEN, UNREAD) and derived is not None:
+        check_source([path], derived)
+    return LogResult(str(path), state, state == SOUND, _worst_text(checks), derived=name_derived(logs))
+
+
+def _worst_text(checks: Sequence[LogCheck]) -> str:
+    """Return the worst remark on a log and its derived log, and the number of the others."""
+    remarks = [
+        (finding, "" if number == 0 else f"{check.path.name}: ")
+        for number, check in enumerate(checks)
+        for finding in check.remarks
+    ]
+    if not remarks:
+        return ""
+    faults = [remark for level in (BROKEN, UNREAD) for remark in remarks if remark[0].level == level]
+    finding, log = (faults or remarks)[0]
+    place = f"{finding.topic}: " if finding.topic else ""
+    more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
+    return f"{log}{place}{finding.text}{more}"
+
+
+def name_derived(logs: Sequence[LogLocation]) -> str | None:
+    """Return the name of the derived log in the result of a log; None without one."""
+    return str(logs[-1]) if len(logs) > 1 else None

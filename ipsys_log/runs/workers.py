@@ -28,7 +28,7 @@ __all__ = ["LocalWorkers", "available_cores", "serve"]
 
 # Number of pieces for each worker that may be finished before the pieces in front of them.
 _AHEAD = 2
-# Of the number of a piece in the common pipe. A system call reads or writes such a number completely.
+# The size of a piece's number in the common pipe. A system call reads or writes such a number completely.
 _NUMBER_BYTES = 4
 # The path of modules is that of this process: the folder of the user has no part in it.
 _START = (

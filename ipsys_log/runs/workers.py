@@ -24,12 +24,15 @@ from ipsys_log.interrupts import undivided
 from ipsys_log.runs.blas import ONE_THREAD
 from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
-__all__ = ["LocalWorkers", "available_cores", "serve"]
+__all__ = ["LocalWorkers", "available_cores", "check_jobs", "serve"]
 
 # Number of pieces for each worker that may be finished before the pieces in front of them.
 _AHEAD = 2
 # The size of a piece's number in the common pipe. A system call reads or writes such a number completely.
 _NUMBER_BYTES = 4
+# More processes than these only take memory, 0.15 GB each. The same script may run on machines of other sizes.
+_MOST_JOBS_OF_CORE = 4
+_MOST_JOBS_OF_SMALL_MACHINE = 16
 # The path of modules is that of this process: the folder of the user has no part in it.
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
@@ -40,6 +43,22 @@ _START = (
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_jobs(jobs: int) -> None:
+    """Check a number of processes.
+
+    Raises
+    ------
+    IpsysError
+        The number is too large for this machine.
+    """
+    cores = available_cores()
+    most = max(_MOST_JOBS_OF_CORE * cores, _MOST_JOBS_OF_SMALL_MACHINE)
+    if jobs > most:
+        raise IpsysError(
+            f"--jobs {jobs}: is too large for the cores of this machine ({cores}); give {most} or fewer"
+        )
 
 
 class _Failure(NamedTuple):

@@ -128,6 +128,18 @@ def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [worker.process.poll() for worker in started] == [-9, -9]
 
 
+@pytest.mark.parametrize(("cores", "most"), [(1, 16), (2, 16), (8, 32)])
+def test_too_many_processes_are_refused(
+    lab_log: Path, ipsys: Ipsys, cores: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "available_cores", lambda: cores)
+    workers.check_jobs(most)
+    done = ipsys("replay", lab_log, "--jobs", str(most + 1))
+    assert done.code == 1
+    assert f"--jobs {most + 1}: is too large" in done.err
+    assert f"give {most} or fewer" in done.err
+
+
 def test_too_many_workers_for_the_system_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The workers before the failed one end."""
     started: list[workers._Worker] = []

@@ -30,7 +30,7 @@ __all__ = ["LocalWorkers", "available_cores", "check_jobs", "serve"]
 _AHEAD = 2
 # The size of a piece's number in the common pipe. A system call reads or writes such a number completely.
 _NUMBER_BYTES = 4
-# More processes than these only take memory, 0.15 GB each. The same script may run on machines of other sizes.
+# More processes than these only take memory, 0.15 GB each. A script may run on machines of other sizes.
 _MOST_JOBS_OF_CORE = 4
 _MOST_JOBS_OF_SMALL_MACHINE = 16
 # The path of modules is that of this process: the folder of the user has no part in it.

@@ -137,7 +137,7 @@ def ratios(laps: dict[str, list[Spent]], over: str, under: str, value: str) -> t
 
 
 def _overhead(folder: Path, options: argparse.Namespace, report: Report) -> None:
-    logs = _copies(_SMALL_LOG, folder / "small", 4 if options.smoke else 200)
+    logs = _copies(_SMALL_LOG, folder / "small", 4 if options.smoke else options.small_logs)
     task = BatchTask(check_log)
     walls_s, cpus_s = [], []
     with open_workers(WorkerSettings(workers=1), 2) as workers:
@@ -178,6 +178,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--batch-logs", type=int, default=8, help="number of logs for the speed")
+    parser.add_argument("--small-logs", type=int, default=200, help="number of logs for the overhead")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
     python benchmarks/jobs.py --job-frames 7200
 
 ``pipeline.replay`` up to detect takes turns over one log of three cameras of 960 x 540 at 30/s: with one
-process, which has a thread for each camera, with two workers, and with one worker for each core. Processor
+process, which has a thread for each camera, with two workers, and with one worker for each core. The threads
+of the one process use more than one core, so the same process on one core takes turns with them. Processor
 times include those of the workers. The share of the first process limits the speed with many cores: this
 process merges, encodes and writes.
 
@@ -31,6 +32,7 @@ from ipsys_log.simulation.settings import LabSettings
 __all__ = ["measure"]
 
 _MS_PER_S = 1e3
+_ONE_CORE = "--jobs 1 on one core"
 
 
 class _Turn(NamedTuple):
@@ -41,11 +43,13 @@ class _Turn(NamedTuple):
     digest: str
 
 
-def _detection(path: Path, jobs: int) -> Turn:
+def _detection(path: Path, jobs: int, one_core: bool = False) -> Turn:
     from ipsys_log.pipeline import replay
     from ipsys_log.runs.options import Request
 
     target = path.with_name(f"jobs_{jobs}.mcap")
+    if one_core:  # of this process, which is new in each round
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
 
     def turn(_number: int) -> _Turn:
         target.unlink(missing_ok=True)
@@ -65,6 +69,7 @@ def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report)
     cores = len(os.sched_getaffinity(0))
     counts = sorted({1, 2, cores})
     contenders = [Contender(f"--jobs {jobs}", _detection, (path, jobs)) for jobs in counts]
+    contenders.append(Contender(_ONE_CORE, _detection, (path, 1, True)))
     timings = race(contenders, 1, options.rounds)
     turns: dict[str, _Turn] = {name: timing.kept[0] for name, timing in timings.items()}
     if len({turn.digest for turn in turns.values()}) != 1:
@@ -75,12 +80,16 @@ def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report)
         report.rows.append(
             ratio_row(f"--jobs 1 / {name}", timings["--jobs 1"], timings[name], wanted, wall=True)
         )
+        report.rows.append(ratio_row(f"{_ONE_CORE} / {name}", timings[_ONE_CORE], timings[name], wall=True))
         turn = turns[name]
         share = turn.own_s / (turn.own_s + turn.workers_s)
         report.rows.append(Row(f"{name}: share of the first process", (share,)))
         extra = (turn.own_s + turn.workers_s) / sum(turns["--jobs 1"][:2])
         report.rows.append(Row(f"{name} / 1, by processor", (extra,)))
     for name, timing in timings.items():
+        turn = turns[name]
+        busy = (turn.own_s + turn.workers_s) / timing.wall_s[0]
+        report.rows.append(Row(f"{name}: cores in use", (busy,)))
         report.rows.append(Row(name, tuple(frames / s for s in timing.wall_s), "frames/s"))
         report.details[name] = {"wall_s": timing.wall_s, "first_round": turns[name]._asdict()}
 

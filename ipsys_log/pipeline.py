@@ -60,7 +60,7 @@ from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.replay import Replay
 from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
-from ipsys_log.runs.workers import LocalWorkers
+from ipsys_log.runs.workers import LocalWorkers, check_jobs
 from ipsys_log.sinks.sink import Consumer, Consumers, Sink
 
 __all__ = ["live", "measure", "record", "replay"]
@@ -98,6 +98,7 @@ def replay(
     IpsysError
         The input has a fault that the user must correct.
     """
+    check_jobs(jobs)
     stages = stages_until(until)
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)

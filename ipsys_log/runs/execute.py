@@ -26,7 +26,7 @@ from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.inputs import inputs
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
-from ipsys_log.runs.pieces import PieceWorkers, merge_pieces, plan_pieces
+from ipsys_log.runs.pieces import DividedRun, merge_pieces
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.states import Recorded, recorded_stages
@@ -121,17 +121,20 @@ def run_stage(
     until: Stage,
     make: Make,
     say: Callable[[str], None] = lambda text: None,
+    prepare: Callable[[Task, Session], None] = lambda task, session: None,
 ) -> Outcome:
     """Find the run that has done ``task``, or ``make`` it and append it to ``target``.
 
     An interrupted run is completed, if its content equals the present result. If the newest run of such a
-    task is out of date, a remark reports this before a new run is made.
+    task is out of date, a remark reports this before a new run is made. ``prepare`` is called before all
+    other work on a run that the log lacks.
     """
     name = request.run if has_given_name(task.stage, until) else None
     record = record_of(session, task)
     finished_run = find_run(session, record, task.stage.writes[0], name)
     if finished_run is not None:
         return Outcome(task.stage.name, finished_run, fresh=False)
+    prepare(task, session)
     _say_renewal(session, task, record, say)
     number = max((run.number for run in session.runs()), default=0) + 1
     record = replace(record, fingerprint=fingerprint(), number=number)
@@ -273,18 +276,18 @@ def record_of(session: Session, task: Task) -> Run:
 
 
 def compute_messages(
-    task: Task, session: Session, name: str, progress: Progress, workers: PieceWorkers | None = None
+    task: Task, session: Session, name: str, progress: Progress, divided: DividedRun | None = None
 ) -> Iterator[Message]:
     """Yield the messages of a task's run: of its causal stage, or those computed from the whole log.
 
-    ``workers`` compute a long run in pieces.
+    The workers of a ``divided`` run compute it in pieces.
     """
     if task.step is None:
         yield from _compute_whole(task, session, name, progress)
         return
     wired = wire(task.stage, name, task.inputs, task.step(name))
-    plan = plan_pieces(task, session) if workers is not None and workers.divides else None
-    if workers is not None and plan is not None and plan.is_long:
+    if divided is not None:
+        plan, workers = divided
         yield from merge_pieces(wired, plan, workers.compute(plan), partial(progress, task.stage.name))
     else:
         yield from _stream(task, session, wired, progress)

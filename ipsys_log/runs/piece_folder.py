@@ -124,6 +124,9 @@ class StoredPieces:
         """True if all pieces of a run were merged."""
         return 0 < len(self.keys) == self.merged
 
+    def prepare(self, plan: PiecePlan) -> None:
+        """Do nothing: the results are stored."""
+
     def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
         """Yield the results in the folder, in the order of the plan.
 

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.graph import Task
 
 __all__ = [
+    "DividedRun",
     "FrameResult",
     "Piece",
     "PieceFrames",
@@ -48,6 +49,7 @@ __all__ = [
     "PieceWorkers",
     "check_versions",
     "compute_piece",
+    "divide_run",
     "merge_pieces",
     "order_frames",
     "plan_pieces",
@@ -166,9 +168,26 @@ class PieceWorkers(Protocol):
     @property
     def divides(self) -> bool: ...
 
+    def prepare(self, plan: PiecePlan) -> None:
+        """Begin to prepare the computation of a plan; return before the preparation is complete."""
+        ...
+
     def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
         """Yield the results of the pieces in the order of the plan."""
         ...
+
+
+class DividedRun(NamedTuple):
+    """The plan of a long run, and the workers that compute its pieces."""
+
+    plan: PiecePlan
+    workers: PieceWorkers
+
+
+def divide_run(task: Task, session: Session, workers: PieceWorkers) -> DividedRun | None:
+    """Divide the run of a task into pieces for workers; None if this process computes it faster, or must."""
+    plan = plan_pieces(task, session) if workers.divides else None
+    return DividedRun(plan, workers) if plan is not None and plan.is_long else None
 
 
 def plan_pieces(task: Task, session: Session) -> PiecePlan | None:

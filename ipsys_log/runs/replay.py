@@ -21,7 +21,7 @@ from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.model_checks import check_fits
 from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
-from ipsys_log.runs.pieces import PieceWorkers
+from ipsys_log.runs.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.runs.preload import preload
 from ipsys_log.runs.provenance import Outcome
 
@@ -42,6 +42,7 @@ class Replay:
     progress, say : called with the state of the work, and with remarks.
     unchecked : several models of which it is not known yet if all can be fitted.
     outcomes : one for each stage so far.
+    divided : the run in work, if the workers compute it.
     """
 
     request: Request
@@ -55,6 +56,7 @@ class Replay:
     say: Callable[[str], None]
     unchecked: list[str] = field(init=False)
     outcomes: list[Outcome] = field(default_factory=list, init=False)
+    divided: DividedRun | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.unchecked = list(self.models) if len(self.models) > 1 else []
@@ -112,9 +114,16 @@ class Replay:
             if isinstance(task, str):
                 return task
             compute = partial(self._messages, following=following, model=model or self.models[0])
-            outcome = run_stage(session, self.target, task, request, self.stages[-1], compute, self.say)
+            until, target = self.stages[-1], self.target
+            outcome = run_stage(session, target, task, request, until, compute, self.say, self._prepare)
         self.outcomes.append(outcome)
         return outcome.run
+
+    def _prepare(self, task: Task, session: Session) -> None:
+        """Divide a long run; the workers start while this process loads libraries and opens the log."""
+        self.divided = divide_run(task, session, self.workers)
+        if self.divided is not None:
+            self.divided.workers.prepare(self.divided.plan)
 
     def _messages(
         self, task: Task, session: Session, name: str, following: Sequence[Stage], model: str
@@ -131,7 +140,7 @@ class Replay:
             if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
                 check_fits(session, self.request, task.inputs, self.unchecked)
                 self.unchecked.clear()
-            messages = compute_messages(task, session, name, progress, self.workers)
+            messages = compute_messages(task, session, name, progress, self.divided)
             fits = any(MODEL in stage.writes for stage in self.stages)
             if task.stage.in_threads and fits and self.request.model_from is None:
                 messages = preload(messages, self.models)

@@ -1,7 +1,8 @@
 """Worker processes of this machine, which compute the pieces of a run.
 
 A worker has a pipe to this process and a session of its own: the keys of the terminal and a closed terminal
-concern this process only. A worker ends with its pipe, so that none remains after this process.
+concern this process only. All workers take the numbers of their pieces from one further pipe. A worker ends
+with its pipes, so that none remains after this process.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import pickle
 import subprocess
 import sys
 import traceback
-from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
@@ -21,24 +21,44 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.interrupts import undivided
+from ipsys_log.runs.blas import ONE_THREAD
 from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
-__all__ = ["LocalWorkers", "available_cores", "serve"]
+__all__ = ["LocalWorkers", "available_cores", "check_jobs", "serve"]
 
 # Number of pieces for each worker that may be finished before the pieces in front of them.
 _AHEAD = 2
-# A worker has the next piece already when it finishes one: this process may be busy with writing.
-_PIECES_OF_WORKER = 2
+# The size of a piece's number in the common pipe. A system call reads or writes such a number completely.
+_NUMBER_BYTES = 4
+# More processes than these only take memory, 0.15 GB each. A script may run on machines of other sizes.
+_MOST_JOBS_OF_CORE = 4
+_MOST_JOBS_OF_SMALL_MACHINE = 16
 # The path of modules is that of this process: the folder of the user has no part in it.
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from ipsys_log.runs.workers import serve; serve()"
+    "from ipsys_log.runs.workers import serve; serve(int(sys.argv[2]))"
 )
 
 
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_jobs(jobs: int) -> None:
+    """Check a number of processes.
+
+    Raises
+    ------
+    IpsysError
+        The number is too large for this machine.
+    """
+    cores = available_cores()
+    most = max(_MOST_JOBS_OF_CORE * cores, _MOST_JOBS_OF_SMALL_MACHINE)
+    if jobs > most:
+        raise IpsysError(
+            f"--jobs {jobs}: is too large for the cores of this machine ({cores}); give {most} or fewer"
+        )
 
 
 class _Failure(NamedTuple):
@@ -49,17 +69,18 @@ class _Failure(NamedTuple):
 
 
 class _Worker:
-    """A worker process, its pipe, and the numbers of the pieces that it has, in their order."""
+    """A worker process and its pipe; ``numbers`` is the file descriptor with the numbers of its pieces."""
 
-    def __init__(self) -> None:
-        self.pieces: deque[int] = deque()
-        command = [sys.executable, "-P", "-c", _START, json.dumps([path for path in sys.path if path])]
+    def __init__(self, numbers: int) -> None:
+        modules = json.dumps([path for path in sys.path if path])
+        command = [sys.executable, "-P", "-c", _START, modules, str(numbers)]
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            pass_fds=(numbers,),
             start_new_session=True,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            env={**os.environ, **ONE_THREAD},
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
@@ -73,31 +94,24 @@ class _Worker:
         self.process.stdin.close()
         self.process.stdout.close()
 
-    def begin(self, run: PieceRun) -> None:
-        """Send the run of the pieces that follow."""
-        self._send(run)
-
-    def send(self, number: int, piece: Piece) -> None:
-        self._send(piece)
-        self.pieces.append(number)
-
-    def _send(self, what: PieceRun | Piece) -> None:
+    def begin(self, plan: PiecePlan) -> None:
+        """Send the run and the pieces whose numbers follow."""
         try:
-            self._sender.send(what)
+            self._sender.send((plan.run, plan.pieces))
         except OSError:
             raise self._ended() from None
 
-    def receive(self) -> PieceResult:
+    def receive(self) -> tuple[int, PieceResult]:
+        """Return the number and the result of a piece."""
         try:
             answer = self.receiver.recv()
         except (EOFError, OSError):
             raise self._ended() from None
-        self.pieces.popleft()
         if isinstance(answer, _Failure):
             answer.error.add_note(f"in a worker process:\n{answer.trace}")
             raise answer.error
-        result: PieceResult = answer
-        return result
+        number, result = answer
+        return number, result
 
     def close(self) -> None:
         """Close the pipe; the worker then ends by itself."""
@@ -129,6 +143,7 @@ class LocalWorkers:
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
         self._workers: list[_Worker] = []
+        self._numbers: tuple[int, ...] = ()  # the ends of the common pipe: to read, to write
 
     def __enter__(self) -> LocalWorkers:
         return self
@@ -143,6 +158,16 @@ class LocalWorkers:
         """True if there is more than one process."""
         return self.jobs > 1
 
+    def prepare(self, plan: PiecePlan) -> None:
+        """Start the workers of a plan; they import the package while this process prepares the run.
+
+        Raises
+        ------
+        IpsysError
+            A worker cannot be started.
+        """
+        self._start(min(self.jobs, len(plan.pieces)))
+
     def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
         """Yield the results of the pieces in their order; the workers may finish them in another order.
 
@@ -155,16 +180,15 @@ class LocalWorkers:
         """
         limit = _AHEAD * self.jobs + len(plan.frames.cameras)
         finished: dict[int, PieceResult] = {}
-        waiting = deque(enumerate(plan.pieces))
+        offered = 0
         try:
-            self._start(min(self.jobs, len(plan.pieces)))
+            self.prepare(plan)
             for worker in self._workers:
-                worker.begin(plan.run)
+                worker.begin(plan)
             for number in range(len(plan.pieces)):
-                self._feed(waiting, number + limit)
+                offered = self._offer(offered, min(number + limit, len(plan.pieces)))
                 while number not in finished:
                     self._receive(finished)
-                    self._feed(waiting, number + limit)
                 yield finished.pop(number)
         finally:
             self._stop()
@@ -180,52 +204,59 @@ class LocalWorkers:
         while len(self._workers) < count:
             with undivided():
                 try:
-                    self._workers.append(_Worker())
+                    self._numbers = self._numbers or os.pipe()
+                    self._workers.append(_Worker(self._numbers[0]))
                 except OSError as error:
                     raise IpsysError(
                         f"only {len(self._workers)} of {count} worker processes can be started "
                         f"({error.strerror}); give fewer processes with --jobs"
                     ) from error
 
-    def _feed(self, waiting: deque[tuple[int, Piece]], stop: int) -> None:
-        """Send pieces with numbers below ``stop``: first to idle workers, then one more to each of them."""
-        for most in range(1, _PIECES_OF_WORKER + 1):
-            for worker in self._workers:
-                if waiting and waiting[0][0] < stop and len(worker.pieces) < most:
-                    worker.send(*waiting.popleft())
+    def _offer(self, start: int, stop: int) -> int:
+        """Offer the pieces from ``start`` up to ``stop`` to all workers; return the next number.
+
+        A worker takes a piece when it has finished one, even while this process writes. A piece that waits
+        behind another one in a slow worker would leave the others idle at the end.
+        """
+        for number in range(start, stop):
+            os.write(self._numbers[1], number.to_bytes(_NUMBER_BYTES, "little"))
+        return stop
 
     def _receive(self, finished: dict[int, PieceResult]) -> None:
         """Wait for results, and add them by the numbers of their pieces."""
-        busy = [worker for worker in self._workers if worker.pieces]
-        ready: Sequence[Any] = wait([worker.receiver for worker in busy])
-        for worker in busy:
+        ready: Sequence[Any] = wait([worker.receiver for worker in self._workers])
+        for worker in self._workers:
             if worker.receiver in ready:
-                number = worker.pieces[0]
-                finished[number] = worker.receive()
+                number, result = worker.receive()
+                finished[number] = result
 
     def _stop(self) -> None:
         while self._workers:
             with undivided():
                 self._workers.pop().stop()
+        with undivided():
+            for end in self._numbers:
+                os.close(end)
+            self._numbers = ()
 
 
-def serve() -> None:
-    """Compute the pieces that arrive at the standard input, until it ends. The main function of a worker."""
+def serve(numbers: int) -> None:
+    """Compute the pieces with the numbers from a file descriptor, until it ends. A worker's main function."""
     receiver, sender = Connection(os.dup(0), writable=False), Connection(os.dup(1), readable=False)
     os.dup2(2, 1)  # a print of another package must not come between the results
     try:
-        _serve(receiver, sender)
+        _serve(receiver, sender, numbers)
     except (EOFError, ConnectionError, BrokenPipeError):
         os._exit(0)  # the process that waits for results has ended
 
 
-def _serve(receiver: Connection, sender: Connection) -> None:
-    run = receiver.recv()
+def _serve(receiver: Connection, sender: Connection, numbers: int) -> None:
+    run, pieces = receiver.recv()
     sent: Future[None] | None = None
     try:
         # The next piece is computed while the other process has no time to read a result.
         with ThreadPoolExecutor(1) as thread:
-            for answer in _answers(run, receiver):
+            for answer in _answers(run, pieces, numbers):
                 if sent is not None:
                     sent.result()
                 sent = thread.submit(_send, sender, answer)
@@ -235,7 +266,7 @@ def _serve(receiver: Connection, sender: Connection) -> None:
         sender.send(_failure(error))
 
 
-def _send(sender: Connection, answer: PieceResult) -> None:
+def _send(sender: Connection, answer: tuple[int, PieceResult]) -> None:
     """Send an answer, or the error that prevents it: the other process waits for one of them."""
     try:
         sender.send(answer)
@@ -250,18 +281,19 @@ def _failure(error: Exception) -> _Failure:
     return _Failure(_portable(error), trace)
 
 
-def _answers(run: PieceRun, receiver: Connection) -> Iterator[PieceResult]:
+def _answers(run: PieceRun, pieces: Sequence[Piece], numbers: int) -> Iterator[tuple[int, PieceResult]]:
+    """Yield the numbers and the results of the pieces that this worker takes."""
     import cv2
 
     from ipsys_log.log.dataset import Session
-    from ipsys_log.runs.blas import one_blas_thread
     from ipsys_log.runs.pieces import check_versions, compute_piece
 
     cv2.setNumThreads(1)
-    with Session(run.paths) as session, one_blas_thread():
+    with Session(run.paths) as session:
         check_versions(session, run)
-        while True:
-            yield compute_piece(session, run, receiver.recv())
+        while taken := os.read(numbers, _NUMBER_BYTES):
+            number = int.from_bytes(taken, "little")
+            yield number, compute_piece(session, run, pieces[number])
 
 
 def _portable(error: Exception) -> Exception:

@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+from ipsys_log.runs.blas import ONE_THREAD
+
 # Models are imported within the block, as a command does.
 LATE = """
 import json
@@ -23,11 +25,26 @@ print(json.dumps([(one["filepath"], one["num_threads"]) for one in info]))
 """
 
 
+# A worker process of a replay loads scipy only if its stage needs it.
+NEW_PROCESS = """
+import json
+import scipy.linalg
+from threadpoolctl import threadpool_info
+info = [one for one in threadpool_info() if one["user_api"] == "blas"]
+print(json.dumps([(one["filepath"], one["num_threads"]) for one in info]))
+"""
+
+
 @pytest.mark.slow
-def test_libraries_loaded_within_the_block_have_one_thread() -> None:
+@pytest.mark.parametrize(("program", "settings"), [(LATE, {}), (NEW_PROCESS, ONE_THREAD)])
+def test_libraries_that_are_loaded_late_have_one_thread(program: str, settings: dict[str, str]) -> None:
     environment = {name: value for name, value in os.environ.items() if "NUM_THREADS" not in name}
     done = subprocess.run(
-        [sys.executable, "-c", LATE], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program],
+        env={**environment, **settings},
+        capture_output=True,
+        text=True,
+        check=True,
     )
     threads = json.loads(done.stdout)
     assert any("scipy" in path for path, _ in threads)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import errno
 import multiprocessing.connection
+import os
 import shutil
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
@@ -38,8 +38,9 @@ def _workers_for_short_logs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def newest_worker_first(receivers: Sequence[Any]) -> list[Any]:
-    """Wait for the last busy worker only: its pieces finish before those of the others."""
-    return list(_wait(list(receivers)[-1:]))
+    """Return the last worker with a result only: its pieces finish before those of the others."""
+    ready = _wait(receivers)
+    return [receiver for receiver in receivers if receiver in ready][-1:]
 
 
 _wait = multiprocessing.connection.wait
@@ -64,9 +65,9 @@ def _count_workers(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     started: list[Any] = []
     create = workers._Worker.__init__
 
-    def counted(self: Any) -> None:
+    def counted(self: Any, numbers: int) -> None:
         started.append(self)
-        create(self)
+        create(self, numbers)
 
     monkeypatch.setattr(workers._Worker, "__init__", counted)
     return started
@@ -76,14 +77,14 @@ def test_killed_worker_leaves_the_log_unchanged(
     lab: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started = _count_workers(monkeypatch)
-    send = workers._Worker.send
+    begin = workers._Worker.begin
 
-    def send_and_kill(self: Any, number: int, piece: Piece) -> None:
-        send(self, number, piece)
-        if number == 1:
+    def begin_and_kill(self: Any, plan: PiecePlan) -> None:
+        begin(self, plan)
+        if self is started[1]:
             self.process.kill()
 
-    monkeypatch.setattr(workers._Worker, "send", send_and_kill)
+    monkeypatch.setattr(workers._Worker, "begin", begin_and_kill)
     before = lab.read_bytes()
     done = ipsys("detect", lab, "--jobs", "2")
     assert done.code == 1
@@ -92,8 +93,25 @@ def test_killed_worker_leaves_the_log_unchanged(
     assert "Traceback" not in done.err
     assert lab.read_bytes() == before
     assert [worker.process.poll() for worker in started] == [-9, -9]
-    monkeypatch.setattr(workers._Worker, "send", send)
+    monkeypatch.setattr(workers._Worker, "begin", begin)
     assert ipsys("detect", lab, "--jobs", "2").code == 0
+
+
+def test_workers_start_only_for_a_missing_run(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They start before other work on the run, and end if this work fails."""
+    started = _count_workers(monkeypatch)
+
+    def interrupted() -> dict[str, str]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ipsys_log.runs.execute.fingerprint", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            replay([lab], REQUEST, "detect", jobs=2)
+    assert [worker.process.poll() for worker in started] == [-9, -9]
+    for _ in range(2):
+        replay([lab], REQUEST, "detect", jobs=2)
+        assert len(started) == 4
 
 
 def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,15 +128,27 @@ def test_interrupt_ends_all_workers(lab: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [worker.process.poll() for worker in started] == [-9, -9]
 
 
+@pytest.mark.parametrize(("cores", "most"), [(1, 16), (2, 16), (8, 32)])
+def test_too_many_processes_are_refused(
+    lab_log: Path, ipsys: Ipsys, cores: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "available_cores", lambda: cores)
+    workers.check_jobs(most)
+    done = ipsys("replay", lab_log, "--jobs", str(most + 1))
+    assert done.code == 1
+    assert f"--jobs {most + 1}: is too large" in done.err
+    assert f"give {most} or fewer" in done.err
+
+
 def test_too_many_workers_for_the_system_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The workers before the failed one end."""
     started: list[workers._Worker] = []
 
     class Limited(workers._Worker):
-        def __init__(self) -> None:
+        def __init__(self, numbers: int) -> None:
             if len(started) == 2:
                 raise OSError(errno.EMFILE, "Too many open files")
-            super().__init__()
+            super().__init__(numbers)
             started.append(self)
 
     monkeypatch.setattr(workers, "_Worker", Limited)
@@ -153,11 +183,16 @@ def test_log_that_is_replaced_is_an_error_of_one_line(lab_log: Path, tmp_path: P
 
 
 def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
-    worker = workers._Worker()
-    worker.begin(_run(lab_log))
-    worker.send(0, Piece("red", 0, 1))
-    assert worker.receive().frames == []
+    """The end of that process closes all its pipes."""
+    taken, offered = os.pipe()
+    worker = workers._Worker(taken)
+    os.close(taken)
+    worker.begin(_plan(_run(lab_log), Piece("red", 0, 1), Piece("red", 1, 2)))
+    os.write(offered, (1).to_bytes(4, "little"))
+    number, result = worker.receive()
+    assert (number, result.frames) == (1, [])
     worker.close()
+    os.close(offered)
     assert worker.process.wait(PATIENCE_S) == 0
 
 
@@ -178,38 +213,37 @@ def _plan(run: PieceRun, *pieces: Piece) -> PiecePlan:
 
 
 def test_results_wait_for_at_most_some_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While the first piece is not finished, only a limited number of later ones is computed."""
-    sent: list[int] = []
-    _pretend(monkeypatch, sent)
-    monkeypatch.setattr(workers, "wait", lambda receivers: list(receivers)[-1:])
+    """While the first result is not used, only a limited number of later pieces is computed."""
+    taken: list[int] = []
+    _pretend(monkeypatch, taken)
     with LocalWorkers(2) as local:
         results = local.compute(_plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(100))))
         next(results)
-        assert len(sent) == 5
+        offered = os.read(local._numbers[0], 1000)
+        assert len(taken) + len(offered) // 4 == 5
+        os.write(local._numbers[1], offered)
         assert sum(1 for _ in results) == 99
-    assert sent == list(range(100))
+    assert taken == list(range(100))
 
 
-def test_busy_worker_has_its_next_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A worker does not wait while this process writes the results before."""
-    sent: list[int] = []
-    _pretend(monkeypatch, sent)
-    monkeypatch.setattr(workers, "wait", lambda receivers: list(receivers)[:1])
+def test_slow_worker_leaves_all_other_pieces_to_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pieces are not distributed in advance: at the end, one worker would wait for the other."""
+    taken: list[int] = []
+    _pretend(monkeypatch, taken, slow=0)
+    plan = _plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(5)))
     with LocalWorkers(2) as local:
-        results = local.compute(_plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(9))))
-        next(results)
-        # Before the first result is used, each worker has a piece in work and another one.
-        assert [list(worker.pieces) for worker in local._workers] == [[2, 4], [1, 3]]
+        places: list[Any] = list(local.compute(plan))
+    assert places == [1, 1, 1, 1, 1]
 
 
 def test_worker_computes_while_its_result_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """The result is larger than the pipe: without a thread of its own, its sending stops the worker."""
     computed = threading.Event()
 
-    def answers(_run: Any, receiver: Connection) -> Iterator[Any]:
+    def answers(_run: Any, _pieces: Any, numbers: int) -> Iterator[Any]:
         yield bytes(1 << 24)
         computed.set()
-        yield receiver.recv()
+        os.read(numbers, 4)
 
     with _served(monkeypatch, answers) as ours:
         assert computed.wait(PATIENCE_S)
@@ -219,9 +253,9 @@ def test_worker_computes_while_its_result_is_not_read(monkeypatch: pytest.Monkey
 def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process that waits for the last result of a worker must get an answer."""
 
-    def answers(_run: Any, receiver: Connection) -> Iterator[Any]:
+    def answers(_run: Any, _pieces: Any, numbers: int) -> Iterator[Any]:
         yield threading.Lock()
-        yield receiver.recv()
+        os.read(numbers, 4)
 
     with _served(monkeypatch, answers) as ours:
         assert ours.poll(PATIENCE_S)
@@ -232,45 +266,50 @@ def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch)
 
 @contextmanager
 def _served(
-    monkeypatch: pytest.MonkeyPatch, answers: Callable[[Any, Connection], Iterator[Any]]
+    monkeypatch: pytest.MonkeyPatch, answers: Callable[[Any, Any, int], Iterator[Any]]
 ) -> Iterator[Connection]:
     """Serve answers in a thread; yield the end of the pipe that has no place for a large one."""
     monkeypatch.setattr(workers, "_answers", answers)
     ours, theirs = multiprocessing.Pipe()
+    taken, offered = os.pipe()
 
     def serve() -> None:
         with suppress(EOFError, ConnectionError):
-            workers._serve(theirs, theirs)
+            workers._serve(theirs, theirs, taken)
 
     thread = threading.Thread(target=serve)
     thread.start()
     try:
-        ours.send("the run")
+        ours.send(("the run", "its pieces"))
         yield ours
     finally:
         ours.close()
+        os.close(offered)
         thread.join()
         theirs.close()
+        os.close(taken)
 
 
-def _pretend(monkeypatch: pytest.MonkeyPatch, sent: list[int]) -> None:
-    """Replace the processes by objects that have a result at once."""
+def _pretend(monkeypatch: pytest.MonkeyPatch, taken: list[int], slow: int | None = None) -> None:
+    """Replace the processes by objects that take a piece when their result is wanted.
+
+    The result of a piece is the place of its worker. A ``slow`` worker has no result.
+    """
+    started: list[Any] = []
 
     class Pretended:
-        def __init__(self) -> None:
-            self.pieces: deque[int] = deque()
-            self.receiver = self
+        def __init__(self, numbers: int) -> None:
+            self.numbers, self.receiver = numbers, self
+            started.append(self)
 
-        def begin(self, _run: PieceRun) -> None: ...
-
-        def send(self, number: int, _piece: Piece) -> None:
-            self.pieces.append(number)
-            sent.append(number)
+        def begin(self, _plan: PiecePlan) -> None: ...
 
         def receive(self) -> Any:
-            self.pieces.popleft()
-            return object()
+            taken.append(int.from_bytes(os.read(self.numbers, 4), "little"))
+            return taken[-1], started.index(self)
 
         def stop(self) -> None: ...
 
     monkeypatch.setattr(workers, "_Worker", Pretended)
+    ready = [worker for worker in (0, 1) if worker != slow][:1]
+    monkeypatch.setattr(workers, "wait", lambda receivers: [receivers[n] for n in ready])

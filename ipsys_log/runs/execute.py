@@ -26,7 +26,7 @@ from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.inputs import inputs
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
-from ipsys_log.runs.pieces import PieceWorkers, merge_pieces, plan_pieces
+from ipsys_log.runs.pieces import PiecePlan, PieceWorkers, merge_pieces, plan_pieces
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.states import Recorded, recorded_stages
@@ -41,6 +41,7 @@ __all__ = [
     "find_unfinished",
     "has_given_name",
     "missing_messages",
+    "plan_workers",
     "record_of",
     "run_stage",
     "sign",
@@ -272,19 +273,29 @@ def record_of(session: Session, task: Task) -> Run:
     )
 
 
+def plan_workers(task: Task, session: Session, workers: PieceWorkers) -> PiecePlan | None:
+    """Return the pieces of a task for workers; None if this process computes its run itself."""
+    plan = plan_pieces(task, session) if task.step is not None and workers.divides else None
+    return plan if plan is not None and plan.is_long else None
+
+
 def compute_messages(
-    task: Task, session: Session, name: str, progress: Progress, workers: PieceWorkers | None = None
+    task: Task,
+    session: Session,
+    name: str,
+    progress: Progress,
+    divided: tuple[PieceWorkers, PiecePlan] | None = None,
 ) -> Iterator[Message]:
     """Yield the messages of a task's run: of its causal stage, or those computed from the whole log.
 
-    ``workers`` compute a long run in pieces.
+    ``divided`` has the workers that compute the pieces of a plan (:func:`plan_workers`).
     """
     if task.step is None:
         yield from _compute_whole(task, session, name, progress)
         return
     wired = wire(task.stage, name, task.inputs, task.step(name))
-    plan = plan_pieces(task, session) if workers is not None and workers.divides else None
-    if workers is not None and plan is not None and plan.is_long:
+    if divided is not None:
+        workers, plan = divided
         yield from merge_pieces(wired, plan, workers.compute(plan), partial(progress, task.stage.name))
     else:
         yield from _stream(task, session, wired, progress)

@@ -16,7 +16,7 @@ from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_earlier_runs
-from ipsys_log.runs.execute import compute_messages, run_stage
+from ipsys_log.runs.execute import compute_messages, plan_workers, run_stage
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.model_checks import check_fits
 from ipsys_log.runs.one_pass import OnePass
@@ -131,9 +131,12 @@ class Replay:
             if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
                 check_fits(session, self.request, task.inputs, self.unchecked)
                 self.unchecked.clear()
-            messages = compute_messages(task, session, name, progress, self.workers)
+            plan = plan_workers(task, session, self.workers)
+            divided = None if plan is None else (self.workers, plan)
+            messages = compute_messages(task, session, name, progress, divided)
             fits = any(MODEL in stage.writes for stage in self.stages)
-            if task.stage.in_threads and fits and self.request.model_from is None:
+            # Threads of this process would wait for the imports, longer than the imports take alone.
+            if divided is not None and fits and self.request.model_from is None:
                 messages = preload(messages, self.models)
             yield from self.one_pass.follow(messages, session, task, name, following, model)
 

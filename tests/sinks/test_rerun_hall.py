@@ -1,4 +1,4 @@
-"""The Rerun layout of a hall, read from the saved recording: whole frames, visible symbols, the whole floor."""
+"""The Rerun layout of a hall in the saved recording: whole frames, visible symbols, the whole floor."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_eye_sees_the_whole_floor_and_little_more(floor: Floor, tmp_path: Path) 
 def test_legend_of_many_series_does_not_hide_them() -> None:
     def is_visible(series: int) -> bool:
         blueprint = layout([], [], None, False, {"series/of": Plot("Disagreement, mm", series)})
-        plot = blueprint.root_container.contents[1]
+        _, plot, _ = blueprint.root_container.contents
         visible: list[bool] = plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist()
         return visible[0]
 

@@ -259,6 +259,8 @@ class RerunSink:
         self._waiting_bytes += len(message.payload.data)
         if self._waiting_bytes >= _MOST_WAITING_BYTES:
             self.flush()
+            # The queue of Rerun has no limit: without this wait, a slow disk fills the memory.
+            self._recording.flush()
 
     def _draw_markers(self, message: Message) -> None:
         entity = ("cameras", str(message.camera), "image", "markers")

@@ -112,7 +112,7 @@ def test_eye_sees_the_whole_floor_and_little_more(floor: Floor, tmp_path: Path) 
 
 def test_legend_of_many_series_does_not_hide_them() -> None:
     def is_visible(series: int) -> bool:
-        blueprint = layout([], [], None, False, {"series/of": Plot("Disagreement, mm", series)})
+        blueprint: Any = layout([], [], None, False, {"series/of": Plot("Disagreement, mm", series)})
         _, plot, _ = blueprint.root_container.contents
         visible: list[bool] = plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist()
         return visible[0]

@@ -8,6 +8,8 @@ and small messages. In turns, ``cp`` copies them, and ipsys cuts, compacts, merg
 a recording for Rerun (``view``), each in a new process. Each turn begins with the logs out of the page cache,
 and ends when the new file is on the disk. Ratios are wall time for each written (or checked) byte. ``crc`` is
 the time of the CRC-32 of as many bytes. Memory is RssAnon of the process at most, read every 10 ms.
+
+``view`` also saves a session of the simulated lab with all its runs, half as large as the other log.
 """
 
 from __future__ import annotations
@@ -24,13 +26,17 @@ from threading import Event, Thread
 
 from results import Report, command
 from rounds import Contender, Row, Timing, Turn, race
-from scenes import CACHE
+from scenes import CACHE, drawn, lengthened
 
 from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage
+from ipsys_log.pipeline import replay
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.workers import available_cores
+from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["Memory", "measure"]
 
@@ -61,6 +67,17 @@ def _record(path: Path, cameras: Sequence[str], instants: int) -> None:
                 image = CompressedImage(now, camera, images[chance.randrange(len(images))], "jpeg")
                 writer.write(f"/cameras/{camera}/image", now, now, encode(image))
             writer.write(f"/{cameras[0]}/small", now, now, b'{"number": %d}' % number)
+
+
+def _session(path: Path, size: float, is_smoke: bool) -> None:
+    """Write a session of the simulated lab of about ``size`` bytes, with the runs of all stages."""
+    width, height = (640, 360) if is_smoke else (1920, 1080)
+    base = drawn(LabSettings(width=width, height=height, stations=16, drive_s=0.5 if is_smoke else 10.0))
+    with LogReader(base) as reader:
+        images = (topic for topic in reader.channels if topic.endswith("/image"))
+        frames = sum(reader.channels[topic].message_count for topic in images)
+    lengthened(base, path, frames if is_smoke else round(frames * size / base.stat().st_size))
+    replay([path], Request(), jobs=available_cores())
 
 
 def _cp(logs: Sequence[Path], copy: Path) -> None:
@@ -170,11 +187,19 @@ def measure(options: argparse.Namespace) -> Report:
         for path, cameras in zip(logs, _CAMERAS, strict=True):
             _record(path, cameras, instants)
         contenders = [Contender(name, _turn, (name, logs, Path(folder) / f"{name}.mcap")) for name in _VERBS]
+        session = Path(folder) / "session.mcap"
+        _session(session, options.handling_gb * 1e9 / 2, options.smoke)
+        for name in ("cp", "view"):
+            of_session = (name, [session], Path(folder) / f"{name}_session.mcap")
+            contenders.append(Contender(f"{name} of a session", _turn, of_session))
         timings = race(contenders, 1, options.rounds)
-        report.remarks.append(f"logs of {' and '.join(f'{log.stat().st_size / 1e9:.2f}' for log in logs)} GB")
+        logs.append(session)
+        report.remarks.append(f"logs of {', '.join(f'{log.stat().st_size / 1e9:.2f}' for log in logs)} GB")
     for name in ("cut", "compact", "merge", "check", "view"):
         limit = None if name in ("check", "view") else ("<=", 2.0)
         report.rows.append(Row(f"{name} / cp", _ratios(timings[name], timings["cp"]), wanted=limit))
+    view, cp = (timings[f"{name} of a session"] for name in ("view", "cp"))
+    report.rows.append(Row("view / cp, a session with all runs", _ratios(view, cp)))
     report.rows.append(Row("crc / cp", _ratios(timings["crc"], timings["cp"])))
     for name in ("cut", "compact", "merge", "check", "view"):
         report.rows.append(Row(f"{name}, anonymous memory", (timings[name].kept[0][1],), "MB", ("<=", 300.0)))

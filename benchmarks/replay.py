@@ -4,7 +4,8 @@
 
 Speed: ``pipeline.replay`` from frames to tracks writes its results to a log. The same detection in the same
 threads discards its results. Both take turns over one log of three cameras of 1920 x 1080 at 30/s. The times
-are wall time, and processor time, which other programs do not disturb.
+are wall time, and processor time, which other programs do not disturb. Two more contenders detect in one
+process for each core, as the command does: the whole replay, and ``detect`` alone, which writes its results.
 
 Memory: RssAnon of a process that replays ten minutes of three cameras (54,000 frames), read ten times a
 second. The frames of that log are smaller (--memory-size), because only a few frames of each camera are in
@@ -36,12 +37,11 @@ _EVERY_S = 0.1
 _CAMERAS = 3
 
 
-def _whole(path: Path) -> Turn:
+def _whole(path: Path, jobs: int = 1, until: str | None = None) -> Turn:
     from ipsys_log.pipeline import replay
     from ipsys_log.runs.options import Request
 
     target = path.with_name("replayed.mcap")
-    target.unlink(missing_ok=True)
 
     def turn(_number: int) -> list[tuple[str, float]]:
         starts: dict[str, float] = {}
@@ -49,7 +49,8 @@ def _whole(path: Path) -> Turn:
         def progress(stage: str, _done: int, _total: int | None) -> None:
             starts.setdefault(stage, time.monotonic())
 
-        replay([path], Request(), output=target, progress=progress)
+        target.unlink(missing_ok=True)
+        replay([path], Request(), until, output=target, progress=progress, jobs=jobs)
         times = [*starts.values(), time.monotonic()]
         return [
             (stage, end - start)
@@ -75,15 +76,26 @@ def _detection(path: Path) -> Turn:
 
 
 def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report) -> None:
-    whole, alone = Contender("replay", _whole, (path,)), Contender("detection", _detection, (path,))
-    timings = race([whole, alone], 1, options.rounds)
+    from ipsys_log.runs.workers import available_cores
+
+    jobs = max(available_cores(), 2)
+    contenders = [
+        Contender("replay", _whole, (path,)),
+        Contender("detection", _detection, (path,)),
+        Contender("replay, processes", _whole, (path, jobs)),
+        Contender("detection, processes", _whole, (path, jobs, "detect")),
+    ]
+    timings = race(contenders, 1, options.rounds)
     both = timings["detection"], timings["replay"]
+    divided = timings["detection, processes"], timings["replay, processes"]
     report.rows.append(ratio_row("replay / detection alone, frames/s", *both, (">=", 0.92), wall=True))
     report.rows.append(ratio_row("the same by the processor's time", *both))
+    report.rows.append(ratio_row(f"the same with {jobs} processes", *divided, (">=", 0.92), wall=True))
     for name, timing in timings.items():
         report.rows.append(Row(name, tuple(frames / s for s in timing.wall_s), "frames/s"))
         report.details[name] = {"wall_s": timing.wall_s, "cpu_s": timing.cpu_s, "frames": frames}
-    report.details["replay"]["stages_s"] = timings["replay"].kept[0]
+    for name in ("replay", "replay, processes"):
+        report.details[name]["stages_s"] = timings[name].kept[0]
 
 
 def _replayed(line: Connection, path: Path) -> None:

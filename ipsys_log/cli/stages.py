@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.location import LogLocation
     from ipsys_log.report.accuracy import Accuracy
+    from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
 __all__ = ["MORE", "add_commands", "build_command", "derive", "options_until", "replay_options"]
@@ -145,16 +146,18 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
     return command
 
 
-def _options(logs: Sequence[LogLocation], **given: Any) -> dict[str, Any]:
-    """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
-    rig, calibration = given.pop("rig"), given.pop("calibration", None)
-    lenses, jobs = given.pop("lenses", None) or {}, given.pop("jobs", None)
-    return {
-        "jobs": jobs,
-        "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
-        "calibrations": {**load_calibrations(calibration, lambda: cameras_of(logs)), **lenses},
-        **replay_options(**given),
-    }
+def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
+    """Return the options of a command as a request."""
+    from ipsys_log.runs.options import Request
+
+    rig, calibration, lenses = given.pop("rig"), given.pop("calibration", None), given.pop("lenses", None)
+    options = replay_options(**given)
+    return Request(
+        models=tuple(options.pop("models")),
+        rig=load_matching_rig(rig, lambda: cameras_of(logs)),
+        lenses={**load_calibrations(calibration, lambda: cameras_of(logs)), **(lenses or {})},
+        **options,
+    )
 
 
 def replay_options(**given: Any) -> dict[str, Any]:
@@ -191,18 +194,20 @@ def derive(
     files of ``calibration``.
     """
     check_present(logs)
-    from ipsys_log import api
+    # Not ``ipsys_log.api``: its imports take longer than finding that all results are there.
+    from ipsys_log import pipeline
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.known_contents import one_reading
     from ipsys_log.report.accuracy import read_accuracy
     from ipsys_log.runs.output import choose_target
+    from ipsys_log.runs.workers import available_cores
 
+    jobs = given.pop("jobs", None) or available_cores()
     with one_reading():
         logs, output = choose_target(logs, output)
-        options = _options(logs, **given)
+        request = _request(logs, **given)
         with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
-            replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
-        outcomes = list(replayed.outcomes)
+            outcomes = pipeline.replay(logs, request, until, output, progress, say, jobs)
         # A new log exists only if there was something to write.
         written = [output] if output is not None and output.exists() else []
         with Session([*logs, *written]) as session:

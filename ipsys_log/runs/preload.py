@@ -1,6 +1,6 @@
-"""Libraries of later stages, loaded in a thread while an earlier stage computes.
+"""Libraries of later stages, loaded in a thread while other processes compute an earlier stage.
 
-scikit-learn takes a second. Meanwhile, detection goes on in other threads or processes.
+scikit-learn takes a second.
 """
 
 from __future__ import annotations

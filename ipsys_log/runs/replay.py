@@ -142,7 +142,8 @@ class Replay:
                 self.unchecked.clear()
             messages = compute_messages(task, session, name, progress, self.divided)
             fits = any(MODEL in stage.writes for stage in self.stages)
-            if task.stage.in_threads and fits and self.request.model_from is None:
+            # Threads of this process would wait for the imports, longer than the imports take alone.
+            if self.divided is not None and fits and self.request.model_from is None:
                 messages = preload(messages, self.models)
             yield from self.one_pass.follow(messages, session, task, name, following, model)
 

@@ -26,7 +26,6 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, Channel
-from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import write_messages
 from ipsys_log.runs.provenance import newest_run
@@ -79,6 +78,8 @@ def open_finished_log(
             raise IpsysError(
                 f"{path}: its reference points change during the log; give the valid ones with --rig"
             )
+    from ipsys_log.pipeline import replay  # most users of a finished log compute nothing
+
     replay([path], request, "camera-frame", progress=progress, say=say)
     with Session([path]) as session:
         for line in out_of_date_lines(session, [newest_run(session, MODEL)]):

@@ -36,6 +36,7 @@ def test_replay_without_work_imports_no_scipy(replayed_lab: Path) -> None:
     assert code == 0
     assert "ipsys_log.pipeline" in modules
     assert not modules & {"scipy", "sklearn", "pandas", "matplotlib"}
+    assert not modules & {"ipsys_log.api", "ipsys_log.calibration.calibrate", "ipsys_log.publish.scoring"}
     assert replayed_lab.read_bytes() == before
 
 
@@ -43,3 +44,10 @@ def test_missing_log_is_an_error_before_the_imports(tmp_path: Path) -> None:
     code, modules = _command("replay", tmp_path / "missing.mcap")
     assert code == 1
     assert not modules & {"numpy", "cv2", "ipsys_log.pipeline", "ipsys_log.log.dataset"}
+
+
+def test_info_does_not_import_the_pipeline(replayed_lab: Path) -> None:
+    code, modules = _command("info", replayed_lab)
+    assert code == 0
+    assert "ipsys_log.survey.from_log" in modules
+    assert not modules & {"scipy", "sklearn", "ipsys_log.pipeline", "ipsys_log.capture"}

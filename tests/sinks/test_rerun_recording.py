@@ -366,6 +366,25 @@ def test_recording_is_the_same_with_any_batches(
     assert content_of(path) == content_of(saved)
 
 
+def test_frames_do_not_wait_in_memory_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file has all frames but those of the last batch, however slow the disk is."""
+    size = 1 << 20
+    monkeypatch.setattr("ipsys_log.sinks.rerun.messages._MOST_WAITING_BYTES", 4 * size)
+    path, chance = tmp_path / "frames.rrd", np.random.default_rng(0)
+    missing: list[int] = []
+
+    def frames() -> Iterator[Message]:
+        for number in range(40):
+            time_ns = START_NS + number
+            image = CompressedImage(time_ns, "red", b"\xff\xd8\xff" + chance.bytes(size), "jpeg")
+            yield Message("/cameras/red/image", time_ns, time_ns, image, "red")
+            # The sink asks for the next frame when it has drawn this one.
+            missing.append((number + 1) * size - path.stat().st_size)
+
+    drawn_by(path, frames())
+    assert max(missing) < 4 * size
+
+
 def test_damaged_frame_hides_the_frame_before_it(tmp_path: Path) -> None:
     """The frames wait for their batch; the one that cannot be drawn must come after them."""
     data = (jpeg(1), jpeg(2), b"damaged", jpeg(3))

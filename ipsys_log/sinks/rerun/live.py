@@ -12,7 +12,7 @@ from ipsys_log.messages import Event, Markers, Message, Positions, Rig, Tracks, 
 from ipsys_log.messages.channels import IMAGES
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
 from ipsys_log.sinks.rerun.recording import check_screen, show_in_viewer
-from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout
+from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout, symbol_scale
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.units import NS_PER_S
 
@@ -115,4 +115,4 @@ class LiveView:
         draw_rig(recording, self._rig)
         draw_legend(recording)
         runs = () if self._run is None else (self._run,)
-        return RerunSink(recording, self._cameras, self._fades_ns(), runs)
+        return RerunSink(recording, self._cameras, self._fades_ns(), runs, symbol_scale(self._rig))

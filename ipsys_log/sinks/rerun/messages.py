@@ -130,6 +130,7 @@ class RerunSink:
     cameras : all cameras; each camera has its colour independent of the order of the messages.
     fade_ns : by topic; the last message of a topic without an entry stays.
     runs : the runs to draw. With several runs, a robot has a colour and a line of text for each run.
+    scale : factor of the size of points and arrows on the floor.
     """
 
     def __init__(
@@ -138,11 +139,13 @@ class RerunSink:
         cameras: Iterable[str],
         fade_ns: Mapping[str, int],
         runs: Sequence[str] = (),
+        scale: float = 1.0,
     ) -> None:
         self._recording = recording
         self._colours = camera_colours(cameras)
         self._fade_ns = fade_ns
         self._runs = tuple(runs)
+        self._scale = scale
         self._robots: dict[tuple[str | None, str], int] = {}
         self._waiting: dict[Entity, tuple[Kind, list[tuple[Message | Segment, Fields]]]] = {}
         self._waiting_bytes = 0
@@ -256,6 +259,8 @@ class RerunSink:
         self._waiting_bytes += len(message.payload.data)
         if self._waiting_bytes >= _MOST_WAITING_BYTES:
             self.flush()
+            # The queue of Rerun has no limit: without this wait, a slow disk fills the memory.
+            self._recording.flush()
 
     def _draw_markers(self, message: Message) -> None:
         entity = ("cameras", str(message.camera), "image", "markers")
@@ -282,7 +287,7 @@ class RerunSink:
             return
         look = {
             "colors": [self._colours[camera]],
-            "radii": [0.02],
+            "radii": [0.02 * self._scale],
             "labels": [f"{p.id} ({camera})" for p in positions],
             "show_labels": [False],
         }
@@ -305,7 +310,7 @@ class RerunSink:
         colour = self._robot_colour(run, track.robot)
         label = self._label(run, track.robot)
         positions = [(track.x_m, track.y_m, track.z_m)]
-        radius = 0.03 if run is None else 0.05
+        radius = (0.03 if run is None else 0.05) * self._scale
         # The ground truth lies under the track: its name would hide the robot's name.
         look = {"colors": [colour], "radii": [radius], "labels": [label], "show_labels": [run is not None]}
         self._log_moved(message, entity, rr.Points3D, {"positions": positions}, look)
@@ -313,9 +318,11 @@ class RerunSink:
         if track.heading_rad is None:
             self._clear_now(message, heading)
             return
-        ahead = [(_HEADING_M * np.cos(track.heading_rad), _HEADING_M * np.sin(track.heading_rad), 0.0)]
+        length_m = _HEADING_M * self._scale
+        ahead = [(length_m * np.cos(track.heading_rad), length_m * np.sin(track.heading_rad), 0.0)]
         arrow = {"origins": positions, "vectors": ahead}
-        self._log_moved(message, heading, rr.Arrows3D, arrow, {"colors": [colour], "radii": [0.012]})
+        arrow_look = {"colors": [colour], "radii": [0.012 * self._scale]}
+        self._log_moved(message, heading, rr.Arrows3D, arrow, arrow_look)
 
     def _robot_colour(self, run: str | None, robot: str) -> tuple[int, int, int]:
         if (run, robot) not in self._robots:

@@ -23,8 +23,8 @@ from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Message
 from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.sinks.player import play
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.scene import draw_legend, draw_places, draw_rig, layout
-from ipsys_log.sinks.rerun.series import DISAGREEMENT, LATENCY_MS, draw_series, read_series
+from ipsys_log.sinks.rerun.scene import Plot, draw_legend, draw_places, draw_rig, layout, symbol_scale
+from ipsys_log.sinks.rerun.series import DISAGREEMENT, LATENCY_MS, Series, draw_series, read_series
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 
 __all__ = [
@@ -203,19 +203,32 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
     places, faults = locate_measurements(measurements, rig)
     trails = [trail_entity(run) for run in (*shown.runs, *([None] if TRUTH_TOPIC in shown.moving else []))]
     series = read_series(session, shown.runs)
-    plots = {entity: title for entity, title in _PLOTS.items() if any(one.is_below(entity) for one in series)}
-    recording.send_blueprint(layout(shown.cameras, trails, rig, bool(shown.events or faults), plots))
+    sizes_px = _sizes_px(session, shown.cameras)
+    has_events = bool(shown.events or faults)
+    recording.send_blueprint(layout(shown.cameras, trails, rig, has_events, _plots(series), sizes_px))
     draw_rig(recording, rig)
-    draw_places(recording, places)
+    draw_places(recording, places, symbol_scale(rig))
     draw_legend(recording)
     draw_series(recording, series)
     for fault in faults:
         recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
     fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)
-    sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs)
+    sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs, symbol_scale(rig))
     play(session.messages([*shown.frames, *shown.moving, *shown.events]), [_Batches(sink, sent)])
     sink.close()
     sent()
+
+
+def _plots(series: Sequence[Series]) -> dict[str, Plot]:
+    counts = {entity: sum(one.is_below(entity) for one in series) for entity in _PLOTS}
+    return {entity: Plot(title, counts[entity]) for entity, title in _PLOTS.items() if counts[entity]}
+
+
+def _sizes_px(session: Session, cameras: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Return the width and height of the frames of the cameras that have intrinsics."""
+    topics = {camera: session.calibrations[camera] for camera in cameras if camera in session.calibrations}
+    lenses = {camera: next(iter(session.payloads([topic])), None) for camera, topic in topics.items()}
+    return {camera: (lens.width, lens.height) for camera, lens in lenses.items() if lens is not None}
 
 
 class _Batches:

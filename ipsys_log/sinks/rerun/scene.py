@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -13,7 +14,7 @@ from ipsys_log.analysis.pairs import KINDS, Place
 from ipsys_log.messages import Floor, Rig
 from ipsys_log.sinks.colours import KIND_COLOURS
 
-__all__ = ["LEGEND", "TIMELINES", "draw_legend", "draw_places", "draw_rig", "layout"]
+__all__ = ["LEGEND", "TIMELINES", "Plot", "draw_legend", "draw_places", "draw_rig", "layout", "symbol_scale"]
 
 # The viewer shows the first timeline; the times in the payloads belong to it.
 TIMELINES = ("publish_time", "log_time")
@@ -33,11 +34,32 @@ _LEGEND = """\
 
 # Columns of tiles per row of a large grid of cameras, which is as wide as two fifths of the window.
 _TILES_ACROSS = 0.7
+# Symbols have their usual size up to a floor of this width or depth.
+_LAB_M = 5.0
+# The vertical angle of view of the viewer is 55 degrees: the eye is at nearly the height of what it sees. The
+# view of the floor is wider than high.
+_EYE_HEIGHT = 1.15
+_VIEW_ASPECT = 1.3
+# A longer legend hides its plot.
+_MOST_IN_LEGEND = 8
 _GRID_M = 0.5
 _MOST_LINES = 100
 _TRAIL_S = 15.0
 _GREY = (60, 60, 60)
 _LIGHT = (150, 150, 150)
+
+
+class Plot(NamedTuple):
+    """The title of a plot of time series, and the number of its series."""
+
+    title: str
+    series: int
+
+
+def symbol_scale(rig: Rig | None) -> float:
+    """Return the factor of the size of points and arrows: in a hall, those of a lab are too small to see."""
+    size_m = 0.0 if rig is None or rig.floor is None else max(rig.floor.width_m, rig.floor.depth_m)
+    return max(1.0, size_m / _LAB_M) if math.isfinite(size_m) else 1.0
 
 
 def draw_rig(recording: rr.RecordingStream, rig: Rig | None) -> None:
@@ -52,7 +74,7 @@ def draw_rig(recording: rr.RecordingStream, rig: Rig | None) -> None:
             [(p.x_m, p.y_m, 0.0) for p in rig.reference_points],
             labels=[p.name for p in rig.reference_points],
             colors=[(255, 255, 255)],
-            radii=[0.03],
+            radii=[0.03 * symbol_scale(rig)],
             show_labels=True,
         )
         recording.log("world/reference_points", points, static=True)
@@ -82,7 +104,7 @@ def _draw_floor(recording: rr.RecordingStream, floor: Floor) -> None:
     recording.log("world/floor/axes", axes, static=True)
 
 
-def draw_places(recording: rr.RecordingStream, places: Iterable[Place]) -> None:
+def draw_places(recording: rr.RecordingStream, places: Iterable[Place], scale: float = 1.0) -> None:
     """Draw the calibration points, one entity for each kind; their ids are labels that show on demand."""
     places = list(places)
     for kind in KINDS:
@@ -92,7 +114,7 @@ def draw_places(recording: rr.RecordingStream, places: Iterable[Place]) -> None:
                 [place.point_m for place in places_of_kind],
                 labels=[place.id for place in places_of_kind],
                 colors=[KIND_COLOURS[kind]],
-                radii=[0.025],
+                radii=[0.025 * scale],
                 show_labels=False,
             )
             recording.log(["world", "places", kind], points, static=True)
@@ -103,7 +125,8 @@ def layout(
     trails: Sequence[str],
     rig: Rig | None,
     events: bool,
-    plots: Mapping[str, str] | None = None,
+    plots: Mapping[str, Plot] | None = None,
+    sizes_px: Mapping[str, tuple[int, int]] | None = None,
 ) -> rrb.Blueprint:
     """Return the layout: cameras on the left, the floor from above on the right, the rest below the floor.
 
@@ -111,15 +134,16 @@ def layout(
     ----------
     cameras : the cameras with frames or markers.
     trails : paths of the entities whose last seconds are shown together.
-    plots : titles of the plots of time series, by the entity above the series.
+    plots : the plots of time series, by the entity above the series.
+    sizes_px : width and height of the frames by camera, as far as they are known.
     """
     right: list[rrb.View | rrb.Container] = [_floor_view(trails, rig)]
-    right += [_plot(entity, title) for entity, title in (plots or {}).items()]
+    right += [_plot(entity, plot) for entity, plot in (plots or {}).items()]
     below = [rrb.TextDocumentView(origin=f"/{LEGEND}", name="Legend")]
     lists = [rrb.TextLogView(origin="/events", name="Events"), *below] if events else below
     right.append(rrb.Tabs(*lists))
     floor = rrb.Vertical(*right, row_shares=[5, *[1.2] * len(plots or {}), 1.2])
-    views = [rrb.Spatial2DView(origin=f"/cameras/{camera}", name=camera) for camera in cameras]
+    views = [_camera_view(camera, (sizes_px or {}).get(camera)) for camera in cameras]
     # Frames are wide: up to three of them fit best in one column, beside a square floor. The tiles of a hall
     # keep the shape of a frame: there are more rows than columns.
     columns = 1 if len(views) <= 3 else max(2, math.floor(math.sqrt(len(views) * _TILES_ACROSS)))
@@ -137,8 +161,15 @@ def layout(
     )
 
 
-def _plot(entity: str, title: str) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin=f"/{entity}", name=title, plot_legend=rrb.PlotLegend(visible=True))
+def _camera_view(camera: str, size_px: tuple[int, int] | None) -> rrb.Spatial2DView:
+    """Return the view of a camera; without bounds, labels below the frame make its image smaller."""
+    bounds = None if size_px is None else rrb.VisualBounds2D(x_range=(0, size_px[0]), y_range=(0, size_px[1]))
+    return rrb.Spatial2DView(origin=f"/cameras/{camera}", name=camera, visual_bounds=bounds)
+
+
+def _plot(entity: str, plot: Plot) -> rrb.TimeSeriesView:
+    legend = rrb.PlotLegend(visible=plot.series <= _MOST_IN_LEGEND)
+    return rrb.TimeSeriesView(origin=f"/{entity}", name=plot.title, plot_legend=legend)
 
 
 def draw_legend(recording: rr.RecordingStream) -> None:
@@ -158,7 +189,7 @@ def _floor_view(trails: Sequence[str], rig: Rig | None) -> rrb.Spatial3DView:
         width_m, depth_m = rig.floor.width_m, rig.floor.depth_m
         middle = (width_m / 2, depth_m / 2, 0.0)
         # The view is straight down, with y upward in the image, as on the plan of the tape measurements.
-        above = (width_m / 2, depth_m / 2, 1.15 * max(width_m, depth_m))
+        above = (width_m / 2, depth_m / 2, _EYE_HEIGHT * max(width_m / _VIEW_ASPECT, depth_m))
         eye = rrb.EyeControls3D(position=above, look_target=middle, eye_up=(0.0, 1.0, 0.0))
     return rrb.Spatial3DView(
         origin="/world",

@@ -143,7 +143,7 @@ class CameraReader:
         """
         self._is_open.wait()
         # The camera of a node has its own recorder there, which may be starting.
-        is_slow = str(self._camera.source).startswith(("sim:", "zenoh:"))
+        is_slow = is_of_node(self._camera) or str(self._camera.source).startswith("sim:")
         begun = self._has_first_frame.wait(_DRAW_S if is_slow else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault

@@ -16,6 +16,7 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.runs.output import record_message
+from ipsys_log.runs.provenance import NODE_FORMAT
 
 __all__ = ["first_messages", "fitting_lenses"]
 
@@ -61,6 +62,6 @@ def first_messages(
         messages.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
     if imported_run is not None:
         time_ns = now_ns()
-        record = Run(time_ns, imported_run, IMPORTED, {"format": "node"})
+        record = Run(time_ns, imported_run, IMPORTED, {"format": NODE_FORMAT})
         messages.append(record_message(record, time_ns))
     return messages

@@ -44,7 +44,7 @@ def as_node(other: Open) -> Open:
 
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Any]]:
-        def with_keys(frames: Iterator[Frame]) -> Iterator[Frame]:
+        def with_keys(frames: Iterator[Any]) -> Iterator[Frame]:
             for number, frame in enumerate(frames):
                 yield frame._replace(format=MARKERS_FORMAT, session="session", number=number)
 

@@ -43,7 +43,7 @@ class RecordedFile:
 
     @property
     def is_deleted(self) -> bool:
-        """Whether the file has no name any more; a fault of the disk is no proof of that."""
+        """True if the file has no name any more; a fault of the disk is no proof of that."""
         try:
             return os.fstat(self._fd).st_nlink == 0
         except OSError:

@@ -13,16 +13,21 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
+from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock, Frame, Open, Say
+from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraPoints, Markers, Message, RigCamera
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS
+from ipsys_log.runs.graph import STAGES, Task, plan_stage
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
+from ipsys_log.runs.pieces import plan_pieces
+from ipsys_log.runs.provenance import imported_inputs
 from tests.conftest import Ipsys
 from tests.live_recordings import RATE_HZ, again, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
@@ -109,6 +114,27 @@ def test_mixed_log_is_verified_and_complete(mixed: Path, replayed_log: Path) -> 
     assert f"/runs/edges/cameras/{OF_NODE}/markers" in {one.topic for one in comparisons}
     outcomes = pipeline.replay([mixed], Request(models=("poly",), model_from=replayed_log))
     assert not any(one.fresh for one in outcomes)
+
+
+def test_markers_of_nodes_are_in_no_piece(mixed: Path, replayed_log: Path) -> None:
+    """Workers process the frames of one camera, and would leave the markers out."""
+    for log, is_divided in ((mixed, False), (replayed_log, True)):
+        with Session([log]) as session:
+            task = plan_stage(STAGES[0], session, {}, imported_inputs(session))
+            assert isinstance(task, Task)
+            assert (plan_pieces(task, session) is not None) == is_divided
+
+
+def test_usual_corners_are_those_of_the_cameras_with_frames(replayed_log: Path) -> None:
+    """A camera that sends markers needs no intrinsics for a recording with detection."""
+    states = {
+        name: CameraState(format=MARKERS_FORMAT if name == OF_NODE else "jpeg") for name in ("red", "white")
+    }
+    with Session([replayed_log]) as session:
+        (rig,) = session.payloads(["/rig"])
+    of_white = {"white": lenses(replayed_log)["white"]}
+    plan = plan_live(states, first_messages(rig, of_white, Clock().now_ns), Request(), "detect")
+    assert plan.request.corners == "edges"
 
 
 def test_replay_of_the_recorded_messages_equals_live(mixed: Path, replayed_log: Path, tmp_path: Path) -> None:

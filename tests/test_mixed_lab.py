@@ -116,6 +116,15 @@ def test_mixed_log_is_verified_and_complete(mixed: Path, replayed_log: Path) -> 
     assert not any(one.fresh for one in outcomes)
 
 
+@pytest.mark.parametrize("camera", [OF_NODE, "white"])
+def test_part_of_a_mixed_log_is_verified(mixed: Path, tmp_path: Path, ipsys: Ipsys, camera: str) -> None:
+    part = tmp_path / "part.mcap"
+    assert ipsys("cut", mixed, "--camera", camera, "-o", part).code == 0
+    comparisons = again(part)
+    assert all(one.equal for one in comparisons)
+    assert f"/runs/edges/cameras/{camera}/markers" in {one.topic for one in comparisons}
+
+
 def test_markers_of_nodes_are_in_no_piece(mixed: Path, replayed_log: Path) -> None:
     """Workers process the frames of one camera, and would leave the markers out."""
     for log, is_divided in ((mixed, False), (replayed_log, True)):

@@ -255,7 +255,8 @@ def _wire(
         runs.append(LiveRun(stage, plan.run, dict(inputs)))
         inputs.update({channel: plan.run for channel in stage.writes if channel is not RUN_EVENTS})
 
-    shared: dict[Channel, str] = dict(imported)
+    # Without frames, the next stages read the arriving run itself.
+    shared: dict[Channel, str] = dict(imported) if cameras else {}
     for stage in _causal(until):
         if not is_of_model(stage):
             add(stage, shared, None)

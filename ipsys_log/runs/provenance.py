@@ -201,9 +201,10 @@ def newest_run(session: Session, channel: Channel) -> str | None:
 def imported_inputs(session: Session) -> dict[Channel, str]:
     """Return the run of the markers that nodes have sent instead of images, for a stage that passes them on.
 
-    Cameras with images have none in this run: a stage detects their markers.
+    Cameras with images have none in this run: a stage detects their markers. In a log without images, the
+    next stages read the run itself.
     """
-    for run in reversed(session.runs()):
+    for run in reversed(session.runs()) if session.images else ():
         if run.stage == IMPORTED and run.parameters.get("format") == NODE_FORMAT:
             cameras = {camera_of_topic(topic) for topic in session.topics(MARKERS, run.run)}
             if cameras and cameras.isdisjoint(session.images):

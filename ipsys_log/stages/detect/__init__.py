@@ -311,7 +311,7 @@ def skipped_frames(events: Iterable[Event]) -> set[int]:
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
-    if not view.cameras:
+    if not view.cameras and not view.run(MARKERS):
         return view.newest(MARKERS)
     corners = options.get("corners") or usual_corners(view.cameras, view.lenses)
     skipped = skipped_frames(view.payloads(EVENTS))

@@ -33,28 +33,26 @@ class GrowingChannel:
 
     Parameters
     ----------
-    path : a log of :class:`~ipsys_log.log.writer.LogWriter`.
-
-    Raises
-    ------
-    LogError
-        The file cannot be opened.
+    path : a log of :class:`~ipsys_log.log.writer.LogWriter`. An existing file is opened at once, because
+        another program can rename it later.
     """
 
     def __init__(self, path: Path, topic: str) -> None:
-        self._topic = topic
-        # Opened now: another program can rename the log later.
-        self._view = FileBytes(path, open_for_reading(path), 0, 0)
+        self._path, self._topic = path, topic
+        self._view: FileBytes | None = None
         self._next = len(MAGIC)
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, str] = {}
         self._chunk = 0
         # For each message, the offset of its chunk in the file, its own in the chunk, and its schema.
         self._places: list[tuple[int, int, str]] = []
+        if path.exists():
+            self._open()
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
-        self._view.close()
+        if self._view is not None:
+            self._view.close()
 
     def read(self, number: int) -> Any:
         """Return the payload of a message; None if the file does not hold it yet.
@@ -69,7 +67,7 @@ class GrowingChannel:
         if number >= len(self._places):
             return None
         chunk, offset, schema = self._places[number]
-        view = self._view
+        view = self._open()
         head = parse_chunk_head(view, chunk)[1]
         if head.compression:
             data = unpack(view, chunk, head)
@@ -80,9 +78,14 @@ class GrowingChannel:
         length = HEADER.unpack(view.read(start, HEADER.size))[1]
         return decode(schema, view.read(start + MESSAGE.size, HEADER.size + length - MESSAGE.size))
 
+    def _open(self) -> FileBytes:
+        if self._view is None:
+            self._view = FileBytes(self._path, open_for_reading(self._path), 0, 0)
+        return self._view
+
     def _extend(self) -> None:
         """Add the records that the file has got since the last call."""
-        view = self._view
+        view = self._open()
         view.size = view.tail_offset = os.fstat(view.fd).st_size
         while self._next + HEADER.size <= view.size:
             opcode, length = HEADER.unpack(view.read(self._next, HEADER.size))

@@ -456,10 +456,10 @@ def live(
     def track(tracker: Tracker) -> list[Outcome]:
         from ipsys_log import pipeline
         from ipsys_log.capture.devices import check_devices, check_sources, source_opener
+        from ipsys_log.capture.first_messages import first_messages, fitting_lenses
         from ipsys_log.capture.frames import Clock
         from ipsys_log.capture.live_plan import check_start
         from ipsys_log.capture.multiplexer import LiveCameras
-        from ipsys_log.capture.recorder import first_messages, fitting_lenses
         from ipsys_log.exchange.lab_files import load_cameras, load_lenses
         from ipsys_log.messages.channels import TRACKS
         from ipsys_log.runs.select import wanted_models

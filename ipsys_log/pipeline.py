@@ -41,7 +41,7 @@ from ipsys_log.capture.knock_events import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
-from ipsys_log.capture.recorder import CameraSource, Recording, Source, open_recording, write_each
+from ipsys_log.capture.recorder import CameraSource, Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.known_contents import one_reading
@@ -114,7 +114,7 @@ def replay(
 
 
 def record(
-    source: Source,
+    source: CameraSource,
     settings: Iterable[Message],
     target: Path,
     consumers: Sequence[Consumer] = (),
@@ -144,6 +144,7 @@ def record(
     ):
         for arrived in write_each(source, log):
             show(arrived)
+    _report_rename(log, source.say)
     log.check_disk()
     show.check()
     return log.counts
@@ -193,6 +194,7 @@ def measure(
     ):
         for message in _through(plan.stages, chain(settings, frames)):
             _show_all(show, frames.take_events(), *(() if message is TICK else (message,)))
+    _report_rename(log, cameras.say)
     log.check_disk()
     show.check()
     return log.counts
@@ -250,19 +252,21 @@ def live(
             for message in frames:
                 _show_all(show, events(), None if message is TICK else message)
         _show_all(show, events())
-    if fault is not None:
-        raise IpsysError(
-            f"{fault}; {target} has all frames; to process them: ipsys replay {target}"
-        ) from fault
+    _report_rename(log, cameras.say)
     log.check_file()
+    path = log.path
+    if path is None:
+        raise IpsysError(f"{target}: its runs have no records yet; find the log, and run: ipsys repair LOG")
+    if fault is not None:
+        raise IpsysError(f"{fault}; {path} has all frames; to process them: ipsys replay {path}") from fault
     try:
-        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
+        outcomes = sign(path, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:
         log.check_disk()
     if frames.skipped:
         cameras.say(
             f"{frames.skipped.total()} frames skipped: processing could not keep up. All are recorded. To "
-            f"process all: ipsys replay {target}; --as-live excludes the skipped frames"
+            f"process all: ipsys replay {path}; --as-live excludes the skipped frames"
         )
     show.check()
     return outcomes
@@ -310,6 +314,13 @@ def _put_through(
     except IpsysError as fault:
         return fault
     return None
+
+
+def _report_rename(log: Recording, say: Callable[[str], None]) -> None:
+    """Report the present name of a log that another program has renamed."""
+    text = log.describe_rename()
+    if text is not None:
+        say(text)
 
 
 def _route_of(message: Message) -> Route | None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import pipeline
+from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.recorder import first_messages
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Latency
 from ipsys_log.messages.channels import LATENCY, MODEL, POSITIONS, TRACKS

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
+from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.network import open_network
-from ipsys_log.capture.recorder import first_messages
 from ipsys_log.images.video import Video, is_keyframe
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedVideo, Message, RigCamera

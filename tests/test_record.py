@@ -382,6 +382,35 @@ def late_by_s(images: list[CompressedImage], jpegs: list[bytes]) -> list[float]:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("options", [(), ("--detect",)])
+def test_renamed_log_is_recorded_to_its_end(
+    options: tuple[str, ...], ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    """The folder has a new name, too, and another program has taken the old name of the log."""
+    old, new = tmp_path / "monday" / "a.mcap", tmp_path / "tuesday" / "b.mcap"
+    old.parent.mkdir()
+    with streams(pictures[0], tmp_path) as rig:
+        program = started("record", "--rig", rig, "-o", old, *options)
+        wait_for(old, 500_000)
+        old.rename(old.with_name("b.mcap"))
+        old.parent.rename(new.parent)
+        old.parent.mkdir()
+        old.write_bytes(b"notes")
+        wait_for(new, new.stat().st_size + 4_000_000)
+        program.send_signal(signal.SIGINT)
+        out, err = program.communicate(timeout=LIMIT_S)
+    assert program.returncode == 0, err
+    assert f"another program has renamed the log {old}: it is {new} now" in " ".join(err.split())
+    assert out.startswith(f"{new} written: ")
+    assert old.read_bytes() == b"notes"
+    found = frames(new)
+    assert sorted(found) == sorted(NAMES)
+    assert all(f"camera {name}: {len(found[name])} frames" in out for name in NAMES)
+    if options:
+        assert ipsys("verify", new).code == 0
+
+
+@pytest.mark.slow
 def test_a_full_disk_ends_it_with_a_complete_log(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:

@@ -11,12 +11,12 @@ place of the simulated wheels, your robot has a motor driver and a timer.
 import argparse
 import json
 import socket
-import time
+from contextlib import suppress
 
 from controller import Controller
 from positions import UdpPositions, VrpnPositions
 
-LONGEST_WAIT_S = 60.0
+TURN_S = 2.0
 
 
 def address_of(text):
@@ -42,12 +42,26 @@ def open_positions(text, robot):
     return (VrpnPositions if kind == "vrpn" else UdpPositions)(address_of(text), robot)
 
 
-def wait_for_positions(positions, count, now_s):
+def wait_for_tick(wheels, hello):
+    """Return the next tick. With lockstep, the simulator may need long for a frame.
+
+    The greeting is sent again and again: it fails after the simulator has ended.
+    """
+    while True:
+        try:
+            return json.loads(wheels.recv(2048))
+        except TimeoutError:
+            wheels.send(hello)
+
+
+def wait_for_positions(positions, count, now_s, wheels, hello):
     """Read positions. With lockstep, wait until all that were sent have arrived."""
     positions.receive(0.0, now_s)
-    last_s = time.monotonic() + LONGEST_WAIT_S
-    while count is not None and positions.count < count and time.monotonic() < last_s:
-        positions.receive(0.5, now_s)
+    while count is not None and positions.count < count:
+        before = positions.count
+        positions.receive(TURN_S, now_s)
+        if positions.count == before:
+            wheels.send(hello)
 
 
 def main():
@@ -56,13 +70,14 @@ def main():
     controller = Controller([tuple(map(float, point.split(","))) for point in options.path.split()])
     wheels = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wheels.connect(address_of(options.wheels))
-    wheels.settimeout(LONGEST_WAIT_S)
-    wheels.send(json.dumps({"robot": options.robot}).encode())
+    wheels.settimeout(TURN_S)
+    hello = json.dumps({"robot": options.robot}).encode()
+    wheels.send(hello)
     while True:
-        tick = json.loads(wheels.recv(2048))
+        tick = wait_for_tick(wheels, hello)
         if "end" in tick:
             break
-        wait_for_positions(positions, tick.get("positions"), tick["time_s"])
+        wait_for_positions(positions, tick.get("positions"), tick["time_s"], wheels, hello)
         pose = positions.pose
         (left_m_s, right_m_s), state = controller.step(pose, tick["time_s"])
         command = {"robot": options.robot, "tick": tick["tick"], "left_m_s": left_m_s, "right_m_s": right_m_s}
@@ -74,4 +89,5 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    with suppress(ConnectionRefusedError):  # the simulator has ended
+        main()

@@ -13,7 +13,7 @@ from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import frame_payload
 from ipsys_log.capture.video_packets import find_size, is_decodable_start
-from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
 from ipsys_log.messages.channels import MARKERS
@@ -62,23 +62,8 @@ class CameraState:
 
 
 def imported_run(states: Mapping[str, CameraState]) -> str | None:
-    """Return the run of the markers that nodes send instead of frames; None if no camera sends markers.
-
-    A stage reads the markers of one run, so all cameras send markers, or none.
-
-    Raises
-    ------
-    IpsysError
-        Some cameras send markers, and others frames.
-    """
-    names = [name for name, state in states.items() if state.format == MARKERS_FORMAT]
-    if names and len(names) < len(states):
-        others = ", ".join(name for name in states if name not in names)
-        raise IpsysError(
-            f"camera {', '.join(names)} sends markers, but camera {others} sends frames; start all nodes with"
-            " --detect, or none"
-        )
-    return NODES_RUN if names else None
+    """Return the run of the markers that nodes send instead of frames; None if no camera sends markers."""
+    return NODES_RUN if any(state.format == MARKERS_FORMAT for state in states.values()) else None
 
 
 class Arrival(NamedTuple):
@@ -143,7 +128,7 @@ class CameraReader:
         """
         self._is_open.wait()
         # The camera of a node has its own recorder there, which may be starting.
-        is_slow = str(self._camera.source).startswith(("sim:", "zenoh:"))
+        is_slow = is_of_node(self._camera) or str(self._camera.source).startswith("sim:")
         begun = self._has_first_frame.wait(_DRAW_S if is_slow else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault

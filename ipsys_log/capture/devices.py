@@ -27,7 +27,7 @@ from ipsys_log.capture.network import check_address, open_network
 from ipsys_log.capture.nodes.centre import Centre, is_of_node, node_of
 from ipsys_log.capture.nodes.network import read_network
 from ipsys_log.capture.simulated import open_simulated, parse_source
-from ipsys_log.capture.usb_bus import advise, list_demands
+from ipsys_log.capture.usb_bandwidth import advise, list_demands
 from ipsys_log.capture.video_files import check_playback_source, open_playback
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed

@@ -111,12 +111,13 @@ def plan_live(
     """
     lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
     (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
-    request = replace(request, corners=request.corners or usual_corners(cameras, lenses))
+    arriving = imported_run(cameras) if isinstance(cameras, Mapping) else None
+    pictured = _pictured(cameras)
+    request = replace(request, corners=request.corners or usual_corners(pictured, lenses))
     copied = _copied(request, until)
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
-    arriving = imported_run(cameras) if isinstance(cameras, Mapping) else None
-    wired = _wire(cameras, settings, lenses, request, copied, until, arriving)
+    wired = _wire(pictured, settings, lenses, request, copied, until, arriving)
     return LivePlan(request, copied, *wired)
 
 
@@ -196,6 +197,12 @@ def _check(
             )
 
 
+def _pictured(cameras: Collection[str]) -> list[str]:
+    """Return the cameras that send frames; nodes can send markers instead."""
+    states = cameras if isinstance(cameras, Mapping) else {}
+    return [name for name in cameras if name not in states or states[name].format != MARKERS_FORMAT]
+
+
 def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
     """Check that each frame of the cameras can be decoded by itself.
 
@@ -228,18 +235,16 @@ def _wire(
 ) -> tuple[list[LiveRun], list[WiredStage]]:
     """Return the runs of a live recording, and its stages, each wired to the runs that it reads.
 
-    ``arriving`` is the run of markers that arrive instead of images.
+    ``cameras`` send frames. ``arriving`` is the run of markers that other cameras send instead.
     """
     runs: list[LiveRun] = []
     stages: list[WiredStage] = []
 
     imported = {} if arriving is None else {MARKERS: arriving}
-    # Stages that read images see no camera.
-    pictured = cameras if arriving is None else ()
 
     def add(stage: Stage, inputs: dict[Channel, str], model: Model | None) -> None:
         options = request.options(model.name if model else None)
-        view = _LiveView(pictured, lenses, settings, inputs, model, imported=imported)
+        view = _LiveView(cameras, lenses, settings, inputs, model, imported=imported)
         plan = stage.plan(view, options)
         if isinstance(plan, str) and arriving is not None:
             inputs.update({channel: plan for channel in stage.writes if channel is not RUN_EVENTS})
@@ -250,7 +255,8 @@ def _wire(
         runs.append(LiveRun(stage, plan.run, dict(inputs)))
         inputs.update({channel: plan.run for channel in stage.writes if channel is not RUN_EVENTS})
 
-    shared: dict[Channel, str] = {}
+    # Without frames, the next stages read the arriving run itself.
+    shared: dict[Channel, str] = dict(imported) if cameras else {}
     for stage in _causal(until):
         if not is_of_model(stage):
             add(stage, shared, None)

@@ -117,13 +117,7 @@ class LiveCameras:
 
     @property
     def imported_run(self) -> str | None:
-        """The run of the markers that nodes send instead of frames; None if no camera sends markers.
-
-        Raises
-        ------
-        IpsysError
-            Some cameras send markers, and others frames.
-        """
+        """The run of the markers that nodes send instead of frames; None if no camera sends markers."""
         return imported_run(self.states)
 
     @property

@@ -51,8 +51,8 @@ class RecentFrames:
             self._write()
 
     @property
-    def is_displaced(self) -> bool:
-        return self._log.is_displaced
+    def is_deleted(self) -> bool:
+        return self._log.is_deleted
 
     @property
     def full(self) -> WriteError | None:

@@ -6,7 +6,6 @@ import os
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -20,41 +19,33 @@ from ipsys_log.capture.disk import (
     reserve,
 )
 from ipsys_log.capture.frames import Clock, Say
+from ipsys_log.capture.recorded_file import RecordedFile
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
-from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
-    IMPORTED,
-    RIG_TOPIC,
     STAMP_UNRELIABLE,
-    CameraCalibration,
     CompressedImage,
     CompressedVideo,
     Event,
     Measurement,
     Message,
-    Rig,
-    Run,
-    calibration_topic,
 )
-from ipsys_log.runs.output import record_message, serialize, write_message
+from ipsys_log.runs.output import serialize, write_message
 
 __all__ = [
     "CameraSource",
     "Recording",
     "Source",
     "Target",
-    "first_messages",
-    "fitting_lenses",
     "open_recording",
     "write_each",
 ]
 
 # After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0
-_DISPLACED = "deleted or renamed"
+_DELETED = "another program has deleted the log"
 
 
 class Source(Protocol):
@@ -94,12 +85,12 @@ class CameraSource(Source, Protocol):
 class Target(Protocol):
     """Destination of messages, in the order of their log times.
 
-    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages. ``is_displaced`` is
-    True if another program has deleted or renamed the file.
+    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages. ``is_deleted`` is
+    True if another program has deleted the file.
     """
 
     @property
-    def is_displaced(self) -> bool: ...
+    def is_deleted(self) -> bool: ...
 
     @property
     def full(self) -> WriteError | None: ...
@@ -125,16 +116,20 @@ class Recording:
     ----------
     counts : number of messages so far, by topic.
     full : set when the disk is full; then the reserved space is in use.
-    is_displaced : set soon after another program has deleted or renamed the file.
+    is_deleted : set soon after another program has deleted the file.
+    path : path of the log; after :func:`open_recording`, the one at its end. None if another program has
+        renamed the log, and its present path cannot be found.
     syncer : syncs the log to the disk.
     """
 
     def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
         self.counts: dict[str, int] = {}
         self.full: WriteError | None = None
-        self.is_displaced = False
+        self.is_deleted = False
+        self.path: Path | None = writer.path
+        self._first_path = writer.path
         self.syncer = Syncer(self._sync)
-        self._file = writer.path.stat()
+        self._file = RecordedFile(writer.path, writer.fd)
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
         self._torn = False
@@ -163,19 +158,32 @@ class Recording:
         """The first error of the disk when it failed to keep written messages."""
         return self.syncer.fault
 
+    def follow(self) -> None:
+        """Note the present path of the log before its end: another program may have renamed it."""
+        self._look()
+        self.path = self._file.find()
+        if self.path is not None:
+            self._writer.follow(self.path)
+
+    def describe_rename(self) -> str | None:
+        """Describe where a log is that another program has renamed; None if it has its first name."""
+        if self.path == self._first_path or self.is_deleted:
+            return None
+        place = "its present name cannot be found" if self.path is None else f"it is {self.path} now"
+        return f"another program has renamed the log {self._first_path}: {place}"
+
     def check_file(self) -> None:
-        """Check that the log still has its name.
+        """Check that the log exists.
 
         Raises
         ------
         IpsysError
-            Another program has deleted or renamed it.
+            Another program has deleted it.
         """
-        self._find_file()
-        if self.is_displaced:
+        if self.is_deleted:
             raise IpsysError(
-                f"{self._writer.path}: another program has {_DISPLACED} the log; the recording has stopped. "
-                "A renamed log is complete up to this time under its new name; a deleted one is lost"
+                f"{self._first_path}: {_DELETED}; the recording has stopped. If it was moved to another "
+                "disk, repair it there: ipsys repair FILE"
             )
 
     def check_disk(self) -> None:
@@ -184,29 +192,25 @@ class Recording:
         Raises
         ------
         IpsysError
-            The disk was full or failed, or the file is displaced; the text describes the log.
+            The disk was full or failed, or :meth:`check_file` fails; the text describes the log.
         """
         self.check_file()
+        path = self.path or self._first_path
         if self.full is not None:
-            raise IpsysError(describe_disk_full(self._writer.path, self.full)) from self.full
+            raise IpsysError(describe_disk_full(path, self.full)) from self.full
         if self.fault is not None:
-            raise IpsysError(describe_disk_failure(self._writer.path, self.fault)) from self.fault
+            raise IpsysError(describe_disk_failure(path, self.fault)) from self.fault
 
     def settle(self) -> bool:
         """Prevent further writes from all threads; return False if a thread is still writing."""
         return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
 
     def _sync(self) -> None:
-        self._find_file()
+        self._look()
         self._writer.sync()
 
-    def _find_file(self) -> None:
-        """Note that the path leads to another file or to none; a fault of the disk is no proof of that."""
-        try:
-            is_same = os.path.samestat(self._file, self._writer.path.stat())
-        except OSError as error:
-            is_same = not isinstance(error, FileNotFoundError)
-        self.is_displaced = self.is_displaced or not is_same
+    def _look(self) -> None:
+        self.is_deleted = self.is_deleted or self._file.is_deleted
 
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
@@ -226,7 +230,7 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
     """Yield the messages of a source, each after it was written.
 
     A measurement is confirmed as soon as it is on the disk. When the disk is full, or another program has
-    deleted or renamed the log, the source is stopped.
+    deleted the log, the source is stopped.
     Messages other than frames are still written, to the reserved space.
     """
     warned = False
@@ -253,8 +257,8 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
                 source.stop(
                     "the disk is full" if is_full(log.full.cause) else describe_disk_fault(log.full.cause)
                 )
-            elif log.is_displaced:
-                source.stop(f"another program has {_DISPLACED} the log")
+            elif log.is_deleted:
+                source.stop(_DELETED)
 
 
 @contextmanager
@@ -285,6 +289,7 @@ def open_recording(
                 for message in settings:
                     log.put(message)
                 log.flush()
+                resources.callback(log.follow)
                 resources.enter_context(log.syncer)
                 yield log
             except KeyboardInterrupt as error:
@@ -314,49 +319,3 @@ def _create(path: Path, overwrite: bool) -> LogWriter:
         return writer
     finally:
         os.close(old)
-
-
-def fitting_lenses(
-    lenses: Mapping[str, CameraCalibration],
-    sizes_px: Mapping[str, tuple[int, int] | None],
-    say: Callable[[str], None],
-) -> dict[str, CameraCalibration]:
-    """Return intrinsics for the frames of cameras, scaled for frames of another size; ``say`` reports this.
-
-    Raises
-    ------
-    IpsysError
-        The frames have another aspect ratio.
-    """
-    fitting = {}
-    for camera, lens in lenses.items():
-        width, height = sizes_px.get(camera) or (lens.width, lens.height)
-        fitting[camera] = scale_intrinsics(lens, width, height, f"camera {camera}")
-        if width != lens.width:
-            say(f"camera {camera}: its calibration is scaled from a width of {lens.width} px to {width} px")
-    return fitting
-
-
-def first_messages(
-    rig: Rig,
-    lenses: Mapping[str, CameraCalibration],
-    now_ns: Callable[[], int],
-    imported_run: str | None = None,
-) -> list[Message]:
-    """Return the first messages of a log: the rig, the intrinsics by camera, and the record of a run.
-
-    Parameters
-    ----------
-    imported_run : the run of markers that other hosts have detected.
-    """
-    time_ns = now_ns()
-    messages = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
-    for camera, lens in sorted(lenses.items()):
-        time_ns = now_ns()
-        stamped = replace(lens, timestamp=time_ns)
-        messages.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
-    if imported_run is not None:
-        time_ns = now_ns()
-        record = Run(time_ns, imported_run, IMPORTED, {"format": "node"})
-        messages.append(record_message(record, time_ns))
-    return messages

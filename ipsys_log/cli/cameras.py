@@ -40,7 +40,7 @@ def cameras(
     """List the USB cameras with device, modes, bus and hub, and check that USB is fast enough for all.
 
     Without --rig, the check uses the largest mode of each camera. Network cameras are not listed."""
-    from ipsys_log.capture.usb_bus import advise, list_demands
+    from ipsys_log.capture.usb_bandwidth import advise, list_demands
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import load_rig
 

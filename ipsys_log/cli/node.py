@@ -125,5 +125,6 @@ def _send(
             pipeline.record(cameras, settings, target, [status, sender], force)
         left = sender.finish(not cameras.is_stopped)
     if left:
-        text = f"the centre {network} does not have {left} frames of camera {camera}; {target} has all frames"
+        missing = f"{left} frames of camera {camera}"
+        text = f"the centre {network} does not have {missing}; {status.log} has all frames"
         remarks.print(text, style="yellow", markup=False)

@@ -165,10 +165,10 @@ def open_cameras(
     """
     from ipsys_log.capture.devices import source_opener
     from ipsys_log.capture.disk import expected_bytes_per_s, free_room
+    from ipsys_log.capture.first_messages import first_messages, fitting_lenses
     from ipsys_log.capture.frames import Clock
     from ipsys_log.capture.live_check import CameraMonitor
     from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.capture.recorder import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
 
     with ExitStack() as stack:
@@ -183,6 +183,7 @@ def open_cameras(
         growing = None if doing and seconds is None else expected
         monitor = stack.enter_context(CameraMonitor(lab.rig))
         status = LiveStatus(attached.states, monitor, output, monotonic, growing)
+        stack.callback(status.close)
         _say_room(lab, attached, free_room(output, expected), seconds, doing)
         say(doing or f"recording into {output}; Ctrl-C to end")
         if panel:

@@ -128,6 +128,7 @@ class LockstepCameras:
         """End the iteration."""
         self._ending = True
         self._sync.stop()
+        self.steering.stop()
 
     def confirm(self, message: Message, fault: OSError | None) -> None:
         """Do nothing: nobody waits for the disk."""

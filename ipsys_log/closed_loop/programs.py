@@ -12,17 +12,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from ipsys_log.capture.frames import Clock
 from ipsys_log.closed_loop.ports import Ports
 from ipsys_log.closed_loop.settings import RobotRun
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Waypoint
-from ipsys_log.units import NS_PER_S
 
 __all__ = ["Programs", "RelayLink", "start_programs"]
 
 _END_S = 5.0
-_RELAY_S = 120.0
+# A relay does little work: ten minutes are enough on any machine.
+_TURN_S, _RELAY_TURNS = 0.1, 6000
 _LOOPBACK = "127.0.0.1"
 
 
@@ -60,7 +59,7 @@ class RelayLink:
     """The connection to a relay with the clock of the simulator."""
 
     def __init__(self, port: int, process: subprocess.Popen[bytes]) -> None:
-        self._address, self._process, self._clock = (_LOOPBACK, port), process, Clock()
+        self._address, self._process = (_LOOPBACK, port), process
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((_LOOPBACK, 0))
 
@@ -77,9 +76,11 @@ class RelayLink:
         """
         fields = {"relay_tick": number, "time_ns": time_ns, "positions": positions}
         self._socket.sendto(json.dumps(fields).encode(), self._address)
-        last_ns = self._clock.now_ns() + round(_RELAY_S * NS_PER_S)
-        while self._process.poll() is None and self._clock.now_ns() < last_ns:
-            if select.select([self._socket], [], [], 0.1)[0]:
+        # In turns: time in which this program is suspended does not count.
+        for _ in range(_RELAY_TURNS):
+            if self._process.poll() is not None:
+                break
+            if select.select([self._socket], [], [], _TURN_S)[0]:
                 answer = json.loads(self._socket.recv(2048))
                 if answer["relay_tick"] == number:
                     return int(answer["forwarded"])

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ipsys_log import pipeline
+from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.live_plan import check_start
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.recorder import CameraSource, first_messages
+from ipsys_log.capture.recorder import CameraSource
 from ipsys_log.closed_loop.lockstep import LockstepCameras, SimulatedClock, SyncPoint
 from ipsys_log.closed_loop.programs import Programs, start_programs
 from ipsys_log.closed_loop.real_time import Driver, RobotCameras, add_truth

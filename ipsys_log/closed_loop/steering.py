@@ -56,6 +56,10 @@ class Steering:
         """Return whether all robots stand at their last waypoints."""
         return all(self._states.get(robot, ("", 0))[0] == FINISHED for robot in self._run.paths)
 
+    def stop(self) -> None:
+        """End the wait for the commands of a tick."""
+        self._wheels.stop()
+
     def tick(self) -> None:
         """Send the next tick to all robots; their commands come later."""
         self._number += 1

@@ -22,9 +22,8 @@ from ipsys_log.units import NS_PER_S
 __all__ = ["Answer", "Wheels"]
 
 LOOPBACK = "127.0.0.1"
-_GREETING_S = 60.0
-# A busy machine may be slow; a program that does not answer for this time has stopped.
-_ANSWER_S = 120.0
+# A slow machine needs long for a program. After the first time it is named; the second is an error.
+_SAID_S, _LONGEST_S = 10.0, 600.0
 _TURN_S = 0.1
 _LONGEST_BYTES = 2048
 _LONGEST_STATE = 32
@@ -37,6 +36,33 @@ class Answer(NamedTuple):
     tick: int | None
 
 
+class _Patience:
+    """The wait for the programs of some robots. Time in which this program is suspended does not count."""
+
+    def __init__(self, clock: Clock, check: Callable[[], None], say: Callable[[str], None]) -> None:
+        self._clock, self._check, self._say = clock, check, say
+        self._waited_s, self._last_ns = 0.0, clock.now_ns()
+        self._is_said = False
+
+    def take_turn(self, robot: str, lacks: str) -> None:
+        """Check the programs after a turn in which a robot did not send what it lacks.
+
+        Raises
+        ------
+        IpsysError
+            A program has ended, or the robot has sent nothing for a long time.
+        """
+        self._check()
+        now_ns = self._clock.now_ns()
+        self._waited_s += min((now_ns - self._last_ns) / NS_PER_S, 2 * _TURN_S)
+        self._last_ns = now_ns
+        if self._waited_s > _LONGEST_S:
+            raise IpsysError(f"{robot}: its program has not sent {lacks} for {_LONGEST_S:g} s; correct it")
+        if self._waited_s > _SAID_S and not self._is_said:
+            self._is_said = True
+            self._say(f"{robot}: waits until its program sends {lacks}; Ctrl-C to end")
+
+
 class Wheels:
     """The wheels of all robots, behind one socket.
 
@@ -45,7 +71,7 @@ class Wheels:
     port : port on loopback.
     robots : names of the robots; a program of another robot is refused.
     check : called while waiting; raises if a program has ended.
-    say : called with the name of a robot that is refused.
+    say : called with the name of a robot that is refused, or whose program is slow.
 
     Raises
     ------
@@ -59,6 +85,7 @@ class Wheels:
         self._robots, self._check, self._say = tuple(robots), check, say
         self._addresses: dict[str, tuple[str, int]] = {}
         self._clock = Clock()
+        self._is_stopped = False
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((LOOPBACK, port))
@@ -80,23 +107,22 @@ class Wheels:
             self._send({"end": True}, address)
         self._socket.close()
 
+    def stop(self) -> None:
+        """End the wait for answers; a signal handler may call this."""
+        self._is_stopped = True
+
     def wait_for_robots(self) -> None:
         """Wait until the program of each robot has sent its name.
 
         Raises
         ------
         IpsysError
-            A program has ended, or did not send its name in time.
+            A program has ended, or did not send its name.
         """
-        last_ns = self._clock.now_ns() + round(_GREETING_S * NS_PER_S)
+        patience = _Patience(self._clock, self._check, self._say)
         while missing := [name for name in self._robots if name not in self._addresses]:
+            patience.take_turn(missing[0], f'{{"robot": "{missing[0]}"}} to {self.address}')
             list(self.receive(_TURN_S))
-            self._check()
-            if self._clock.now_ns() > last_ns:
-                raise IpsysError(
-                    f"{missing[0]}: its program did not connect to the wheels in {_GREETING_S:g} s; it must "
-                    f'send {{"robot": "{missing[0]}"}} to {self.address}'
-                )
 
     def tick(self, number: int, time_s: float, positions: Mapping[str, int] | None = None) -> None:
         """Send a tick to all robots.
@@ -115,21 +141,22 @@ class Wheels:
     def answers(self, number: int) -> list[WheelCommand]:
         """Wait for the answers of all robots to a tick; return them in the order of the robots.
 
+        After :meth:`stop`, none are returned.
+
         Raises
         ------
         IpsysError
             A program has ended, or does not answer.
         """
         commands: dict[str, WheelCommand] = {}
-        last_ns = self._clock.now_ns() + round(_ANSWER_S * NS_PER_S)
-        while len(commands) < len(self._robots):
+        patience = _Patience(self._clock, self._check, self._say)
+        while missing := [name for name in self._robots if name not in commands]:
+            if self._is_stopped:
+                return []
+            patience.take_turn(missing[0], "a command")
             for answer in self.receive(_TURN_S):
                 if answer.tick == number:
                     commands[answer.command.robot] = answer.command
-            self._check()
-            if self._clock.now_ns() > last_ns:
-                missing = next(name for name in self._robots if name not in commands)
-                raise IpsysError(f"{missing}: its program sent no command for {_ANSWER_S:g} s; correct it")
         return [commands[robot] for robot in self._robots]
 
     def receive(self, wait_s: float) -> Iterator[Answer]:

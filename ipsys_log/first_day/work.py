@@ -13,11 +13,11 @@ from ipsys_log import api, pipeline
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.capture.devices import check_devices, check_sources, source_opener
 from ipsys_log.capture.disk import expected_bytes_per_s, free_room
+from ipsys_log.capture.first_messages import first_messages, fitting_lenses
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.capture.live_plan import check_start
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.recorder import first_messages, fitting_lenses
 from ipsys_log.capture.simulated import show_board
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text

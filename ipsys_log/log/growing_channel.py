@@ -33,7 +33,8 @@ class GrowingChannel:
 
     Parameters
     ----------
-    path : a log of :class:`~ipsys_log.log.writer.LogWriter`.
+    path : a log of :class:`~ipsys_log.log.writer.LogWriter`. An existing file is opened at once, because
+        another program can rename it later.
     """
 
     def __init__(self, path: Path, topic: str) -> None:
@@ -45,6 +46,8 @@ class GrowingChannel:
         self._chunk = 0
         # For each message, the offset of its chunk in the file, its own in the chunk, and its schema.
         self._places: list[tuple[int, int, str]] = []
+        if path.exists():
+            self._open()
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""

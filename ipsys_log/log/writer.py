@@ -181,6 +181,16 @@ class LogWriter:
         with suppress(OSError):
             output.storage.fsync_directory(path.parent)
 
+    @property
+    def fd(self) -> int:
+        """The descriptor of the file until it is closed."""
+        return self._output.fd
+
+    def follow(self, path: Path) -> None:
+        """Take the new name of a new log that another program has renamed."""
+        if isinstance(self._output, NewFile):
+            self.path = self._output.path = path
+
     def add_channel(
         self,
         topic: str,

@@ -19,6 +19,7 @@ from ipsys_log.analysis.overlap_stream import OverlapSummary
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
+from ipsys_log.capture.recorded_file import RecordedFile
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.units import CM_PER_M, format_bytes, format_duration
 
@@ -47,6 +48,10 @@ class LiveStatus:
     target : the log that is written.
     now_s : clock for the rates.
     expected_bytes_per_s : growth of the log, until it can be measured; None if it does not grow with time.
+
+    Attributes
+    ----------
+    log : after :meth:`close`, the path of the log; another program may have renamed it.
     """
 
     def __init__(
@@ -58,6 +63,8 @@ class LiveStatus:
         expected_bytes_per_s: float | None = None,
     ) -> None:
         self._states, self._monitor, self._target, self._now_s = states, monitor, target, now_s
+        self.log, self._size = target, 0
+        self._file: RecordedFile | None = None
         self._begin_s = now_s()
         self._expected_bytes_per_s = expected_bytes_per_s
         self._before: dict[str, tuple[float, int, int]] = {}
@@ -72,12 +79,20 @@ class LiveStatus:
 
     def __call__(self, message: Message | None) -> None:
         """Handle one recorded message."""
+        self._open_log()
         self._monitor(message)
         if message is None:
             return
         self._overlap(message)
         if isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
+
+    def close(self) -> None:
+        """Note the path and the size of the finished log."""
+        if self._file is not None:
+            self.log, self._size = self._file.find() or self._target, self._file.size
+            self._file.close()
+            self._file = None
 
     def show(self) -> Group:
         """Return the display: cameras, robots, warnings on cameras, and the disk."""
@@ -95,7 +110,8 @@ class LiveStatus:
 
     def _disk(self, took_s: float) -> Text:
         """Return the size of the log, and how long the disk lasts at its measured growth."""
-        size = self._target.stat().st_size if self._target.exists() else 0
+        file = self._open_log()
+        size = 0 if file is None else file.size
         folder = self._target.absolute().parent
         free = shutil.disk_usage(folder).free
         line = f"{took_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
@@ -109,10 +125,16 @@ class LiveStatus:
             style="bold red" if room.is_short() else "",
         )
 
+    def _open_log(self) -> RecordedFile | None:
+        """Return the open log, which another program may rename; None before it exists."""
+        if self._file is None:
+            self._file = RecordedFile.open(self._target)
+        return self._file
+
     def summary(self) -> list[str]:
         """Return the lines that describe a finished recording."""
         took_s = self._now_s() - self._begin_s
-        lines = [f"{self._target} written: {took_s:.1f} s, {format_bytes(self._target.stat().st_size)}"]
+        lines = [f"{self.log} written: {took_s:.1f} s, {format_bytes(self._size)}"]
         for name, state in self._states.items():
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
             missed = f", {state.missed} lost before arrival" if state.missed else ""

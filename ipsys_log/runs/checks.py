@@ -38,7 +38,7 @@ from ipsys_log.runs.model_checks import (
     check_models,
 )
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, newest_run
+from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, imported_inputs, newest_run
 from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.stages.detect import usual_corners
 
@@ -113,7 +113,7 @@ def _check_new_stages(
     session: Session, request: Request, models: Sequence[str], stages: Sequence[Stage]
 ) -> None:
     """Check that the run name of the user is free for each stage that this command computes."""
-    inputs: dict[Channel, str] = {}
+    inputs = imported_inputs(session)
     new: set[Channel] = set()
     # A run name belongs to one model.
     for stage in sorted(stages, key=is_of_model) if request.run is not None else ():
@@ -193,7 +193,8 @@ def _check_rigs(session: Session, request: Request) -> None:
 def _cameras(session: Session, written: Collection[Channel]) -> set[str]:
     """Return the cameras whose markers need camera intrinsics; none if the log has only camera points."""
     if session.images:
-        return set(session.images)
+        imported = session.topics(MARKERS, imported_inputs(session).get(MARKERS, ""))
+        return {*session.images, *(str(camera_of_topic(topic)) for topic in imported)}
     markers = newest_run(session, MARKERS)
     if markers is not None and CAMERA_POINTS in written:
         return {str(camera_of_topic(topic)) for topic in session.topics(MARKERS, markers)}

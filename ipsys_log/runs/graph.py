@@ -70,7 +70,8 @@ def stages_until(name: str | None) -> list[Stage]:
 def _with_needed(stage: Stage) -> set[Stage]:
     needed = {stage}
     for writer in (candidate for candidate in STAGES if _own(candidate) & set(stage.reads)):
-        needed |= _with_needed(writer)
+        if writer is not stage:
+            needed |= _with_needed(writer)
     return needed
 
 

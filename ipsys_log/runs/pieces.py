@@ -192,7 +192,9 @@ def divide_run(task: Task, session: Session, workers: PieceWorkers) -> DividedRu
 
 def plan_pieces(task: Task, session: Session) -> PiecePlan | None:
     """Divide the run of a task into pieces; None if its stage, or a video, needs all earlier frames."""
-    frames = order_frames(session, task.topics) if task.stage.pieces is not None else None
+    # Markers of nodes, which the stage passes on, are in no piece.
+    is_divided = task.stage.pieces is not None and not task.inputs
+    frames = order_frames(session, task.topics) if is_divided else None
     if frames is None:
         return None
     run = PieceRun.of_task(task, session)

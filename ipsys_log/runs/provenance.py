@@ -16,18 +16,21 @@ import threadpoolctl
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
+from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, ChannelRead, Run
-from ipsys_log.messages.channels import Channel
+from ipsys_log.messages import IMPORTED, CameraCalibration, ChannelRead, Run
+from ipsys_log.messages.channels import MARKERS, Channel
 from ipsys_log.runs.origins import has_result, present_inputs, was_complete
 
 __all__ = [
+    "NODE_FORMAT",
     "Outcome",
     "check_run_name",
     "complete_runs",
     "find_run",
     "fingerprint",
     "free_name",
+    "imported_inputs",
     "is_complete",
     "newest_run",
     "read_channels",
@@ -36,6 +39,8 @@ __all__ = [
     "with_inputs",
 ]
 
+# The parameter ``format`` of the record of markers that nodes have sent.
+NODE_FORMAT = "node"
 _MOST_DIGITS = 6
 
 
@@ -191,3 +196,17 @@ def newest_run(session: Session, channel: Channel) -> str | None:
         if topics and (topics.isdisjoint(recorded) or topics & {output.topic for output in run.outputs}):
             return run.run
     return None
+
+
+def imported_inputs(session: Session) -> dict[Channel, str]:
+    """Return the run of the markers that nodes have sent instead of images, for a stage that passes them on.
+
+    Cameras with images have none in this run: a stage detects their markers. In a log without images, the
+    next stages read the run itself.
+    """
+    for run in reversed(session.runs()) if session.images else ():
+        if run.stage == IMPORTED and run.parameters.get("format") == NODE_FORMAT:
+            cameras = {camera_of_topic(topic) for topic in session.topics(MARKERS, run.run)}
+            if cameras and cameras.isdisjoint(session.images):
+                return {MARKERS: run.run}
+    return {}

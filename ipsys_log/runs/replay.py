@@ -23,7 +23,7 @@ from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.runs.preload import preload
-from ipsys_log.runs.provenance import Outcome
+from ipsys_log.runs.provenance import Outcome, imported_inputs
 
 __all__ = ["Replay"]
 
@@ -72,7 +72,8 @@ class Replay:
         of_model = [stage for stage in self.stages if is_of_model(stage)]
         # A copied model is known before its turn: its stages can follow the first ones.
         is_copied = self.request.model_from is not None and len(self.models) == 1
-        shared: dict[Channel, str] = {}
+        with Session(self.logs) as session:
+            shared = imported_inputs(session)
         first = [stage for stage in self.stages if stage not in of_model]
         self._run_stages(first, shared, None, of_model if is_copied else [])
         for model in self.models:

@@ -19,7 +19,6 @@ from ipsys_log.capture import multiplexer as attached_module
 from ipsys_log.capture.camera_thread import CameraState, imported_run
 from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.errors import IpsysError
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing
 
@@ -468,10 +467,9 @@ def test_silent_camera_does_not_stop_the_others() -> None:
         assert [message is None for message in found] == [False, True, True, True]
 
 
-def test_cameras_that_send_markers_and_frames_are_refused() -> None:
+def test_markers_of_some_cameras_are_an_imported_run() -> None:
     states = {"red": CameraState(format="markers"), "white": CameraState(format="markers")}
     assert imported_run(states) == "nodes"
     states["black"] = CameraState(format="jpeg")
-    with pytest.raises(IpsysError, match="red, white sends markers, but camera black sends frames; start"):
-        imported_run(states)
+    assert imported_run(states) == "nodes"
     assert imported_run({"black": states["black"]}) is None

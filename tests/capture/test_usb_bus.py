@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from ipsys_log.capture import usb_bus, v4l2
-from ipsys_log.capture.usb_bus import BandwidthDemand, Mode, UsbConnection, advise, find_cameras, list_demands
+from ipsys_log.capture.usb_bandwidth import BandwidthDemand, advise, list_demands
+from ipsys_log.capture.usb_bus import Mode, UsbConnection, find_cameras
 from ipsys_log.messages import Rig, RigCamera
 from tests.capture.camera_driver import Driver
 from tests.conftest import Ipsys

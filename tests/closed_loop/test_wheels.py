@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ipsys_log.capture.frames import Clock
+from ipsys_log.closed_loop import wheels as wheels_module
 from ipsys_log.closed_loop.relay import Relay
 from ipsys_log.closed_loop.wheels import Wheels
 from ipsys_log.errors import IpsysError
+from ipsys_log.units import NS_PER_S
+from tests.closed_loop.example_robot import example
 
 
 @pytest.fixture
@@ -48,6 +53,87 @@ def test_commands_answer_their_tick(wheels: Wheels, robot: socket.socket) -> Non
     (answer,) = wheels.answers(7)
     assert (answer.left_m_s, answer.right_m_s, answer.state, answer.waypoint) == (0.1, -0.2, "driving", 2)
     assert (answer.x_m, answer.y_m, answer.position_time) == (1.5, 2.5, 99)
+
+
+class SteppingClock(Clock):
+    """A clock that advances at each reading."""
+
+    def __init__(self, step_s: float) -> None:
+        super().__init__()
+        self._ns, self._step_ns = 0, round(step_s * NS_PER_S)
+
+    def now_ns(self) -> int:
+        self._ns += self._step_ns
+        return self._ns
+
+
+def open_wheels(
+    robot: socket.socket, lines: list[str], clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> Wheels:
+    monkeypatch.setattr(wheels_module, "Clock", lambda: clock)
+    opened = Wheels(0, ["ada"], lambda: None, lines.append)
+    host, port = opened.address.split(":")
+    robot.connect((host, int(port)))
+    return opened
+
+
+def test_suspended_simulator_still_takes_the_answer(
+    robot: socket.socket, lines: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each reading of the clock is an hour later: the simulator was suspended meanwhile."""
+    with closing(open_wheels(robot, lines, SteppingClock(3600.0), monkeypatch)) as opened:
+        robot.send(b'{"robot": "ada"}')
+        opened.wait_for_robots()
+        robot.send(b'{"robot": "ada", "tick": 1, "left_m_s": 1, "right_m_s": 1}')
+        assert [answer.left_m_s for answer in opened.answers(1)] == [1.0]
+    assert lines == []
+
+
+def test_slow_program_is_named_before_it_is_an_error(
+    robot: socket.socket, lines: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wheels_module, "_TURN_S", 0.001)
+    monkeypatch.setattr(wheels_module, "_SAID_S", 0.01)
+    monkeypatch.setattr(wheels_module, "_LONGEST_S", 0.1)
+    with closing(open_wheels(robot, lines, SteppingClock(1.0), monkeypatch)) as opened:
+        with pytest.raises(IpsysError, match=r'ada: its program has not sent \{"robot": "ada"\} to 127'):
+            opened.wait_for_robots()
+        robot.send(b'{"robot": "ada"}')
+        assert list(opened.receive(60.0)) == []
+        with pytest.raises(IpsysError, match=r"ada: its program has not sent a command for 0\.1 s"):
+            opened.answers(1)
+    assert lines[1:] == ["ada: waits until its program sends a command; Ctrl-C to end"]
+
+
+def test_stop_ends_the_wait_for_answers(wheels: Wheels, robot: socket.socket) -> None:
+    robot.send(b'{"robot": "ada"}')
+    wheels.wait_for_robots()
+    wheels.stop()
+    assert wheels.answers(1) == []
+
+
+def test_robot_waits_for_every_position_in_lockstep(wheels: Wheels, robot: socket.socket) -> None:
+    """A robot that goes on without a position makes another log on a slow machine."""
+
+    class SlowPositions:
+        count = turns = 0
+
+        def receive(self, wait_s: float, _now_s: float) -> None:
+            self.turns += wait_s > 0
+            self.count += self.turns % 100 == 99
+
+    positions = SlowPositions()
+    example("robot").wait_for_positions(positions, 3, 0.0, robot, b'{"robot": "ada"}')
+    assert positions.count == 3
+    wheels.wait_for_robots()  # the robot has shown meanwhile that it is there
+
+
+def test_robot_ends_after_its_simulator(wheels: Wheels, robot: socket.socket) -> None:
+    """A killed simulator sends no end, and its robots must not wait for ever."""
+    wheels.close()
+    robot.settimeout(0.01)
+    with pytest.raises(ConnectionRefusedError):
+        example("robot").wait_for_tick(robot, b'{"robot": "ada"}')
 
 
 def test_program_of_another_robot_is_refused(wheels: Wheels, robot: socket.socket, lines: list[str]) -> None:

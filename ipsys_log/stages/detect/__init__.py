@@ -82,7 +82,8 @@ _GREEN = Color(0.1, 0.9, 0.3, 1.0)
 class FrameDetector:
     """The detection in frames of all cameras, with a memory that ends at each reset.
 
-    It yields for a frame its :class:`Markers` and their drawing for viewers. It yields an :class:`Event` for
+    It yields for a frame its :class:`Markers` and their drawing for viewers. Markers that a node has detected
+    pass unchanged. It yields an :class:`Event` for
     a frame that cannot be decoded, and :class:`OtherSize` for a frame of another size than the calibration.
     It leaves out a marker id that is seen twice in a frame or is not in the rig; an event names the id.
     Another event names a marker of the rig that is seen and cannot be measured.
@@ -124,6 +125,8 @@ class FrameDetector:
         elif isinstance(payload, SkippedVideo):
             with suppress(FrameError):
                 self._video(message.camera, payload.frame).skip(payload.frame)
+        elif isinstance(payload, Markers):
+            yield payload
         elif not isinstance(payload, Event):  # events only tell which frames a replay ``as_live`` skips
             yield from self._frame(message)
 
@@ -308,7 +311,7 @@ def skipped_frames(events: Iterable[Event]) -> set[int]:
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
-    if not view.cameras:
+    if not view.cameras and not view.run(MARKERS):
         return view.newest(MARKERS)
     corners = options.get("corners") or usual_corners(view.cameras, view.lenses)
     skipped = skipped_frames(view.payloads(EVENTS))
@@ -329,6 +332,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
             RIG,
             *([CALIBRATIONS] if corners == EDGES else []),
             *([EVENTS] if as_live else []),
+            *([MARKERS] if view.run(MARKERS) else []),
             IMAGES,
         ),
         step=lambda run: _make_step(corners, resets),
@@ -398,7 +402,7 @@ def _has_video(view: StageView) -> bool:
 STAGE = Stage(
     name="detect",
     versions={"detect": 2, EDGES: 1, STOCK: 1},
-    reads=(RIG, CALIBRATIONS, IMAGES, EVENTS),
+    reads=(RIG, CALIBRATIONS, IMAGES, EVENTS, MARKERS),
     writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
     plan=_plan,
     rig_part=_rig_part,

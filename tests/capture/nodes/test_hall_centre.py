@@ -12,11 +12,11 @@ import pytest
 
 from ipsys_log import __version__, pipeline
 from ipsys_log.capture.devices import source_opener
+from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
-from ipsys_log.capture.recorder import first_messages
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Markers, Message, RigCamera, RigNodes, Tracks

@@ -1,0 +1,67 @@
+"""The first messages of a recording: the rig, and the intrinsics that fit the frames of the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from ipsys_log.geometry.lenses import scale_intrinsics
+from ipsys_log.messages import (
+    IMPORTED,
+    RIG_TOPIC,
+    CameraCalibration,
+    Message,
+    Rig,
+    Run,
+    calibration_topic,
+)
+from ipsys_log.runs.output import record_message
+from ipsys_log.runs.provenance import NODE_FORMAT
+
+__all__ = ["first_messages", "fitting_lenses"]
+
+
+def fitting_lenses(
+    lenses: Mapping[str, CameraCalibration],
+    sizes_px: Mapping[str, tuple[int, int] | None],
+    say: Callable[[str], None],
+) -> dict[str, CameraCalibration]:
+    """Return intrinsics for the frames of cameras, scaled for frames of another size; ``say`` reports this.
+
+    Raises
+    ------
+    IpsysError
+        The frames have another aspect ratio.
+    """
+    fitting = {}
+    for camera, lens in lenses.items():
+        width, height = sizes_px.get(camera) or (lens.width, lens.height)
+        fitting[camera] = scale_intrinsics(lens, width, height, f"camera {camera}")
+        if width != lens.width:
+            say(f"camera {camera}: its calibration is scaled from a width of {lens.width} px to {width} px")
+    return fitting
+
+
+def first_messages(
+    rig: Rig,
+    lenses: Mapping[str, CameraCalibration],
+    now_ns: Callable[[], int],
+    imported_run: str | None = None,
+) -> list[Message]:
+    """Return the first messages of a log: the rig, the intrinsics by camera, and the record of a run.
+
+    Parameters
+    ----------
+    imported_run : the run of markers that other hosts have detected.
+    """
+    time_ns = now_ns()
+    messages = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
+    for camera, lens in sorted(lenses.items()):
+        time_ns = now_ns()
+        stamped = replace(lens, timestamp=time_ns)
+        messages.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
+    if imported_run is not None:
+        time_ns = now_ns()
+        record = Run(time_ns, imported_run, IMPORTED, {"format": NODE_FORMAT})
+        messages.append(record_message(record, time_ns))
+    return messages

@@ -16,7 +16,7 @@ from itertools import chain
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage
+from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
 from ipsys_log.capture.nodes.network import NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import (
@@ -33,7 +33,7 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["Centre", "exchange_period_s", "is_of_node", "node_of"]
+__all__ = ["Centre", "describe_no_answer", "exchange_period_s", "is_of_node", "node_of"]
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
@@ -84,6 +84,15 @@ def node_of(camera: RigCamera) -> str:
     'red'
     """
     return check_name(str(camera.source).removeprefix(_SCHEME), f"camera {camera.name}: the node")
+
+
+def describe_no_answer(camera: RigCamera, network: NodeNetwork) -> str:
+    """Return the text of the error that no node answers for a camera."""
+    node = node_of(camera)
+    return (
+        f"camera {camera.name}: no node {node} answers at {network}; start it on its host: "
+        f"ipsys node lab.toml --camera {node}"
+    )
 
 
 class _Arrival(NamedTuple):
@@ -152,14 +161,6 @@ class Centre:
             self._links[camera.name] = link
         yield chain(link.await_node(self._network, say, self._is_stopped), link.items())
 
-    def choose_opener(self, other: Open) -> Open:
-        """Return the function that opens the cameras of nodes, and with ``other`` all other cameras."""
-
-        def choose(camera: RigCamera, clock: Clock, say: Say) -> Any:
-            return self.open(camera, clock, say) if is_of_node(camera) else other(camera, clock, say)
-
-        return choose
-
 
 def _directly(receive: Callable[[Any], None]) -> Any:
     """Return a handler that is called in the thread of the network.
@@ -220,10 +221,7 @@ class _Link:
             else:
                 self._early += arrival.take()
         if not self._stream.is_known:
-            raise SourceError(
-                f"camera {self._camera.name}: no node {self._node} answers at {network}; start it on its "
-                f"host: ipsys node lab.toml --camera {self._node}"
-            )
+            raise SourceError(describe_no_answer(self._camera, network))
         if is_first:
             self._early.insert(0, self._stream.report_answer(self._clock.now_ns()))
 

@@ -96,7 +96,8 @@ class ReaderContext:
     """The objects that the threads of all cameras share.
 
     ``put`` takes an arrival; it returns False if there is no room for a frame. Before ``started``, a thread
-    takes only the first frame. After ``stopped``, it takes nothing.
+    takes only the first frame. Before ``taken``, nothing leaves the queue, and frames of nodes are discarded
+    after the first one. After ``stopped``, a thread takes nothing.
     """
 
     open_source: Open
@@ -104,6 +105,7 @@ class ReaderContext:
     put: Callable[[Arrival], bool]
     say: Say
     started: threading.Event
+    taken: threading.Event
     stopped: threading.Event
     heartbeat: Heartbeat
 
@@ -136,6 +138,7 @@ class CameraReader:
         self._broken = False
         self._since_key = 0
         self._late = LateFrameDetector(shared.heartbeat, camera.rate_hz)
+        self._is_of_node = is_of_node(camera)
 
     def wait_for_first_frame(self) -> None:
         """Wait for the first frame.
@@ -147,7 +150,7 @@ class CameraReader:
         """
         self._is_open.wait()
         # The camera of a node has its own recorder there, which may be starting.
-        is_slow = str(self.camera.source).startswith(("sim:", "zenoh:"))
+        is_slow = self._is_of_node or str(self.camera.source).startswith("sim:")
         begun = self._has_first_frame.wait(_DRAW_S if is_slow else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault
@@ -248,9 +251,10 @@ class CameraReader:
         self._report_lost()
         self._has_first_frame.set()
         # A frame with a stamp waits until the slowest camera has started: it is only delayed. A frame
-        # without a stamp must not wait: its arrival is its time.
+        # without a stamp must not wait: its arrival is its time. A node sends on meanwhile.
         while (
             frame.time_ns is not None
+            and not self._is_of_node
             and not self._shared.started.is_set()
             and not self._shared.stopped.is_set()
         ):
@@ -273,11 +277,16 @@ class CameraReader:
 
         The caller discards such frames. The first frame is never early. The time of a frame without a stamp
         is its arrival, so the frame must not wait until the recording begins. Files and the simulator give
-        stamps, and wait.
+        stamps, and wait. The frames of nodes must not wait either: positions would be late for long.
         """
         if not self._has_first_frame.is_set():
             return False
-        if frame.time_ns is None and not self._shared.started.wait(_EARLY_S):
+        is_early = (
+            not self._shared.taken.is_set()
+            if self._is_of_node
+            else frame.time_ns is None and not self._shared.started.wait(_EARLY_S)
+        )
+        if is_early:
             self._broken = True
             return True
         self._broken = self._broken and 0 < self._since_key < MAX_FRAMES_WITHOUT_KEYFRAME
@@ -365,7 +374,7 @@ class CameraReader:
 
         A node has the settings of its camera, and its centre reports only that it waits for the node.
         """
-        self._say_once(NODE_AWAITED if is_of_node(self.camera) else "camera_setting", text)
+        self._say_once(NODE_AWAITED if self._is_of_node else "camera_setting", text)
 
     def _say_once(self, kind: str, text: str) -> None:
         if text not in self._said:

@@ -76,10 +76,10 @@ class LiveCameras:
         self._saving: list[_Saving] = []
         self._closed = self._ending = False
         self._reason = "the recording has ended; to measure in its log: ipsys measure LOG"
-        self._started, self._stopped = threading.Event(), threading.Event()
+        self._started, self._taken, self._stopped = (threading.Event() for _ in range(3))
         self._heartbeat = Heartbeat(clock)
         shared = ReaderContext(
-            open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat
+            open_source, clock, self._put, say, self._started, self._taken, self._stopped, self._heartbeat
         )
         self._readers = [CameraReader(camera, shared) for camera in cameras]
         self._threads = reader_threads(self._readers)
@@ -138,6 +138,7 @@ class LiveCameras:
 
         The end of the iteration closes the stream.
         """
+        self._taken.set()
         try:
             while True:
                 if self._ending:

@@ -29,7 +29,8 @@ from the log to the stages, as long as the stages keep up (``backlog``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import gc
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -243,7 +244,8 @@ def live(
     ):
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         events = frames.take_events
-        fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show, events)
+        arriving = chain(settings, _without_old_objects(frames))
+        fault = _put_through(arriving, plan.stages, ledger, log, show, events)
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in frames:
@@ -265,6 +267,18 @@ def live(
         )
     show.check()
     return outcomes
+
+
+def _without_old_objects(frames: Iterable[Message]) -> Iterator[Message]:
+    """Yield the frames; meanwhile, the search for garbage leaves out the objects from before, such as models.
+
+    For 24 cameras, it would take an eighth of the time of a message.
+    """
+    gc.freeze()
+    try:
+        yield from frames
+    finally:
+        gc.unfreeze()
 
 
 def _through(

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -240,15 +241,15 @@ def live(
         Consumers([KnockEvents(cameras), *consumers], cameras.add_event, sinks) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
-        Backlog(cameras, log, cameras.now_ns) as frames,
+        ExitStack() as resources,
     ):
+        frames = Backlog(cameras, log, cameras.now_ns)
+        arriving, events = _begin(frames, resources), frames.take_events
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
-        events = frames.take_events
-        arriving = chain(settings, _without_old_objects(frames))
-        fault = _put_through(arriving, plan.stages, ledger, log, show, events)
+        fault = _put_through(chain(settings, arriving), plan.stages, ledger, log, show, events)
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
-            for message in frames:
+            for message in arriving:
                 _show_all(show, events(), None if message is TICK else message)
         _show_all(show, events())
     if fault is not None:
@@ -269,16 +270,16 @@ def live(
     return outcomes
 
 
-def _without_old_objects(frames: Iterable[Message]) -> Iterator[Message]:
-    """Yield the frames; meanwhile, the search for garbage leaves out the objects from before, such as models.
+def _begin(frames: Backlog, resources: ExitStack) -> Iterator[Message]:
+    """Begin the recording, and yield its frames: after the preparation of the stages, so that none is late.
 
-    For 24 cameras, it would take an eighth of the time of a message.
+    From then on, the search for garbage leaves out the objects from before. Most of them are models: for 24
+    cameras, the search takes an eighth of the time of a message.
     """
     gc.freeze()
-    try:
-        yield from frames
-    finally:
-        gc.unfreeze()
+    resources.callback(gc.unfreeze)
+    resources.enter_context(frames)
+    yield from frames
 
 
 def _through(

@@ -116,11 +116,10 @@ _LAST_S = 1.0
 class Backlog:
     """The frames that are in the log and that the stages have not seen. A context manager; iterate once.
 
-    A separate thread writes the messages of a source and passes the frames on; it begins with the iteration.
-    If the stages are slower than the cameras, frames are skipped as in
-    :class:`~ipsys_log.capture.backlog.Waiting`. The recording loses no frame, and an event names each skipped
-    frame. After all waiting messages, and after an event, comes a :data:`TICK`. The events that no stage
-    reads do not pass the stages: :meth:`take_events` returns them.
+    A separate thread writes the messages of a source and passes the frames on. If the stages are slower than
+    the cameras, frames are skipped as in :class:`~ipsys_log.capture.backlog.Waiting`. The recording loses no
+    frame, and an event names each skipped frame. After all waiting messages, and after an event, comes a
+    :data:`TICK`. The events that no stage reads do not pass the stages: :meth:`take_events` returns them.
 
     Parameters
     ----------
@@ -140,19 +139,16 @@ class Backlog:
         self._thread = threading.Thread(target=self._record, name="recorder", daemon=True)
 
     def __enter__(self) -> Backlog:
+        self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._source.stop()
-        if self._thread.ident is None:  # an early interrupt
-            return
         self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def __iter__(self) -> Iterator[Message]:
-        if self._thread.ident is None:
-            self._thread.start()
         while True:
             with self._changed:
                 while not self._waiting and not self._events and not self._ended:

@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -79,7 +80,10 @@ class _Hall:
 
 @dataclass(frozen=True, slots=True)
 class _Usage:
-    """Processor time in s, and largest memory in MB, of a process so far; ``time_s`` is the time of day."""
+    """Processor time in s, and largest memory in MB, of a process and its children so far.
+
+    ``time_s`` is the time of day.
+    """
 
     time_s: float
     cpu_s: float
@@ -91,7 +95,16 @@ class _Usage:
         status = Path(f"/proc/{pid}/status").read_text().splitlines()
         peak_kb = next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
         ticks = int(fields[11]) + int(fields[12])
-        return cls(time.time(), ticks / os.sysconf("SC_CLK_TCK"), peak_kb / 1000)
+        children = [
+            cls.of(int(child))
+            for task in Path(f"/proc/{pid}/task").iterdir()
+            for child in (task / "children").read_text().split()
+        ]
+        return cls(
+            time.time(),
+            ticks / os.sysconf("SC_CLK_TCK") + sum(child.cpu_s for child in children),
+            peak_kb / 1000 + sum(child.memory_mb for child in children),
+        )
 
 
 def make_hall(
@@ -133,14 +146,15 @@ def write_rig(hall: _Hall, folder: Path, port: int) -> Path:
 class _Run:
     """A run of the centre: its ledger, usage between two instants, and the numbers of messages.
 
-    ``sent`` and ``recorded`` are messages of markers, ``left`` those that the nodes still have at the end.
+    ``sent`` are messages of markers. ``lost`` are those after the beginning that the log does not have,
+    ``left`` those that the nodes still have at the end.
     """
 
     latencies: list[Latency]
     begin: _Usage
     end: _Usage
     sent: int
-    recorded: int
+    lost: int
     left: int
     events: dict[str, int]
     robots: set[str]
@@ -239,18 +253,29 @@ def _read_line(player: subprocess.Popen[str], expected: str) -> None:
 def _read(log: Path, model: str, begin: _Usage, end: _Usage, reports: list[dict[str, Any]]) -> _Run:
     with Session([log]) as session:
         kinds = [event.kind for event in session.payloads(session.topics(EVENTS))]
-        recorded = sum(session.count(topic) for topic in session.topics(MARKERS, NODES_RUN))
+        numbers: dict[str, list[int]] = defaultdict(list)
+        for message in session.messages(session.topics(MARKERS, NODES_RUN)):
+            numbers[str(message.camera)].append(message.payload.node_frame)
         tracks: list[Tracks] = session.payloads(session.topics(TRACKS, model))
     return _Run(
         [entry for entry in recorded_latencies([log]) if entry.received >= begin.time_s * NS_PER_S],
         begin,
         end,
         sum(sum(report["sent"].values()) for report in reports),
-        recorded,
+        sum(_lost(numbers[camera], count) for report in reports for camera, count in report["sent"].items()),
         sum(report["left"] for report in reports),
         {kind: kinds.count(kind) for kind in sorted(set(kinds))},
         {track.robot for row in tracks for track in row.tracks},
     )
+
+
+def _lost(numbers: Sequence[int], sent: int) -> int:
+    """Return the frames of a node that are not in the log: of those after the first two in the log.
+
+    The centre takes the first frame, and discards the next ones while it prepares the stages.
+    """
+    recorded = sorted(set(numbers))[1:]
+    return sent - recorded[0] - len(recorded) if recorded else sent
 
 
 def _most_waiting(entries: Iterable[Latency]) -> int:
@@ -273,7 +298,7 @@ def _rows(title: str, runs: Sequence[_Run]) -> Iterator[Row]:
             yield Row(f"{title}: {part}, {name}", values, "ms", wanted)
     skipped = [run.events.get(FRAME_SKIPPED, 0) for run in runs]
     counts: Mapping[str, tuple[str, Sequence[float], tuple[str, float] | None]] = {
-        "not recorded": ("messages", [run.sent - run.recorded for run in runs], ("<=", 0.0)),
+        "not recorded": ("messages", [run.lost for run in runs], ("<=", 0.0)),
         "most waiting": ("messages", [_most_waiting(run.latencies) for run in runs], None),
         "skipped": ("messages", skipped, ("<=", 0.0)),
         "tracked": ("robots", [len(run.robots) for run in runs], (">=", float(_ROBOTS))),

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors", "interrupts"),
+    ("errors", "interrupts", "piped_process"),
     ("units", "plain_text", "passwords", "extras", "atomic_files"),
     ("messages",),
     ("geometry", "rig"),

@@ -1,9 +1,9 @@
-"""The thread of one camera: it reads the frames, and opens the camera again after a disconnection."""
+"""The reader of one camera: it reads the frames, and opens the camera again after a disconnection."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from ipsys_log.messages.events import NODE_AWAITED
 from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "ReaderContext", "imported_run"]
+__all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "Pause", "ReaderContext", "imported_run"]
 
 # The run of markers that nodes have detected.
 NODES_RUN = "nodes"
@@ -81,7 +81,8 @@ class ReaderContext:
     """The objects that the threads of all cameras share.
 
     ``put`` takes an arrival; it returns False if there is no room for a frame. Before ``started``, a thread
-    takes only the first frame. After ``stopped``, it takes nothing.
+    takes only the first frame. Before ``taken``, nothing leaves the queue, and frames of nodes are discarded
+    after the first one. After ``stopped``, a thread takes nothing.
     """
 
     open_source: Open
@@ -89,23 +90,32 @@ class ReaderContext:
     put: Callable[[Arrival], bool]
     say: Say
     started: threading.Event
+    taken: threading.Event
     stopped: threading.Event
     heartbeat: Heartbeat
 
 
+class Pause(NamedTuple):
+    """A pause of a reader: until an event, or for a time in s."""
+
+    until: threading.Event
+    seconds: float
+
+
 class CameraReader:
-    """The reader of one camera, with its thread.
+    """The reader of one camera. A thread calls :meth:`read`; that of nodes calls it for all nodes in turn.
 
     Attributes
     ----------
+    camera : the camera of the rig.
     state : counts and properties of the frames so far.
-    fault : the error that ended the thread; None if it ended with the source.
+    fault : the error that ended the reader; None if it ended with the source.
     """
 
     def __init__(self, camera: RigCamera, shared: ReaderContext) -> None:
         self.state = CameraState()
         self.fault: BaseException | None = None
-        self._camera, self._shared = camera, shared
+        self.camera, self._shared = camera, shared
         self._is_open, self._has_first_frame = threading.Event(), threading.Event()
         self._lost_ns: int | None = None
         self._dropped_before = self._missed_before = self._missed_named_ns = 0
@@ -113,10 +123,7 @@ class CameraReader:
         self._broken = False
         self._since_key = 0
         self._late = LateFrameDetector(shared.heartbeat, camera.rate_hz)
-        # Zenoh's threads are daemons if their caller is one. Python ends a daemon within a call of Zenoh,
-        # and the program aborts. The thread of a device is a daemon, because a driver can block for ever.
-        is_daemon = not is_of_node(camera)
-        self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=is_daemon)
+        self._is_of_node = is_of_node(camera)
 
     def wait_for_first_frame(self) -> None:
         """Wait for the first frame.
@@ -128,34 +135,38 @@ class CameraReader:
         """
         self._is_open.wait()
         # The camera of a node has its own recorder there, which may be starting.
-        is_slow = is_of_node(self._camera) or str(self._camera.source).startswith("sim:")
+        is_slow = self._is_of_node or str(self.camera.source).startswith("sim:")
         begun = self._has_first_frame.wait(_DRAW_S if is_slow else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault
         if not begun:
             raise SourceError(
-                f"camera {self._camera.name}: {hide_password(str(self._camera.source))} sends no frames; "
+                f"camera {self.camera.name}: {hide_password(str(self.camera.source))} sends no frames; "
                 "check that no other program uses it"
             )
 
-    def _attend(self) -> None:
+    def read(self) -> Iterator[Pause | None]:
+        """Read the camera until it ends or the recording stops.
+
+        The iterator yields None if its source has no frame now, and a pause before the next attempt.
+        """
         retry_s, stopped = _RETRY_S, self._shared.stopped
         try:
             while not stopped.is_set():
                 before = self.state.frames
-                lost = self._take_all()
+                lost = yield from self._take_all()
                 if lost is None:
                     break
                 if not self._has_first_frame.is_set():
                     raise lost
                 retry_s = _RETRY_S if self.state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
-                stopped.wait(retry_s)
+                yield Pause(stopped, retry_s)
         except BaseException as fault:  # raised again in the thread that opens or iterates the cameras
             self.fault = fault
             if self._has_first_frame.is_set():
                 # The other cameras may run for hours. The traceback is shown only after they have ended.
                 text = (
-                    f"camera {self._camera.name}: internal error ({fault!r}); this camera is no "
+                    f"camera {self.camera.name}: internal error ({fault!r}); this camera is no "
                     "longer recorded"
                 )
                 self._say("camera_failed", text)
@@ -165,11 +176,11 @@ class CameraReader:
             self._is_open.set()
             self._has_first_frame.set()
 
-    def _take_all(self) -> SourceError | None:
+    def _take_all(self) -> Generator[Pause | None, None, SourceError | None]:
         """Take frames until the source ends (return None) or the camera disconnects (return the error)."""
         shared = self._shared
         try:
-            with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
+            with shared.open_source(self.camera, shared.clock, self._say_setting) as frames:
                 self._is_open.set()
                 for frame in frames:
                     if isinstance(frame, SourceMessage):
@@ -177,10 +188,12 @@ class CameraReader:
                         continue
                     if shared.stopped.is_set():
                         break
-                    if frame is not None:
-                        self._count_since_key(frame)
-                    if frame is not None and not self._is_early(frame):
-                        self._take(frame)
+                    if frame is None:
+                        yield None
+                        continue
+                    self._count_since_key(frame)
+                    if not self._is_early(frame):
+                        yield from self._take(frame)
         except SourceError as error:
             if self.state.up:
                 self.state.up, self._lost_ns = False, shared.clock.now_ns()
@@ -195,8 +208,8 @@ class CameraReader:
         if isinstance(payload, Event):
             self._shared.say(payload.text)
 
-    def _take(self, frame: Frame) -> None:
-        state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()
+    def _take(self, frame: Frame) -> Iterator[Pause]:
+        state, camera, now_ns = self.state, self.camera, self._shared.clock.now_ns()
         self._check_format(frame)
         if self._lost_ns is not None:
             gone_s = (now_ns - self._lost_ns) / NS_PER_S
@@ -223,17 +236,18 @@ class CameraReader:
         self._report_lost()
         self._has_first_frame.set()
         # A frame with a stamp waits until the slowest camera has started: it is only delayed. A frame
-        # without a stamp must not wait: its arrival is its time.
+        # without a stamp must not wait: its arrival is its time. A node sends on meanwhile.
         while (
             frame.time_ns is not None
-            and not self._shared.started.wait(_TURN_S)
+            and not self._is_of_node
+            and not self._shared.started.is_set()
             and not self._shared.stopped.is_set()
         ):
-            pass
+            yield Pause(self._shared.started, _TURN_S)
 
     def _payload(self, frame: Frame, time_ns: int) -> tuple[str, Any]:
         """Return the topic and the payload of a frame, or of the markers that a node sends instead."""
-        name = self._camera.name
+        name = self.camera.name
         if frame.format != MARKERS_FORMAT:
             return image_topic(name), frame_payload(time_ns, name, frame.data, frame.format)
         try:
@@ -248,11 +262,16 @@ class CameraReader:
 
         The caller discards such frames. The first frame is never early. The time of a frame without a stamp
         is its arrival, so the frame must not wait until the recording begins. Files and the simulator give
-        stamps, and wait.
+        stamps, and wait. The frames of nodes must not wait either: positions would be late for long.
         """
         if not self._has_first_frame.is_set():
             return False
-        if frame.time_ns is None and not self._shared.started.wait(_EARLY_S):
+        is_early = (
+            not self._shared.taken.is_set()
+            if self._is_of_node
+            else frame.time_ns is None and not self._shared.started.wait(_EARLY_S)
+        )
+        if is_early:
             self._broken = True
             return True
         self._broken = self._broken and 0 < self._since_key < MAX_FRAMES_WITHOUT_KEYFRAME
@@ -263,7 +282,7 @@ class CameraReader:
         self._since_key = 0 if is_decodable_start(frame) else self._since_key + 1
         if self._since_key == MAX_FRAMES_WITHOUT_KEYFRAME:
             text = (
-                f"camera {self._camera.name}: no keyframe in {MAX_FRAMES_WITHOUT_KEYFRAME} frames; "
+                f"camera {self.camera.name}: no keyframe in {MAX_FRAMES_WITHOUT_KEYFRAME} frames; "
                 "frames after a skipped or damaged one cannot be decoded until the next keyframe; "
                 "set its keyframe interval (GOP) to 1 or 2 s"
             )
@@ -271,7 +290,7 @@ class CameraReader:
 
     def _check_format(self, frame: Frame) -> None:
         """Check that a frame has the format of the earlier frames: a channel of a log holds one format."""
-        before, name = self.state.format, self._camera.name
+        before, name = self.state.format, self.camera.name
         if before in (None, frame.format):
             return
         text = (
@@ -294,12 +313,12 @@ class CameraReader:
         self.state.size_px = size_px
         if before is not None:
             new, old = (f"{width} x {height} px" for width, height in (size_px, before))
-            text = f"camera {self._camera.name}: its image size changed from {old} to {new}; a calibration "
+            text = f"camera {self.camera.name}: its image size changed from {old} to {new}; a calibration "
             self._say("camera_size", f"{text}is valid for one size; set it back")
 
     def _report_lost(self, now: bool = False) -> None:
         """Report the frames lost since the last report."""
-        state, name = self.state, self._camera.name
+        state, name = self.state, self.camera.name
         if dropped := state.dropped - self._dropped_before:
             self._dropped_before = state.dropped
             self._say("frames_dropped", f"{dropped} frames of camera {name} dropped: the disk is too slow")
@@ -318,7 +337,7 @@ class CameraReader:
         if stall is None:
             return
         text = (
-            f"camera {self._camera.name}: the recorder was suspended for "
+            f"camera {self.camera.name}: the recorder was suspended for "
             f"{(stall.end_ns - stall.start_ns) / NS_PER_S:.1f} s; its frames arrive late now, with "
             "wrong times"
         )
@@ -330,7 +349,7 @@ class CameraReader:
         if start_ns is None or end_ns is None or not self._late.has_caught_up():
             return
         text = (
-            f"camera {self._camera.name}: its frames arrive in time again; the frames from "
+            f"camera {self.camera.name}: its frames arrive in time again; the frames from "
             f"{format_time(start_ns)} to {format_time(end_ns)} UTC were late"
         )
         self._say(STAMP_UNRELIABLE, text, start_ns, end_ns)
@@ -340,7 +359,7 @@ class CameraReader:
 
         A node has the settings of its camera, and its centre reports only that it waits for the node.
         """
-        self._say_once(NODE_AWAITED if is_of_node(self._camera) else "camera_setting", text)
+        self._say_once(NODE_AWAITED if self._is_of_node else "camera_setting", text)
 
     def _say_once(self, kind: str, text: str) -> None:
         if text not in self._said:
@@ -350,6 +369,6 @@ class CameraReader:
     def _say(self, kind: str, text: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
         """Put an event of this camera into the stream, and show its text at once."""
         now_ns = self._shared.clock.now_ns()
-        event = Event(now_ns, kind, text, self._camera.name, None, start_ns, end_ns)
+        event = Event(now_ns, kind, text, self.camera.name, None, start_ns, end_ns)
         self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, event))
         self._shared.say(text)

@@ -24,8 +24,9 @@ from ipsys_log.capture.frames import (
     report_refused_settings,
 )
 from ipsys_log.capture.network import check_address, open_network
-from ipsys_log.capture.nodes.centre import Centre, is_of_node, node_of
+from ipsys_log.capture.nodes.centre import is_of_node, node_of
 from ipsys_log.capture.nodes.network import read_network
+from ipsys_log.capture.nodes.receiver import Receiver
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.capture.usb_bandwidth import advise, list_demands
 from ipsys_log.capture.video_files import check_playback_source, open_playback
@@ -195,8 +196,8 @@ def source_opener(
         yield open_source
         return
     check_installed(f"camera {of_nodes[0].name}: the source {of_nodes[0].source} needs", "zenoh")
-    with Centre(of_nodes, read_network(rig.nodes, folder), version("ipsys_log"), is_stopped) as centre:
-        yield centre.choose_opener(open_source)
+    with Receiver(of_nodes, read_network(rig.nodes, folder), version("ipsys_log"), is_stopped) as receiver:
+        yield receiver.choose_opener(open_source)
 
 
 def check_devices(cameras: Iterable[RigCamera]) -> None:

@@ -81,8 +81,8 @@ class Clock:
         read_ns, slept_ns = self._read_ns, _asleep_ns() - self._asleep_ns
         if slept_ns - self._sleeps_ns[-1][1] > _LEAST_SLEEP_NS:
             self._sleeps_ns.append((read_ns + 1, slept_ns))
-        self._read_ns = time.monotonic_ns()
-        return self.to_utc_ns(self._read_ns)
+        self._read_ns = read_ns = time.monotonic_ns()
+        return read_ns + self._offset_ns + self._sleeps_ns[-1][1]
 
     def to_utc_ns(self, monotonic_ns: int) -> int:
         """Convert a stamp of the monotonic clock, such as a stamp of V4L2, to UTC."""

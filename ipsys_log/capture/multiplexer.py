@@ -1,7 +1,7 @@
 """The live cameras as one source of messages.
 
-Each camera has a thread that only puts the arriving frames into one queue. A message gets its log time when
-it leaves the queue.
+Threads of the cameras only put the arriving frames into one queue. A message gets its log time when it leaves
+the queue.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from ipsys_log.capture.camera_thread import Arrival, CameraReader, ReaderContext, imported_run
+from ipsys_log.capture.camera_threads import reader_threads
 from ipsys_log.capture.frames import Clock, Open, Say, SourceError
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
@@ -75,12 +76,13 @@ class LiveCameras:
         self._saving: list[_Saving] = []
         self._closed = self._ending = False
         self._reason = "the recording has ended; to measure in its log: ipsys measure LOG"
-        self._started, self._stopped = threading.Event(), threading.Event()
+        self._started, self._taken, self._stopped = (threading.Event() for _ in range(3))
         self._heartbeat = Heartbeat(clock)
         shared = ReaderContext(
-            open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat
+            open_source, clock, self._put, say, self._started, self._taken, self._stopped, self._heartbeat
         )
         self._readers = [CameraReader(camera, shared) for camera in cameras]
+        self._threads = reader_threads(self._readers)
         self.states = {
             camera.name: reader.state for camera, reader in zip(cameras, self._readers, strict=True)
         }
@@ -88,8 +90,8 @@ class LiveCameras:
     def __enter__(self) -> LiveCameras:
         try:
             self._heartbeat.start()
-            for reader in self._readers:
-                reader.thread.start()
+            for thread in self._threads:
+                thread.start()
             for reader in self._readers:
                 reader.wait_for_first_frame()
         except BaseException:
@@ -130,6 +132,7 @@ class LiveCameras:
 
         The end of the iteration closes the stream.
         """
+        self._taken.set()
         try:
             while True:
                 if self._ending:
@@ -269,9 +272,9 @@ class LiveCameras:
     def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
         self._heartbeat.stop()
-        for reader in self._readers:
-            if reader.thread.ident is not None:  # after an early interrupt, some threads have not started
-                reader.thread.join(seconds)
+        for thread in self._threads:
+            if thread.ident is not None:  # after an early interrupt, some threads have not started
+                thread.join(seconds)
 
 
 @dataclass(eq=False, slots=True)

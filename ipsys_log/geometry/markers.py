@@ -41,7 +41,7 @@ def check_covariance(covariance_px2: Array, where: str) -> None:
     IpsysError
         The matrix is not a covariance. The text names ``where``.
     """
-    if not (np.isfinite(covariance_px2).all() and np.trace(covariance_px2) > 0):
+    if not (np.isfinite(covariance_px2).all() and covariance_px2.trace() > 0):
         raise IpsysError(f"{where}: covariance_px2 has no variance; detect the markers again")
 
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -41,6 +42,7 @@ def camera_of_topic(topic: str) -> str | None:
     return match["camera"] if match else None
 
 
+@lru_cache(4096)  # a log has few topics, but many messages
 def run_of_topic(topic: str) -> str | None:
     """Return the run in a topic; None for a recorded topic."""
     match = _RUN.match(topic)

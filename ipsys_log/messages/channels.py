@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 from ipsys_log.messages.clocks import ClockEstimate
 from ipsys_log.messages.commands import RobotPath, WheelCommand
@@ -94,7 +95,12 @@ class Channel:
 
     def topic_of(self, run: str | None = None, camera: str | None = None) -> str:
         """Return the topic of a run and a camera."""
-        return self.topic.format(run=run, camera=camera)
+        return _topic(self.topic, run, camera)
+
+
+@lru_cache(4096)
+def _topic(pattern: str, run: str | None, camera: str | None) -> str:
+    return pattern.format(run=run, camera=camera)
 
 
 RIG = Channel(name="rig", topic="/rig", payloads=(Rig,), by_schema=True, lasting=True)
@@ -174,6 +180,7 @@ def clock_topic(camera: str) -> str:
     return CLOCKS.topic_of(camera=camera)
 
 
+@lru_cache(4096)  # a log has few topics, but many messages
 def channel_of(topic: str, payload: type | None) -> Channel | None:
     """Return the channel of a topic with messages of a type; None if the table has none.
 

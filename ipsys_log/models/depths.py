@@ -40,8 +40,11 @@ def depth_terms(points_m: Array) -> tuple[Array, Array]:
     """
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
     r2 = u * u + v * v
-    terms = [np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3, r2 * r2]
-    return np.stack(terms, axis=1), 1 + r2
+    columns = (1.0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3, r2 * r2)
+    terms = np.empty((len(u), len(columns)))
+    for n, column in enumerate(columns):  # np.stack takes longer for the few points of a frame
+        terms[:, n] = column
+    return terms, 1 + r2
 
 
 def fit_depths(points_m: Array, ratios: Array) -> tuple[Array, Array]:

@@ -196,7 +196,7 @@ def needs_height(name: str) -> bool:
 
 def inputs(name: str, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the inputs of a model: camera points (n, 3), and heights (n,) if the model needs them."""
-    return np.column_stack([points_m, heights_m]) if reads_height(name) else points_m
+    return np.concatenate([points_m, heights_m[:, None]], axis=1) if reads_height(name) else points_m
 
 
 def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.float64]:

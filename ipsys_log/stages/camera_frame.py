@@ -126,7 +126,7 @@ def _lens_slopes(seen: Sequence[_Seen], lens: CameraCalibration) -> Array:
 
 
 def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
-    uv, lengths_m = np.stack([s.uv for s in seen]), np.array([s.length_m for s in seen])
+    uv, lengths_m = np.array([s.uv for s in seen]), np.array([s.length_m for s in seen])
     places = zip(camera_point(uv, lengths_m).tolist(), heading(uv).tolist(), strict=True)
     covariances_m2 = _perimeter_covariances(seen, uv, lengths_m, lens)
     points = []
@@ -148,7 +148,7 @@ def _perimeter_covariances(
     by_px = np.linalg.inv(pixel_slopes(uv[indices].reshape(-1, 2), lens)).reshape(-1, 4, 2, 2)
     by_corner = camera_point_slopes(uv[indices], lengths_m[indices]) @ by_px
     m_by_px = by_corner.swapaxes(1, 2).reshape(-1, 3, 8)
-    covariances_m2 = m_by_px @ np.stack([*known.values()]) @ m_by_px.swapaxes(1, 2)
+    covariances_m2 = m_by_px @ np.array([*known.values()]) @ m_by_px.swapaxes(1, 2)
     return dict(zip(indices, covariances_m2, strict=True))
 
 

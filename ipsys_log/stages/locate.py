@@ -108,10 +108,12 @@ def _world_poses(
     a tilted camera, the point ahead has another height. The vertical part of the step is removed along the
     ray, because markers are level.
     """
-    units = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(len(points_m))], axis=1)
-    deeper = points_m * (1 + _STEP_M / points_m[:, 2:])
-    moved = np.vstack([points_m, points_m + _STEP_M * units, deeper])
-    world, ahead, below = applied.predict(moved, np.tile(heights_m, 3)).reshape(3, -1, 3)
+    units, moved = np.zeros(points_m.shape), np.empty((3, *points_m.shape))
+    units[:, 0], units[:, 1] = np.cos(angles_rad), np.sin(angles_rad)
+    moved[0], moved[1] = points_m, points_m + _STEP_M * units
+    moved[2] = points_m * (1 + _STEP_M / points_m[:, 2:])
+    heights = np.concatenate([heights_m] * 3)
+    world, ahead, below = applied.predict(moved.reshape(-1, 3), heights).reshape(3, -1, 3)
     along, ray = ahead - world, below - world
     # A model with known heights has no vertical part, and its ray has no length.
     falls = np.abs(ray[:, 2]) > _LEAST_FALL * _STEP_M

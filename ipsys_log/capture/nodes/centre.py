@@ -12,10 +12,11 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from itertools import chain
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage
+from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
 from ipsys_log.capture.nodes.network import NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import (
@@ -32,7 +33,7 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["Centre", "exchange_period_s", "is_of_node", "node_of"]
+__all__ = ["Centre", "describe_no_answer", "exchange_period_s", "is_of_node", "node_of"]
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
@@ -83,6 +84,15 @@ def node_of(camera: RigCamera) -> str:
     'red'
     """
     return check_name(str(camera.source).removeprefix(_SCHEME), f"camera {camera.name}: the node")
+
+
+def describe_no_answer(camera: RigCamera, network: NodeNetwork) -> str:
+    """Return the text of the error that no node answers for a camera."""
+    node = node_of(camera)
+    return (
+        f"camera {camera.name}: no node {node} answers at {network}; start it on its host: "
+        f"ipsys node lab.toml --camera {node}"
+    )
 
 
 class _Arrival(NamedTuple):
@@ -136,28 +146,20 @@ class Centre:
     ) -> Iterator[Iterator[Frame | SourceMessage | None]]:
         """Open the camera of a node; an :data:`~ipsys_log.capture.frames.Open`.
 
+        The iterator never waits: it yields None if nothing has arrived.
+
         Raises
         ------
         SourceError
-            No node answers, the node has another version, or two nodes have the name.
+            In the iteration: no node answers, the node has another version, or two nodes have the name.
         """
         link = self._links.get(camera.name)
         if link is None:
             stream = NodeStream(camera, self._version)
             period_s = partial(exchange_period_s, nodes=len(self._nodes))
             link = _Link(self._session, camera, self._nodes[camera.name], stream, clock, period_s)
-            link.await_node(self._network, say, self._is_stopped)
             self._links[camera.name] = link
-        link.heard_ns = clock.now_ns()
-        yield link.items()
-
-    def choose_opener(self, other: Open) -> Open:
-        """Return the function that opens the cameras of nodes, and with ``other`` all other cameras."""
-
-        def choose(camera: RigCamera, clock: Clock, say: Say) -> Any:
-            return self.open(camera, clock, say) if is_of_node(camera) else other(camera, clock, say)
-
-        return choose
+        yield chain(link.await_node(self._network, say, self._is_stopped), link.items())
 
 
 def _directly(receive: Callable[[Any], None]) -> Any:
@@ -185,7 +187,7 @@ class _Link:
         self.heard_ns = clock.now_ns()
         self._session, self._camera, self._node, self._period_s = session, camera, node, period_s
         self._stream, self._clock = stream, clock
-        self._arrived = threading.Condition()
+        self._lock = threading.Lock()
         self._waiting: deque[_Arrival] = deque()
         self._waiting_bytes = 0
         # The number of answers, and items from before the opening.
@@ -195,15 +197,16 @@ class _Link:
         self._asks_frames = False
         self._subscriber = session.declare_subscriber(frames_key(node), _directly(self._receive))
 
-    def await_node(self, network: NodeNetwork, say: Say, is_stopped: Callable[[], bool]) -> None:
-        """Wait for the first answers of the node, or for a stop; ``say`` reports a longer wait.
+    def await_node(self, network: NodeNetwork, say: Say, is_stopped: Callable[[], bool]) -> Iterator[None]:
+        """Yield None until the node has answered, or until a stop; ``say`` reports a longer wait.
 
         Raises
         ------
         SourceError
             No node answers.
         """
-        start_ns, is_said = self._clock.now_ns(), False
+        start_ns = self.heard_ns = self._clock.now_ns()
+        is_said, is_first = False, not self._stream.is_known
         while not (self._exchanges >= _OPENING_EXCHANGES and self._stream.is_known):
             waited_s = (self._clock.now_ns() - start_ns) / NS_PER_S
             if waited_s > _FIRST_ANSWER_S or is_stopped():
@@ -212,14 +215,15 @@ class _Link:
                 is_said = True
                 say(f"camera {self._camera.name}: waits for node {self._node} at {network}")
             arrival = self._take()
-            self._early += [] if arrival is None else arrival.take()
             self._ask_state()
+            if arrival is None:
+                yield None
+            else:
+                self._early += arrival.take()
         if not self._stream.is_known:
-            raise SourceError(
-                f"camera {self._camera.name}: no node {self._node} answers at {network}; start it on its "
-                f"host: ipsys node lab.toml --camera {self._node}"
-            )
-        self._early.insert(0, self._stream.report_answer(self._clock.now_ns()))
+            raise SourceError(describe_no_answer(self._camera, network))
+        if is_first:
+            self._early.insert(0, self._stream.report_answer(self._clock.now_ns()))
 
     def items(self) -> Iterator[Frame | SourceMessage | None]:
         """Yield the frames and the messages about them."""
@@ -239,11 +243,11 @@ class _Link:
                 return
 
     def _take(self) -> _Arrival | None:
-        with self._arrived:
-            if not self._waiting:
-                self._arrived.wait(self._until_request_s())
-            arrival = self._waiting.popleft() if self._waiting else None
-            self._waiting_bytes -= arrival.size if arrival else 0
+        if not self._waiting:
+            return None
+        with self._lock:
+            arrival = self._waiting.popleft()
+            self._waiting_bytes -= arrival.size
             return arrival
 
     def _until_request_s(self) -> float:
@@ -252,13 +256,12 @@ class _Link:
         return max(self._period_s(self._exchanges) - since_s, 0.0)
 
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
-        with self._arrived:
+        with self._lock:
             self.heard_ns = self._clock.now_ns()
             if size and self._waiting_bytes + size > _MOST_WAITING_BYTES:
                 return
             self._waiting_bytes += size
             self._waiting.append(_Arrival(size, take))
-            self._arrived.notify_all()
 
     def _receive(self, sample: Any, is_late: bool = False) -> None:
         """Take a frame; Zenoh calls this in its thread."""

@@ -128,10 +128,13 @@ def receiving(centre: Centre, camera: str = "red", clock: Clock | None = None) -
         while not stopped.is_set():
             try:
                 with centre.open(rig_camera, clock, lambda text: None) as items:
-                    opened.set()
                     for item in items:
                         if stopped.is_set():
                             return
+                        if item is None:
+                            stopped.wait(0.001)
+                            continue
+                        opened.set()
                         _keep(received, item)
                     return
             except Exception as error:
@@ -148,9 +151,9 @@ def receiving(centre: Centre, camera: str = "red", clock: Clock | None = None) -
         thread.join()
 
 
-def _keep(received: Received, item: Frame | SourceMessage | None) -> None:
+def _keep(received: Received, item: Frame | SourceMessage) -> None:
     if isinstance(item, Frame):
         received.frames.append(item)
-    elif item is not None:
+    else:
         kept = received.events if isinstance(item.payload, Event) else received.estimates
         kept.append(item.payload)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import socket
 import threading
+import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from ipsys_log.capture.devices import open_source
-from ipsys_log.capture.frames import Clock, SourceError
+from ipsys_log.capture.frames import Clock, Frame, SourceError, SourceMessage
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes import node as node_module
 from ipsys_log.capture.nodes.centre import Centre, _Link
@@ -36,6 +37,15 @@ HOUR_NS = 3600 * 1_000_000_000
 
 def cameras(*names: str) -> list[RigCamera]:
     return [RigCamera(name, source=f"zenoh:{name}") for name in names or ("red",)]
+
+
+def first_of(items: Iterator[Frame | SourceMessage | None]) -> Frame | SourceMessage:
+    """Return the first item that arrives."""
+    for item in items:
+        if item is not None:
+            return item
+        time.sleep(0.001)
+    raise AssertionError("the frames have ended")
 
 
 def local() -> NodeNetwork:
@@ -182,9 +192,9 @@ def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path)
         Centre(cameras(), network, "0.1.0") as centre,
         sending(tmp_path, network, version="0.2.0"),
         pytest.raises(SourceError, match=r"has ipsys 0\.2\.0, but this machine has ipsys 0\.1\.0"),
-        centre.open(cameras()[0], Clock(), lambda text: None),
+        centre.open(cameras()[0], Clock(), lambda text: None) as items,
     ):
-        pass
+        first_of(items)
     network = local()
     with (
         Centre(cameras(), network, "0.1.0") as centre,
@@ -207,11 +217,13 @@ def test_calls_of_zenoh_end_before_the_program(monkeypatch: pytest.MonkeyPatch) 
         daemons.update(thread.name for thread in threading.enumerate() if thread.daemon)
 
     monkeypatch.setattr(_Link, "_ask_state", watch)
-    with Centre(cameras(), local(), "0.1.0") as centre:
-        open_camera = centre.choose_opener(open_source)
-        with pytest.raises(SourceError, match="no node red"), LiveCameras(cameras(), open_camera, Clock()):
-            pass
-    assert not [name for name in daemons if name == "red" or "closure" in name]
+    with (
+        Centre(cameras(), local(), "0.1.0") as centre,
+        pytest.raises(SourceError, match="no node red"),
+        LiveCameras(cameras(), centre.open, Clock()),
+    ):
+        pass
+    assert not [name for name in daemons if name == "nodes" or "closure" in name]
 
 
 @pytest.mark.slow
@@ -222,9 +234,9 @@ def test_centre_without_a_node_names_the_command(monkeypatch: pytest.MonkeyPatch
         pytest.raises(
             SourceError, match=r"no node red answers at 127\.0\.0\.1:\d+; start it on its host: ipsys"
         ),
-        centre.open(cameras()[0], Clock(), lambda text: None),
+        centre.open(cameras()[0], Clock(), lambda text: None) as items,
     ):
-        pass
+        first_of(items)
 
 
 def test_port_in_use_and_foreign_address_are_refused() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Generator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from ipsys_log import __version__, pipeline
 from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.first_messages import first_messages
-from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.frames import Clock, Open, Say
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
@@ -50,11 +51,34 @@ def driven_markers(lab: GeometricLab) -> dict[str, list[Markers]]:
     return markers
 
 
-def send(nodes: dict[str, Node], markers: dict[str, list[Markers]], begin: Event, clock: Clock) -> None:
-    """Send all markers as soon as the centre knows all nodes; their times are those of the last seconds."""
-    assert begin.wait(PATIENCE_S)
-    later_ns = clock.now_ns() - max(row.timestamp for rows in markers.values() for row in rows)
+class AnnouncedCameras(LiveCameras):
+    """Cameras that announce the begin of the recording; frames before it are discarded."""
+
+    def __init__(self, cameras: list[RigCamera], opener: Open, clock: Clock, say: Say, begin: Event) -> None:
+        super().__init__(cameras, opener, clock, say)
+        self._begin = begin
+
+    def __iter__(self) -> Generator[Message | None, None, None]:
+        messages = super().__iter__()
+        yield next(messages)
+        self._begin.set()
+        yield from messages
+
+
+def send(
+    nodes: dict[str, Node], markers: dict[str, list[Markers]], answered: Event, begin: Event, clock: Clock
+) -> None:
+    """Send the first markers to a centre that knows all nodes, and the others to one that records.
+
+    Their times are those of the last seconds.
+    """
+    last_ns = max(row.timestamp for rows in markers.values() for row in rows)
+    assert answered.wait(PATIENCE_S)
+    later_ns = clock.now_ns() - last_ns
     for number in range(round(SECONDS * RATE_HZ)):
+        if number == 1:
+            assert begin.wait(PATIENCE_S)
+            later_ns = clock.now_ns() - last_ns
         for camera, node in nodes.items():
             row = markers[camera][number]
             stamp_ns = row.timestamp + later_ns
@@ -68,13 +92,13 @@ def record_hall(folder: Path, lab: GeometricLab, markers: dict[str, list[Markers
     """Run the centre with one node for each camera; return its log."""
     network, clock, target = NodeNetwork("127.0.0.1", free_port()), Clock(), folder / "hall.mcap"
     cameras = [RigCamera(name, source=f"zenoh:{name}") for name in lab.settings.lab.cameras]
-    answered, begin = set[str](), Event()
+    names, answered, begin = set[str](), Event(), Event()
 
     def say(text: str) -> None:
         if "its node answers" in text:
-            answered.add(text.split(":", maxsplit=1)[0])
-        if len(answered) == len(cameras):
-            begin.set()
+            names.add(text.split(":", maxsplit=1)[0])
+        if len(names) == len(cameras):
+            answered.set()
 
     with ExitStack() as stack:
         nodes = {
@@ -83,12 +107,12 @@ def record_hall(folder: Path, lab: GeometricLab, markers: dict[str, list[Markers
             )
             for camera in cameras
         }
-        sender = Thread(target=send, args=(nodes, markers, begin, clock))
+        sender = Thread(target=send, args=(nodes, markers, answered, begin, clock))
         sender.start()
         stack.callback(sender.join)
         rig = replace(geometric_rig(lab), cameras=tuple(cameras), nodes=RigNodes(str(network)))
         opener = stack.enter_context(source_opener(rig, cameras, folder))
-        live = stack.enter_context(LiveCameras(cameras, opener, clock, say))
+        live = stack.enter_context(AnnouncedCameras(cameras, opener, clock, say, begin))
         settings = first_messages(rig, dict(lab.calibrations), live.now_ns, live.imported_run)
         request = Request(models=(MODEL,), model_from=folder / "calibration.mcap")
         pipeline.live(live, settings, target, request)

@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 from threading import Thread
 
 from ipsys_log.capture.camera_thread import CameraReader, Pause
+from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.nodes.centre import is_of_node
+from ipsys_log.capture.nodes.receiver import passing_period_s
+from ipsys_log.units import NS_PER_S
 
 __all__ = ["reader_threads"]
-
-# The period of the turns of nodes, in s: longer for many nodes, so that more frames come in one turn.
-_LEAST_PERIOD_S, _MOST_PERIOD_S, _PERIOD_OF_NODE_S = 0.001, 0.005, 0.0002
 
 
 def reader_threads(readers: Sequence[CameraReader]) -> list[Thread]:
@@ -43,12 +43,12 @@ def _read_device(reader: CameraReader) -> None:
 
 def _read_nodes(readers: Sequence[CameraReader]) -> None:
     """Read nodes in turn. A node whose reader pauses misses its turns."""
-    period_s = min(max(len(readers) * _PERIOD_OF_NODE_S, _LEAST_PERIOD_S), _MOST_PERIOD_S)
+    period_s, clock = passing_period_s(len(readers)), Clock()
     turns = [_Turn(reader) for reader in readers]
     while turns:
-        begin_s = time.monotonic()
-        turns = [turn for turn in turns if turn.take(begin_s)]
-        time.sleep(max(period_s - (time.monotonic() - begin_s), 0.0))
+        now_s = clock.now_ns() / NS_PER_S
+        turns = [turn for turn in turns if turn.take(now_s)]
+        time.sleep(period_s)
 
 
 class _Turn:

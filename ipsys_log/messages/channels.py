@@ -180,7 +180,6 @@ def clock_topic(camera: str) -> str:
     return CLOCKS.topic_of(camera=camera)
 
 
-@lru_cache(4096)  # a log has few topics, but many messages
 def channel_of(topic: str, payload: type | None) -> Channel | None:
     """Return the channel of a topic with messages of a type; None if the table has none.
 
@@ -193,14 +192,20 @@ def channel_of(topic: str, payload: type | None) -> Channel | None:
     >>> channel_of("/front/image_raw", RawImage)
     <channel images>
     """
-    match = _TOPIC.fullmatch(topic)
-    if match is None or payload is None:
+    pattern = _pattern_of(topic)
+    if pattern is None or payload is None:
         return None
-    pattern = (
-        f"{'/runs/{run}' * bool(match['run'])}{'/cameras/{camera}' * bool(match['camera'])}{match['rest']}"
-    )
     fitting = [channel for channel in CHANNELS if payload in channel.payloads]
     named = next((channel for channel in fitting if channel.topic == pattern), None)
-    if named is not None or match["run"]:
+    if named is not None or pattern.startswith("/runs/"):
         return named
     return next((channel for channel in fitting if channel.by_schema), None)
+
+
+@lru_cache(4096)  # a log has few topics, but many messages
+def _pattern_of(topic: str) -> str | None:
+    """Return the topic with placeholders for the names of the run and the camera."""
+    match = _TOPIC.fullmatch(topic)
+    if match is None:
+        return None
+    return f"{'/runs/{run}' * bool(match['run'])}{'/cameras/{camera}' * bool(match['camera'])}{match['rest']}"

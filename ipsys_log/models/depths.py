@@ -40,9 +40,9 @@ def depth_terms(points_m: Array) -> tuple[Array, Array]:
     """
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
     r2 = u * u + v * v
-    columns = (1.0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3, r2 * r2)
-    terms = np.empty((len(u), len(columns)))
-    for n, column in enumerate(columns):  # np.stack takes longer for the few points of a frame
+    columns = (u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3, r2 * r2)
+    terms = np.ones((len(u), len(columns) + 1))
+    for n, column in enumerate(columns, 1):  # np.stack takes longer for the few points of a frame
         terms[:, n] = column
     return terms, 1 + r2
 

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from threadpoolctl import threadpool_limits
 
-__all__ = ["ONE_THREAD", "one_blas_thread"]
-
-# The environment of a new process with one BLAS thread. Such a process has no need to load the BLAS of scipy
-# for :func:`one_blas_thread`, which takes 0.1 s.
-ONE_THREAD = dict.fromkeys(
-    ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "OMP_NUM_THREADS"), "1"
-)
+__all__ = ["one_blas_thread"]
 
 
 def one_blas_thread() -> threadpool_limits:

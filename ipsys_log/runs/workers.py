@@ -1,17 +1,13 @@
 """Worker processes of this machine, which compute the pieces of a run.
 
-A worker has a pipe to this process and a session of its own: the keys of the terminal and a closed terminal
-concern this process only. All workers take the numbers of their pieces from one further pipe. A worker ends
-with its pipes, so that none remains after this process.
+All workers take the numbers of their pieces from one pipe, besides the pipe that each of them has for the
+results. A worker ends with its pipes, so that none remains after this process.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
-import subprocess
-import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,7 +17,7 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.interrupts import undivided
-from ipsys_log.runs.blas import ONE_THREAD
+from ipsys_log.piped_process import PipedProcess, parent_pipe
 from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
 __all__ = ["LocalWorkers", "available_cores", "check_jobs", "serve"]
@@ -33,11 +29,6 @@ _NUMBER_BYTES = 4
 # More processes than these only take memory, 0.15 GB each. A script may run on machines of other sizes.
 _MOST_JOBS_OF_CORE = 4
 _MOST_JOBS_OF_SMALL_MACHINE = 16
-# The path of modules is that of this process: the folder of the user has no part in it.
-_START = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from ipsys_log.runs.workers import serve; serve(int(sys.argv[2]))"
-)
 
 
 def available_cores() -> int:
@@ -68,36 +59,16 @@ class _Failure(NamedTuple):
     trace: str
 
 
-class _Worker:
-    """A worker process and its pipe; ``numbers`` is the file descriptor with the numbers of its pieces."""
+class _Worker(PipedProcess):
+    """A worker process; ``numbers`` is the file descriptor with the numbers of its pieces."""
 
     def __init__(self, numbers: int) -> None:
-        modules = json.dumps([path for path in sys.path if path])
-        command = [sys.executable, "-P", "-c", _START, modules, str(numbers)]
-        self.process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=(numbers,),
-            start_new_session=True,
-            env={**os.environ, **ONE_THREAD},
-        )
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        try:
-            self._sender = Connection(os.dup(self.process.stdin.fileno()), readable=False)
-            self.receiver = Connection(os.dup(self.process.stdout.fileno()), writable=False)
-        except OSError:  # no file descriptor is free
-            self.process.kill()
-            self.process.wait()
-            raise
-        self.process.stdin.close()
-        self.process.stdout.close()
+        super().__init__(serve, numbers)
 
     def begin(self, plan: PiecePlan) -> None:
         """Send the run and the pieces whose numbers follow."""
         try:
-            self._sender.send((plan.run, plan.pieces))
+            self.sender.send((plan.run, plan.pieces))
         except OSError:
             raise self._ended() from None
 
@@ -113,22 +84,10 @@ class _Worker:
         number, result = answer
         return number, result
 
-    def close(self) -> None:
-        """Close the pipe; the worker then ends by itself."""
-        self._sender.close()
-        self.receiver.close()
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        self.close()
-
     def _ended(self) -> IpsysError:
-        code = self.process.wait()
-        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
         return IpsysError(
-            f"a worker process has ended {how}, perhaps for lack of memory; its results are not written. "
-            "Repeat the command, or give fewer processes with --jobs"
+            f"a worker process has ended {self.describe_end()}, perhaps for lack of memory; its results are "
+            "not written. Repeat the command, or give fewer processes with --jobs"
         )
 
 
@@ -242,8 +201,7 @@ class LocalWorkers:
 
 def serve(numbers: int) -> None:
     """Compute the pieces with the numbers from a file descriptor, until it ends. A worker's main function."""
-    receiver, sender = Connection(os.dup(0), writable=False), Connection(os.dup(1), readable=False)
-    os.dup2(2, 1)  # a print of another package must not come between the results
+    receiver, sender = parent_pipe()
     try:
         _serve(receiver, sender, numbers)
     except (EOFError, ConnectionError, BrokenPipeError):

@@ -146,7 +146,7 @@ def test_clock_offset_is_that_of_the_stored_model(ipsys: Ipsys, fitted: Path) ->
     printed_ms = {camera["camera"]: camera["clock_ms"] for camera in described(ipsys, fitted)["cameras"]}
     with Session([fitted]) as session:
         (model,) = session.payloads(session.topics(MODEL, "joint"))
-    stored_ms = {camera.camera: restore_joint(camera).clock_s * 1000 for camera in model.cameras}
+    stored_ms = {name: camera.clock_s * 1000 for name, camera in restore_joint(model).items()}
     assert printed_ms == stored_ms
     assert list(printed_ms.values()).count(0.0) >= 2
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from ipsys_log.runs.blas import ONE_THREAD
+from ipsys_log.piped_process import ONE_THREAD
 
 # Models are imported within the block, as a command does.
 LATE = """

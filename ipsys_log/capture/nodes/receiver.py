@@ -22,13 +22,18 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.interrupts import undivided
 from ipsys_log.messages import RigCamera
 from ipsys_log.piped_process import PipedProcess, parent_pipe
+from ipsys_log.units import NS_PER_S
 
-__all__ = ["Receiver", "serve"]
+__all__ = ["Receiver", "passing_period_s", "serve"]
 
-# The period in which arrivals are passed on, in s: longer for many nodes, so that more of them come together.
 _LEAST_PERIOD_S, _MOST_PERIOD_S, _PERIOD_OF_NODE_S = 0.001, 0.005, 0.0002
 # The readers of all cameras ask one after the other. One look at the pipe is enough for all of them.
-_LOOK_EVERY_S = 0.001
+_LOOK_EVERY_NS = NS_PER_S // 1000
+
+
+def passing_period_s(nodes: int) -> float:
+    """Return the period of passing on arrivals, in s. A longer one for many nodes lets more come together."""
+    return min(max(nodes * _PERIOD_OF_NODE_S, _LEAST_PERIOD_S), _MOST_PERIOD_S)
 
 
 class _End(NamedTuple):
@@ -81,7 +86,7 @@ class Receiver:
         self._is_stopped = is_stopped
         self._process: PipedProcess | None = None
         self._arrived: dict[str, deque[_Item]] = {camera.name: deque() for camera in cameras}
-        self._looked_s = 0.0
+        self._clock, self._looked_ns = Clock(), 0
 
     def __enter__(self) -> Self:
         self._start()
@@ -141,10 +146,10 @@ class Receiver:
 
     def _look(self) -> None:
         """Take what has arrived since the last look, for all cameras."""
-        now_s = time.monotonic()
-        if now_s - self._looked_s < _LOOK_EVERY_S:
+        now_ns = self._clock.now_ns()
+        if now_ns - self._looked_ns < _LOOK_EVERY_NS:
             return
-        self._looked_s = now_s
+        self._looked_ns = now_ns
         try:
             while self._process is not None and self._process.receiver.poll():
                 for camera, item in self._process.receiver.recv():
@@ -220,17 +225,15 @@ def _pass_on(
     centre: Centre, cameras: Mapping[str, RigCamera], receiver: Connection, sender: Connection
 ) -> None:
     """Pass on all arrivals of the open cameras, once in each period."""
-    period_s = min(max(len(cameras) * _PERIOD_OF_NODE_S, _LEAST_PERIOD_S), _MOST_PERIOD_S)
     opened: dict[str, Iterator[_Item | None]] = {}
     while True:
-        begin_s = time.monotonic()
         while receiver.poll():
             name, clock = receiver.recv()
             opened[name] = _items_of(centre, cameras[name], clock)
         arrived = [(name, item) for name, items in opened.items() for item in _until_none(items)]
         if arrived:
             sender.send(arrived)
-        time.sleep(max(period_s - (time.monotonic() - begin_s), 0.0))
+        time.sleep(passing_period_s(len(cameras)))
 
 
 def _until_none(items: Iterator[_Item | None]) -> Iterator[_Item]:

@@ -118,11 +118,12 @@ def error_sources(fit: JointFit, session: Session) -> dict[str, float]:
 def _by_unknowns(model: JointModel, layout: Layout, block: CameraBlock) -> JointModel:
     """Return the model with one mode for each global unknown, so that modes are derivatives."""
     own, floor = block.stop - block.start, layout.floor.count
-    modes = np.zeros((own + 1 + floor, len(layout.mean)))
+    modes = np.zeros((own + 1, len(layout.mean)))
     modes[:own, block.start : block.stop] = np.eye(own)
     modes[own, layout.scales] = 1 / layout.bodies
-    modes[own + 1 :, layout.modes] = np.eye(floor)
-    return replace(model, modes=modes)
+    floor_modes = np.zeros((floor, len(layout.mean)))
+    floor_modes[:, layout.modes] = np.eye(floor)
+    return replace(model, modes=modes, floor_modes=floor_modes)
 
 
 def _tape_pulls(fit: JointFit, pulls: Array) -> Array:

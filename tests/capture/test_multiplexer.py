@@ -81,6 +81,29 @@ def test_every_frame_comes_as_it_was_and_log_times_increase() -> None:
     assert all(0 < message.log_time_ns - message.publish_time_ns < most_ns for message in found)
 
 
+def test_frames_of_a_node_before_the_recording_are_discarded() -> None:
+    """Stages prepare for seconds. The positions of frames that waited meanwhile would come late."""
+    discarded = threading.Event()
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            yield from (Frame(b"early %d" % n, "jpeg", clock.now_ns()) for n in range(5))
+            discarded.set()
+            while not attached._taken.is_set():
+                yield None
+            yield from (Frame(b"%d" % n, "jpeg", clock.now_ns()) for n in range(5))
+
+        yield sent()
+
+    attached = LiveCameras([RigCamera("red", source="zenoh:red")], opened, Clock())
+    with attached:
+        assert discarded.wait(LIMIT_S)
+        found = [message for message in attached if message is not None]
+    assert data_of(found, "red") == [b"early 0", b"0", b"1", b"2", b"3", b"4"]
+    assert not events(found)
+
+
 def test_log_times_are_utc() -> None:
     before_ns = time.time_ns()
     (first, *_) = messages(LiveCameras(cameras("red"), playing(FRAMES, 1000.0), Clock()))

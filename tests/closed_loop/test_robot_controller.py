@@ -115,7 +115,7 @@ def test_example_needs_only_the_standard_library() -> None:
         if line.startswith(("import ", "from "))
     }
     allowed = {
-        *("argparse", "json", "math", "queue", "select", "socket", "struct", "time", "typing"),
+        *("argparse", "contextlib", "json", "math", "queue", "select", "socket", "struct", "time", "typing"),
         *("controller", "positions"),
     }
     assert {(name, module) for name, module in imported if module not in allowed} == {

@@ -45,7 +45,7 @@ _Item = Frame | SourceMessage | str | _End | Exception
 
 
 class _Setup(NamedTuple):
-    """What the process needs first."""
+    """The first message to the process."""
 
     cameras: tuple[RigCamera, ...]
     network: NodeNetwork

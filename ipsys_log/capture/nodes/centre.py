@@ -250,11 +250,6 @@ class _Link:
             self._waiting_bytes -= arrival.size
             return arrival
 
-    def _until_request_s(self) -> float:
-        """Return the time until the next request for the state."""
-        since_s = (self._clock.now_ns() - self._state_asked_ns) / NS_PER_S
-        return max(self._period_s(self._exchanges) - since_s, 0.0)
-
     def _put(self, size: int, take: Callable[[], Iterator[Frame | SourceMessage]]) -> None:
         with self._lock:
             self.heard_ns = self._clock.now_ns()
@@ -279,7 +274,8 @@ class _Link:
         """Ask the node for its state, if the last request is old enough."""
         import zenoh
 
-        if self._until_request_s() > 0:
+        since_s = (self._clock.now_ns() - self._state_asked_ns) / NS_PER_S
+        if since_s < self._period_s(self._exchanges):
             return
         self._state_asked_ns = sent_ns = self._clock.now_ns()
 

@@ -38,10 +38,11 @@ __all__ = ["Centre", "describe_no_answer", "exchange_period_s", "is_of_node", "n
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
 # The period of the exchanges up to a number of them: the first ones together find offset and drift.
-_TURNS_S = ((500, 0.02), (1000, 0.04))
+_FIRST_EXCHANGES = 500
+_TURNS_S = ((_FIRST_EXCHANGES, 0.02), (1000, 0.04))
 _TURN_S = 0.1
-# More exchanges with all nodes together need the time of the thread that computes the positions.
-_MOST_EXCHANGES_PER_S = 150
+# After the first ones, many nodes share this number: exchanges need the time of the receiving process.
+_MOST_EXCHANGES_PER_S = 480
 _FIRST_ANSWER_S, _WAIT_UNSAID_S, _OPENING_EXCHANGES = 60.0, 3.0, 10
 _SILENT_NS = 5 * NS_PER_S
 _ANSWER_S, _FRAMES_S = 3.0, 20.0
@@ -52,16 +53,20 @@ def exchange_period_s(exchanges: int, nodes: int = 1) -> float:
 
     Parameters
     ----------
-    nodes : all nodes of the centre; more nodes have a longer period at first.
+    nodes : all nodes of the centre; with many nodes, the period is longer after the first exchanges.
 
     Examples
     --------
-    >>> exchange_period_s(0), exchange_period_s(0, nodes=6), exchange_period_s(0, nodes=24)
-    (0.02, 0.04, 0.1)
+    >>> exchange_period_s(0), exchange_period_s(0, nodes=24)
+    (0.02, 0.02)
+    >>> exchange_period_s(600), exchange_period_s(600, nodes=24)
+    (0.04, 0.05)
     >>> exchange_period_s(100_000)
     0.1
     """
     period_s = next((period_s for count, period_s in _TURNS_S if exchanges < count), _TURN_S)
+    if exchanges < _FIRST_EXCHANGES:
+        return period_s
     return min(max(period_s, nodes / _MOST_EXCHANGES_PER_S), _TURN_S)
 
 

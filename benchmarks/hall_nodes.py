@@ -270,12 +270,12 @@ def _read(log: Path, model: str, begin: _Usage, end: _Usage, reports: list[dict[
 
 
 def _lost(numbers: Sequence[int], sent: int) -> int:
-    """Return the frames of a node that are not in the log: of those after the first two in the log.
+    """Return the frames of a node that are not in the log, after the first one of the log.
 
-    The centre takes the first frame, and discards the next ones while it prepares the stages.
+    The centre discards frames while it prepares the stages.
     """
-    recorded = sorted(set(numbers))[1:]
-    return sent - recorded[0] - len(recorded) if recorded else sent
+    recorded = set(numbers)
+    return sent - min(recorded) - len(recorded) if recorded else sent
 
 
 def _most_waiting(entries: Iterable[Latency]) -> int:

@@ -46,8 +46,9 @@ class CameraState:
 
     ``dropped`` frames arrived, but the log does not hold them. ``missed`` frames were lost before they
     arrived, by the count of the camera's driver. ``format`` is the format of the frames, such as jpeg or
-    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``delay_s`` is the time from
-    exposure to arrival of the last frame, if it has a capture stamp.
+    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``first_bytes`` is the size of the
+    first frame, which the log of a node's camera does not hold. ``delay_s`` is the time from exposure to
+    arrival of the last frame, if it has a capture stamp.
     """
 
     frames: int = 0
@@ -58,6 +59,7 @@ class CameraState:
     finished: bool = False
     format: str | None = None
     size_px: tuple[int, int] | None = None
+    first_bytes: int = 0
     delay_s: float | None = None
 
 
@@ -81,8 +83,8 @@ class ReaderContext:
     """The objects that the threads of all cameras share.
 
     ``put`` takes an arrival; it returns False if there is no room for a frame. Before ``started``, a thread
-    takes only the first frame. Before ``taken``, nothing leaves the queue, and frames of nodes are discarded
-    after the first one. After ``stopped``, a thread takes nothing.
+    takes only the first frame. Before ``taken``, nothing leaves the queue, and frames of nodes are discarded.
+    After ``stopped``, a thread takes nothing.
     """
 
     open_source: Open
@@ -194,6 +196,8 @@ class CameraReader:
                     self._count_since_key(frame)
                     if not self._is_early(frame):
                         yield from self._take(frame)
+                    elif not self._has_first_frame.is_set():
+                        self._note_first(frame)
         except SourceError as error:
             if self.state.up:
                 self.state.up, self._lost_ns = False, shared.clock.now_ns()
@@ -229,6 +233,7 @@ class CameraReader:
         if not self._shared.put(Arrival(received_ns, topic, time_ns, payload, camera.name)):
             state.dropped += 1
             return
+        state.first_bytes = state.first_bytes or len(frame.data)
         state.frames += 1
         state.bytes += len(frame.data)
         if frame.time_ns is None and self._late.since_ns is not None:
@@ -245,6 +250,14 @@ class CameraReader:
         ):
             yield Pause(self._shared.started, _TURN_S)
 
+    def _note_first(self, frame: Frame) -> None:
+        """Store the properties of a first frame that is not recorded."""
+        state = self.state
+        state.up, state.format, state.first_bytes = True, frame.format, len(frame.data)
+        _, payload = self._payload(frame, self._shared.clock.now_ns())
+        self._note_size(frame, payload)
+        self._has_first_frame.set()
+
     def _payload(self, frame: Frame, time_ns: int) -> tuple[str, Any]:
         """Return the topic and the payload of a frame, or of the markers that a node sends instead."""
         name = self.camera.name
@@ -260,17 +273,16 @@ class CameraReader:
     def _is_early(self, frame: Frame) -> bool:
         """Return whether a frame arrived before the recording began, or depends on a frame that did.
 
-        The caller discards such frames. The first frame is never early. The time of a frame without a stamp
-        is its arrival, so the frame must not wait until the recording begins. Files and the simulator give
-        stamps, and wait. The frames of nodes must not wait either: positions would be late for long.
+        The caller discards such frames. The time of a frame without a stamp is its arrival, so the frame must
+        not wait until the recording begins, except the first one. Files and the simulator give stamps, and
+        wait. The frames of nodes must not wait either: positions would be late for long.
         """
-        if not self._has_first_frame.is_set():
+        if self._is_of_node:
+            is_early = not self._shared.taken.is_set()
+        elif not self._has_first_frame.is_set():
             return False
-        is_early = (
-            not self._shared.taken.is_set()
-            if self._is_of_node
-            else frame.time_ns is None and not self._shared.started.wait(_EARLY_S)
-        )
+        else:
+            is_early = frame.time_ns is None and not self._shared.started.wait(_EARLY_S)
         if is_early:
             self._broken = True
             return True

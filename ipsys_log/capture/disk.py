@@ -233,7 +233,7 @@ def expected_bytes_per_s(cameras: Iterable[RigCamera], states: Mapping[str, Came
 
     Examples
     --------
-    >>> state = CameraState(frames=1, bytes=200_000, format="jpeg", size_px=(1920, 1080))
+    >>> state = CameraState(first_bytes=200_000, format="jpeg", size_px=(1920, 1080))
     >>> expected_bytes_per_s([RigCamera("red", rate_hz=15.0)], {"red": state})
     3000000.0
     """
@@ -255,4 +255,4 @@ def _frame_bytes(state: CameraState) -> float:
     if state.format in ("h264", "h265") and state.size_px is not None:
         width, height = state.size_px
         return _VIDEO_BYTES_PER_PX * width * height
-    return state.bytes / state.frames if state.frames else 0.0
+    return state.first_bytes

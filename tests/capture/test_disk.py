@@ -122,10 +122,10 @@ def test_displayed_disk_time_uses_the_measured_rate(tmp_path: Path, monkeypatch:
 def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
     cameras = [RigCamera("red", rate_hz=15.0), RigCamera("white"), RigCamera("gate", rate_hz=30.0)]
     states = {
-        "red": CameraState(frames=2, bytes=200_000, format="jpeg", size_px=(1280, 720)),
-        "white": CameraState(frames=1, bytes=50_000, format="jpeg", size_px=(640, 480)),
+        "red": CameraState(first_bytes=100_000, format="jpeg", size_px=(1280, 720)),
+        "white": CameraState(first_bytes=50_000, format="jpeg", size_px=(640, 480)),
         # The first frame of a video is a keyframe, so its size gives no rate.
-        "gate": CameraState(frames=1, bytes=400_000, format="h264", size_px=(1920, 1080)),
+        "gate": CameraState(first_bytes=400_000, format="h264", size_px=(1920, 1080)),
     }
     video = expected_bytes_per_s(cameras[2:], states)
     assert 4e6 / 8 < video < 10e6 / 8
@@ -134,7 +134,7 @@ def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
 
 def test_advice_needs_a_large_recording_or_a_small_disk(tmp_path: Path) -> None:
     cameras = [RigCamera("red", rate_hz=30.0)]
-    jpeg, video = (CameraState(1, 1, format=name) for name in ("jpeg", "h264"))
+    jpeg, video = (CameraState(1, 1, format=name, first_bytes=1) for name in ("jpeg", "h264"))
     assert DiskRoom(tmp_path, 10**12, 1e6).advise(cameras, {"red": jpeg}) is None
     advice = DiskRoom(tmp_path, 10**12, 25e6).advise(cameras, {"red": jpeg})
     assert advice is not None

@@ -100,7 +100,7 @@ def test_frames_of_a_node_before_the_recording_are_discarded() -> None:
     with attached:
         assert discarded.wait(LIMIT_S)
         found = [message for message in attached if message is not None]
-    assert data_of(found, "red") == [b"early 0", b"0", b"1", b"2", b"3", b"4"]
+    assert data_of(found, "red") == [b"0", b"1", b"2", b"3", b"4"]
     assert not events(found)
 
 

@@ -46,8 +46,8 @@ class CameraState:
 
     ``dropped`` frames arrived, but the log does not hold them. ``missed`` frames were lost before they
     arrived, by the count of the camera's driver. ``format`` is the format of the frames, such as jpeg or
-    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``first_bytes`` is the size of the
-    first frame, which the log of a node's camera does not hold. ``delay_s`` is the time from exposure to
+    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``first_bytes`` is the size of
+    the first frame, which the log of a node's camera does not hold. ``delay_s`` is the time from exposure to
     arrival of the last frame, if it has a capture stamp.
     """
 
@@ -126,6 +126,8 @@ class CameraReader:
         self._since_key = 0
         self._late = LateFrameDetector(shared.heartbeat, camera.rate_hz)
         self._is_of_node = is_of_node(camera)
+        # The session and the number of the newest frame of a node before the recording.
+        self._last_early: tuple[str | None, int] | None = None
 
     def wait_for_first_frame(self) -> None:
         """Wait for the first frame.
@@ -278,7 +280,7 @@ class CameraReader:
         wait. The frames of nodes must not wait either: positions would be late for long.
         """
         if self._is_of_node:
-            is_early = not self._shared.taken.is_set()
+            is_early = self._precedes_recording(frame)
         elif not self._has_first_frame.is_set():
             return False
         else:
@@ -288,6 +290,18 @@ class CameraReader:
             return True
         self._broken = self._broken and 0 < self._since_key < MAX_FRAMES_WITHOUT_KEYFRAME
         return self._broken
+
+    def _precedes_recording(self, frame: Frame) -> bool:
+        """Return whether a frame of a node arrived before the recording, or is older than one that did.
+
+        A node sends older frames again, after a gap. The log would have some of them, and others not.
+        """
+        key = frame.session, frame.number or 0
+        if self._shared.taken.is_set():
+            return self._last_early is not None and key[0] == self._last_early[0] and key < self._last_early
+        if self._last_early is None or key[0] != self._last_early[0] or key > self._last_early:
+            self._last_early = key
+        return True
 
     def _count_since_key(self, frame: Frame) -> None:
         """Report a video without keyframes: after a dropped frame, decoding cannot start again."""

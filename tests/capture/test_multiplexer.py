@@ -88,11 +88,14 @@ def test_frames_of_a_node_before_the_recording_are_discarded() -> None:
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
         def sent() -> Iterator[Frame | None]:
-            yield from (Frame(b"early %d" % n, "jpeg", clock.now_ns()) for n in range(5))
+            yield from map(frame, (0, 1, 4, 5))
             discarded.set()
             while not attached._taken.is_set():
                 yield None
-            yield from (Frame(b"%d" % n, "jpeg", clock.now_ns()) for n in range(5))
+            yield from map(frame, (6, 2, 7, 3, 9, 8))  # after a gap, a node sends older frames again
+
+        def frame(number: int) -> Frame:
+            return Frame(b"%d" % number, "jpeg", clock.now_ns(), session="first", number=number)
 
         yield sent()
 
@@ -100,7 +103,7 @@ def test_frames_of_a_node_before_the_recording_are_discarded() -> None:
     with attached:
         assert discarded.wait(LIMIT_S)
         found = [message for message in attached if message is not None]
-    assert data_of(found, "red") == [b"0", b"1", b"2", b"3", b"4"]
+    assert data_of(found, "red") == [b"6", b"7", b"9", b"8"]
     assert not events(found)
 
 

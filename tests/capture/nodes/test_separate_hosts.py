@@ -119,7 +119,12 @@ def record_on_hosts(hosts: Hosts, folder: Path) -> None:
         stop(node)
         frames = GrowingChannel(folder / "centre.mcap", image_topic("red")), list[CompressedImage]()
         made = images(folder / "red.mcap")
-        wait_for(lambda: len(read_new(*frames)) == len(made) - made.index(frames[1][0].data), [centre])
+
+        def has_all_since_its_first() -> bool:
+            arrived = {made.index(payload.data) for payload in read_new(*frames)}
+            return arrived == set(range(min(arrived), len(made)))
+
+        wait_for(has_all_since_its_first, [centre])
         stop(centre)
 
 

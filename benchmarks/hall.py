@@ -116,12 +116,12 @@ def _exponent(halls: Sequence[Figures], times_s: Sequence[float]) -> float:
 
 
 def _table(halls: Sequence[Figures]) -> str:
-    lines = ["cameras  sightings  no point  steps   start    fit   MB  model  start mm  mean mm   p95"]
+    lines = ["cameras sightings no point steps  start   fit   MB model start mm mean mm  p95"]
     for one in halls:
-        times = f"{one.start_s:>6.2f} s{one.fit_s:>5.0f} s"
-        errors = f"{one.start_mm:>10.0f}{one.mean_mm:>9.2f}{one.p95_mm:>6.2f}"
-        counts = f"{one.cameras:>7}{one.sightings:>11}{one.unmeasured:>10}{one.steps:>7}"
-        lines.append(f"{counts}{times}{one.memory_mb:>5.0f}{one.message_mb:>7.1f}{errors}")
+        times = f"{one.start_s:>5.2f} s{one.fit_s:>4.0f} s"
+        errors = f"{one.start_mm:>9.0f}{one.mean_mm:>8.2f}{one.p95_mm:>5.1f}"
+        counts = f"{one.cameras:>7}{one.sightings:>10}{one.unmeasured:>9}{one.steps:>6}"
+        lines.append(f"{counts}{times}{one.memory_mb:>5.0f}{one.message_mb:>6.1f}{errors}")
     return "\n".join(lines)
 
 

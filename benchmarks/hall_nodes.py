@@ -6,9 +6,9 @@ The markers of twelve robots come from exact geometry, with the noise of ``detec
 Nodes play them in real time, several in one process; ``ipsys live`` runs as for a user, in a process of its
 own. The nodes have the lowest priority, because those of a hall run on other machines. The first seconds are
 not counted. The latency is the time from the arrival of the markers at the centre, in the thread of Zenoh, to
-the published position. It has a row for the end, because markers wait at the beginning while the stages are
-prepared. The processor time is that of the whole process of the centre. All programs share the cores of this
-machine, so another program increases the latency. The steps are processor times of a message, in one thread.
+the published position. The processor time is that of the centre and its receiving process. All programs share
+the cores of this machine, so another program increases the latency. The steps are processor times of a
+message, in one thread.
 """
 
 from __future__ import annotations

@@ -129,7 +129,17 @@ class _Memory:
 
     def __init__(self) -> None:
         self.pixels = np.zeros((0, 0), dtype=np.uint8)
-        self.bytes = bytearray()
+        self._bytes = bytearray()
+
+    def reserve(self, size: int) -> bytearray:
+        """Return the buffer for a JPEG, of at least ``size`` bytes.
+
+        A larger buffer is a new one. The old one cannot be resized if another thread, such as a profiler,
+        looks at the frames of this thread.
+        """
+        if len(self._bytes) < size:
+            self._bytes = bytearray(size)
+        return self._bytes
 
 
 _THREAD = threading.local()
@@ -172,7 +182,8 @@ def decode_rows(
     starts, stops = [part.start for part in shown], [part.stop for part in shown]
     for low, high in zip([0, *stops], [*starts, layout.height], strict=True):
         grey[low:high] = 0
-    for piece, part in zip(cut_rows(frame.data, layout, shown, memory.bytes), shown, strict=True):
+    pieces = cut_rows(frame.data, layout, shown, memory.reserve(len(frame.data)))
+    for piece, part in zip(pieces, shown, strict=True):
         # Without restart markers, the data after the last requested row looks like damage.
         _decode_jpeg(piece, grey[part], strict=layout.interval > 0)
     return grey, shown

@@ -112,8 +112,8 @@ def cut_rows(
     ----------
     data, layout : the whole JPEG, and its :func:`read_layout`.
     rows : slices from :func:`whole_rows`.
-    memory : buffer for a JPEG, used again for the next JPEG, because allocation of new memory takes longer
-        than filling it. It grows if necessary.
+    memory : buffer for a JPEG, at least as long as ``data``. The caller uses it again for the next JPEG,
+        because allocation of new memory takes longer than filling it.
 
     Returns
     -------
@@ -128,7 +128,6 @@ def cut_rows(
     if layout.interval or not rows:
         pieces = [*_between(data, layout, rows)]
     else:
-        memory.extend(bytes(max(len(data) - len(memory), 0)))
         pieces = [memoryview(memory)[: len(data)]]
         pieces[0][:] = data
     for piece, part in zip(pieces, rows, strict=True):

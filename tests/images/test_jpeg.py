@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import FrameError, SizeError
+from ipsys_log.images import decode
 from ipsys_log.images.decode import decode_grey, decode_rows, frame_size
 from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
 from ipsys_log.messages import CompressedImage, RawImage
@@ -117,7 +120,7 @@ def test_restart_markers_save_the_rows_above(sampling: str) -> None:
     shown = whole_rows(layout, [slice(200, 210), slice(400, 410)])
     assert len(shown) == 2
     assert sum(part.stop - part.start for part in shown) < 200
-    pieces = cut_rows(data, layout, shown, bytearray())
+    pieces = cut_rows(data, layout, shown, bytearray(len(data)))
     assert sum(len(piece) for piece in pieces) < 0.6 * len(data)
 
 
@@ -299,6 +302,25 @@ def test_jpeg_header_without_an_image_is_damaged(data: bytes) -> None:
     for whole in (data, b"\xff\xd8" + data, b"\xff\xd8\xff\xc0" + data + b"\xff\xd9"):
         with pytest.raises(FrameError):
             decode_rows(CompressedImage(0, "red", whole, "jpeg"), [slice(0, 9)])
+
+
+def test_larger_frame_is_decoded_while_a_profiler_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A profiler in another thread, such as that of Dask, holds the local variables of this thread."""
+    held: list[object] = []
+    real = decode._decode_jpeg
+
+    def held_decode(data: Any, *given: Any, **options: Any) -> Any:
+        held.append(data)
+        return real(data, *given, **options)
+
+    monkeypatch.setattr(decode, "_decode_jpeg", held_decode)
+    monkeypatch.setattr(decode, "_THREAD", threading.local())
+    for height in (100, 200, 400):
+        data = packed(colourful(320, height, 1), "4:2:0", 0)
+        whole = simplejpeg.decode_jpeg(data, colorspace="GRAY")[..., 0]
+        grey, (part,) = decode_rows(CompressedImage(0, "red", data, "jpeg"), [slice(40, 60)])
+        np.testing.assert_array_equal(grey[part], whole[part])
+    assert len(held) == 3
 
 
 @pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -55,11 +56,11 @@ def streams(video: Path, folder: Path, more: str = "") -> Iterator[Path]:
         yield rig
 
 
-def started(*arguments: object) -> subprocess.Popen[str]:
+def started(*arguments: object, err: IO[str] | int = subprocess.PIPE) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "ipsys_log", *map(str, arguments)],
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=err,
         text=True,
     )
 
@@ -343,9 +344,9 @@ def test_recorder_that_stood_still_names_its_late_frames(
     pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     """The position of each image in the loop gives its sending time."""
-    log, (video, jpegs) = tmp_path / "a.mcap", pictures
-    with streams(video, tmp_path) as rig:
-        program = started("record", "--rig", rig, "-o", log)
+    log, said, (video, jpegs) = tmp_path / "a.mcap", tmp_path / "said.txt", pictures
+    with streams(video, tmp_path) as rig, said.open("w") as err_file:
+        program = started("record", "--rig", rig, "-o", log, err=err_file)
         wait_for(log, 500_000)
         program.send_signal(signal.SIGSTOP)
         os.waitid(os.P_PID, program.pid, os.WSTOPPED | os.WNOWAIT)
@@ -355,8 +356,13 @@ def test_recorder_that_stood_still_names_its_late_frames(
             time.sleep(0.05)
         program.send_signal(signal.SIGCONT)
         wait_for(log, size + 2_000_000)
+        until = time.monotonic() + LIMIT_S
+        while said.read_text().count("arrive in time again") < len(NAMES):
+            assert time.monotonic() < until, said.read_text()
+            time.sleep(0.05)
         program.send_signal(signal.SIGINT)
-        _, err = program.communicate(timeout=LIMIT_S)
+        program.communicate(timeout=LIMIT_S)
+    err = said.read_text()
     assert program.returncode == 0, err
     with Session([log]) as session:
         events = [e for e in session.payloads(["/events"]) if e.kind == "stamp_unreliable"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -78,6 +79,20 @@ def going_live(rig: Path, model: Path, log: Path, size: int) -> Iterator[subproc
         program.communicate()
 
 
+def wait_for_markers(log: Path, copy: Path) -> None:
+    """Wait until the log that is being recorded has markers of each camera."""
+    until = time.monotonic() + LIMIT_S
+    while True:
+        shutil.copy(log, copy)
+        repair(copy)
+        with Session([copy]) as session:
+            counts = [session.count(f"/runs/edges/cameras/{camera}/markers") for camera in session.images]
+        if counts and all(counts):
+            return
+        assert time.monotonic() < until, counts
+        time.sleep(0.2)
+
+
 def equal(log: Path) -> bool:
     return all(one.equal for one in verify([log], None, lambda stage, done, total: None))
 
@@ -113,6 +128,7 @@ def test_killed_live_run_is_completed_by_repair(
             assert (done.code, done.err.count("\n")) == (1, 1)
             assert "is being recorded or written now" in done.err
         assert "another process is writing it" in ipsys("repair", log).err
+        wait_for_markers(log, tmp_path / "copy.mcap")
         assert program.poll() is None
         program.send_signal(signal.SIGKILL)
         program.wait(LIMIT_S)

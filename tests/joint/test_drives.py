@@ -142,7 +142,7 @@ def test_short_drive_without_chessboard_converges() -> None:
     )
     steps: list[int] = []
     fit = fit_jointly(nominal, progress=lambda step, cost: steps.append(step))
-    assert max(steps) > 200
+    assert max(steps) > 100, "the drive is easy: the test shows nothing"
     # The last camera is uncertain; the others are near their places.
     for number, camera in enumerate(lab.cameras[:3]):
         start = fit.problem.layout.cameras[number].start + 3

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import FitError
+from ipsys_log.joint import solver
 from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
@@ -128,11 +129,14 @@ def test_fit_twice_is_identical() -> None:
 
 
 @pytest.mark.slow
-def test_short_drive_without_chessboard_converges() -> None:
+def test_short_drive_without_chessboard_converges(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four cameras, nominal intrinsics, three points and 10 s; the last camera saw one marker alone.
 
     Focal lengths, distortions and heights then have a curved valley, in which straight steps are too short.
+    Rounding decides if 200 straight steps are enough, so fewer are allowed here: then long steps must follow.
     """
+    usual_steps = 140
+    monkeypatch.setattr(solver, "_MOST_STEPS", usual_steps)
     cameras = ("a", "b", "c", "d")
     settings = LabSettings(seed=6, rate_hz=10.0, drive_s=10.0, markers=1, cameras=cameras)
     lab = build_lab(GeometricSettings(lab=settings, points=3, intrinsics="nominal", clock_offset_s=0.025))
@@ -142,7 +146,7 @@ def test_short_drive_without_chessboard_converges() -> None:
     )
     steps: list[int] = []
     fit = fit_jointly(nominal, progress=lambda step, cost: steps.append(step))
-    assert max(steps) > 100, "the drive is easy: the test shows nothing"
+    assert max(steps) > usual_steps
     # The last camera is uncertain; the others are near their places.
     for number, camera in enumerate(lab.cameras[:3]):
         start = fit.problem.layout.cameras[number].start + 3

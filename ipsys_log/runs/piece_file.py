@@ -13,9 +13,9 @@ from dataclasses import fields
 from typing import Any
 
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
-from ipsys_log.messages import kind_of
-from ipsys_log.runs.pieces import FrameResult, PieceResult
+from ipsys_log.log.codec import PAYLOADS, decode, encode, payload_type, schema_name
+from ipsys_log.messages import Encoded, kind_of
+from ipsys_log.runs.pieces import FrameResult, PieceResult, stays_encoded
 
 __all__ = ["from_bytes", "to_bytes"]
 
@@ -92,7 +92,8 @@ class _Payloads:
         if isinstance(rest, int):
             end = self._position + rest
             data, self._position = self._data[self._position : end], end
-            return decode(name, data)
+            kind = payload_type(name)
+            return Encoded(kind, data) if kind is not None and stays_encoded(kind) else decode(name, data)
         return self._interim[name](**{key: self._field(value) for key, value in rest.items()})
 
     def _field(self, value: Any) -> Any:

@@ -54,6 +54,7 @@ __all__ = [
     "order_frames",
     "plan_pieces",
     "split_frames",
+    "stays_encoded",
 ]
 
 # A smaller run is done before workers have started, and opened the log.
@@ -272,7 +273,12 @@ def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:
 def _encode_drawing(payload: Any) -> Any:
     """Encode what only viewers read: its many small parts would go to another process one by one."""
     kind = type(payload)
-    return Encoded(kind, encode(payload)) if kind in ANNOTATIONS.payloads else payload
+    return Encoded(kind, encode(payload)) if stays_encoded(kind) else payload
+
+
+def stays_encoded(kind: type) -> bool:
+    """Return whether only viewers read a type of payload: it goes encoded from a worker into the log."""
+    return kind in ANNOTATIONS.payloads
 
 
 def _messages(session: Session, run: PieceRun, piece: Piece) -> Iterator[Message]:

@@ -17,7 +17,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.messages import Event, Marker, Markers
+from ipsys_log.messages import Encoded, Event, ImageAnnotations, Marker, Markers
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import pieces
 from ipsys_log.runs.options import Request
@@ -50,6 +50,7 @@ payloads = st.one_of(
     st.builds(
         Markers, st.integers(0, 2**62), st.lists(markers, max_size=3).map(tuple), st.just(960), st.just(540)
     ),
+    st.builds(Encoded, st.just(ImageAnnotations), st.binary(max_size=9)),
     events,
     st.builds(OtherSize, events, st.text(), st.tuples(st.integers(1, 9999), st.integers(1, 9999))),
 )

@@ -8,6 +8,9 @@ of the one process use more than one core, so the same process on one core takes
 times include those of the workers. The share of the first process limits the speed with many cores: this
 process merges, encodes and writes.
 
+The limit of the machine: the pieces of the same log in one process and in two that share nothing, which have
+loaded all libraries before. Two cores of a virtual machine rarely compute twice as much as one.
+
 Latency: single frames of 1920 x 1080 in one thread, from the compressed image to the markers, in the first
 frame after a reset and in all other frames.
 """
@@ -16,23 +19,31 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import multiprocessing
 import os
 import statistics
 import tempfile
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from results import Report, command
 from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE, drawn, lengthened
 
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages.channels import MARKERS
 from ipsys_log.simulation.settings import LabSettings
+
+if TYPE_CHECKING:
+    from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan
 
 __all__ = ["measure"]
 
 _MS_PER_S = 1e3
 _ONE_CORE = "--jobs 1 on one core"
+_ALONE, _APART = "pieces, one process", "pieces, two processes"
 
 
 class _Turn(NamedTuple):
@@ -65,12 +76,82 @@ def _detection(path: Path, jobs: int, one_core: bool = False) -> Turn:
     return turn
 
 
+def _pieces(path: Path, processes: int) -> Turn:
+    """Compute the pieces of a log in processes that share nothing, and discard the results."""
+    context = multiprocessing.get_context("spawn")
+    lines = []
+    for number in range(processes):
+        line, remote = context.Pipe()
+        context.Process(target=_compute_share, args=(remote, path, number, processes), daemon=True).start()
+        lines.append(line)
+    for line in lines:
+        line.recv()
+
+    def turn(_number: int) -> None:
+        for line in lines:
+            line.send(None)
+        for line in lines:
+            line.recv()
+
+    return turn
+
+
+def _compute_share(line: Connection, path: Path, number: int, processes: int) -> None:
+    """Compute one share of the pieces of a log when the line says so."""
+    import cv2
+
+    from ipsys_log.runs.pieces import compute_piece
+
+    cv2.setNumThreads(1)
+    with Session([path]) as session:
+        plan = _detection_plan(session)
+        share = _share(plan.pieces, plan.frames, number, processes)
+        compute_piece(session, plan.run, share[-1]._replace(end_ns=share[-1].start_ns))  # loads all libraries
+        line.send(None)
+        line.recv()
+        for piece in share:
+            compute_piece(session, plan.run, piece)
+        line.send(None)
+
+
+def _detection_plan(session: Session) -> PiecePlan:
+    from ipsys_log.runs.graph import Task, plan_stage, writer_of
+    from ipsys_log.runs.options import Request
+    from ipsys_log.runs.pieces import plan_pieces
+
+    task = plan_stage(writer_of(MARKERS), session, Request().options(None), {})
+    assert isinstance(task, Task)
+    plan = plan_pieces(task, session)
+    assert plan is not None
+    return plan
+
+
+def _share(pieces: list[Piece], frames: PieceFrames, number: int, processes: int) -> list[Piece]:
+    """Return the pieces of one process; all processes have about the same number of frames."""
+    counts = {
+        piece: int(
+            (
+                (frames.places == frames.cameras.index(piece.camera))
+                & (frames.times_ns >= piece.start_ns)
+                & (frames.times_ns < piece.end_ns)
+            ).sum()
+        )
+        for piece in pieces
+    }
+    shares: list[list[Piece]] = [[] for _ in range(processes)]
+    for piece in sorted(pieces, key=lambda piece: -counts[piece]):
+        min(shares, key=lambda share: sum(counts[one] for one in share)).append(piece)
+    return shares[number]
+
+
 def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report) -> None:
     cores = len(os.sched_getaffinity(0))
     counts = sorted({1, 2, cores})
     contenders = [Contender(f"--jobs {jobs}", _detection, (path, jobs)) for jobs in counts]
     contenders.append(Contender(_ONE_CORE, _detection, (path, 1, True)))
+    contenders += [Contender(_ALONE, _pieces, (path, 1)), Contender(_APART, _pieces, (path, 2))]
     timings = race(contenders, 1, options.rounds)
+    alone, apart = timings.pop(_ALONE), timings.pop(_APART)
     turns: dict[str, _Turn] = {name: timing.kept[0] for name, timing in timings.items()}
     if len({turn.digest for turn in turns.values()}) != 1:
         raise SystemExit("jobs: the logs differ")
@@ -86,6 +167,8 @@ def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report)
         report.rows.append(Row(f"{name}: share of the first process", (share,)))
         extra = (turn.own_s + turn.workers_s) / sum(turns["--jobs 1"][:2])
         report.rows.append(Row(f"{name} / 1, by processor", (extra,)))
+    report.rows.append(ratio_row("limit: two separate processes / one", alone, apart, wall=True))
+    report.rows.append(ratio_row("two separate processes / --jobs 2", apart, timings["--jobs 2"], wall=True))
     for name, timing in timings.items():
         turn = turns[name]
         busy = (turn.own_s + turn.workers_s) / timing.wall_s[0]
@@ -95,7 +178,6 @@ def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report)
 
 
 def _latency(path: Path, report: Report) -> None:
-    from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import CALIBRATIONS, RIG
     from ipsys_log.messages.resets import Resets
     from ipsys_log.stages.detect import EDGES, Detect

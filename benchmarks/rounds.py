@@ -142,7 +142,8 @@ class _Started:
         self.name = contender.name
         context = multiprocessing.get_context("spawn")
         self._line, remote = context.Pipe()
-        self._process = context.Process(target=_serve, args=(remote, contender), daemon=True)
+        # Not a daemon, because some contenders start processes of their own; it ends with its connection.
+        self._process = context.Process(target=_serve, args=(remote, contender))
         self._process.start()
         remote.close()
         self._hear()
@@ -170,7 +171,15 @@ class _Started:
 def _serve(line: Connection, contender: Contender) -> None:
     work = contender.make(*contender.arguments)
     line.send((Spent(), None))
-    while (turn := line.recv()) != _STOP:
+    while (turn := _next_turn(line)) != _STOP:
         before = Spent.so_far()
         result = work(turn)
         line.send((Spent.so_far().minus(before), result))
+
+
+def _next_turn(line: Connection) -> int:
+    try:
+        turn: int = line.recv()
+    except EOFError:  # the process of the race has ended
+        return _STOP
+    return turn

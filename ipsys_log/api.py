@@ -16,7 +16,8 @@ from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
-from ipsys_log.log.location import LogUrl, find_logs, parse_location
+from ipsys_log.log.location import LogUrl, parse_location
+from ipsys_log.log.log_files import find_logs
 from ipsys_log.messages import CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.models.table import AppliedModel, reads_corners

@@ -15,7 +15,8 @@ from ipsys_log.analysis.ground_truth import gather_paths
 from ipsys_log.analysis.trajectory_errors import ErrorSummary, trajectory_errors
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.location import LogLocation, LogUrl, find_logs, is_one_of
+from ipsys_log.log.location import LogLocation, LogUrl, is_one_of
+from ipsys_log.log.log_files import find_logs
 from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, TRACKS, TRUTH, Channel

@@ -84,7 +84,7 @@ def annotate(parameter: StageParameter) -> Any:
 
 def _locations(texts: list[str] | None) -> list[Any]:
     """Return the logs of an argument; a pattern of a URL gives all its objects."""
-    from ipsys_log.log.location import find_logs
+    from ipsys_log.log.log_files import find_logs
 
     return find_logs(texts or ())
 

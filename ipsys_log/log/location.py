@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
@@ -17,7 +17,6 @@ __all__ = [
     "LogState",
     "LogUrl",
     "file_beside",
-    "find_logs",
     "is_one_of",
     "parse_location",
 ]
@@ -138,25 +137,6 @@ def parse_location(text: str | os.PathLike[str] | LogUrl) -> LogLocation:
     if match[2] == "://" and match[1].lower() in _LOCAL:
         return Path(unquote(text[match.end() :]))
     return LogUrl(text)
-
-
-def find_logs(texts: Iterable[str | os.PathLike[str] | LogUrl]) -> list[LogLocation]:
-    """Return the locations of logs; a URL with ``*`` or ``[`` gives all objects that match, by name.
-
-    Raises
-    ------
-    IpsysError
-        A pattern matches nothing, or its store cannot be listed.
-    """
-    found: list[LogLocation] = []
-    for location in map(parse_location, texts):
-        if isinstance(location, LogUrl) and location.is_pattern:
-            from ipsys_log.log.remote_listing import list_objects
-
-            found += list_objects(location)
-        else:
-            found.append(location)
-    return found
 
 
 def is_one_of(path: Path, logs: Sequence[LogLocation]) -> bool:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from itertools import takewhile
 from pathlib import Path, PurePath, PurePosixPath
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.location import LogLocation, LogState, LogUrl
+from ipsys_log.log.location import LogLocation, LogState, LogUrl, parse_location
 
-__all__ = ["expand_folders", "logs_below", "name_places", "read_log_state", "states_below"]
+__all__ = ["expand_folders", "find_logs", "logs_below", "name_places", "read_log_state", "states_below"]
 
 _ALL_BELOW = "**/*.mcap"
 
@@ -30,6 +31,25 @@ def read_log_state(log: LogLocation) -> LogState:
         return read_state(log)
     status = log.stat()
     return LogState(status.st_size, status.st_mtime_ns)
+
+
+def find_logs(texts: Iterable[str | os.PathLike[str] | LogUrl]) -> list[LogLocation]:
+    """Return the locations of logs; a URL with ``*`` or ``[`` gives all objects that match, by name.
+
+    Raises
+    ------
+    IpsysError
+        A pattern matches nothing, or its store cannot be listed.
+    """
+    found: list[LogLocation] = []
+    for location in map(parse_location, texts):
+        if isinstance(location, LogUrl) and location.is_pattern:
+            from ipsys_log.log.remote_listing import list_objects
+
+            found += list_objects(location)
+        else:
+            found.append(location)
+    return found
 
 
 def expand_folders(logs: Iterable[LogLocation]) -> list[LogLocation]:

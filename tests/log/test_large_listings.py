@@ -13,7 +13,8 @@ import pytest
 from ipsys_log.catalogue import table
 from ipsys_log.catalogue.row import Baseline
 from ipsys_log.catalogue.table import CatalogueUpdate, update_catalogue
-from ipsys_log.log.location import LogLocation, find_logs, parse_location
+from ipsys_log.log.location import LogLocation, parse_location
+from ipsys_log.log.log_files import find_logs
 
 # The import of the server takes seconds; s3fs closes its connections after the test.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]

@@ -10,8 +10,8 @@ import pytest
 import ipsys_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.log import remote_object
-from ipsys_log.log.location import find_logs, parse_location
-from ipsys_log.log.log_files import states_below
+from ipsys_log.log.location import parse_location
+from ipsys_log.log.log_files import find_logs, states_below
 from ipsys_log.log.remote_object import open_object
 from tests.conftest import ROOT, Ipsys
 from tests.s3_server import put

@@ -20,6 +20,7 @@ from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ClockEstimate, CompressedImage, Event, Message, RigCamera, image_topic
 from ipsys_log.runs.output import write_message
 from tests.ports import free_port
+from tests.waiting import wait_until
 
 __all__ = ["Feed", "Received", "ShiftedClock", "make_certificates", "receiving", "sending"]
 
@@ -101,18 +102,15 @@ class Received:
     estimates: list[ClockEstimate] = field(default_factory=list)
     errors: list[Exception] = field(default_factory=list)
 
-    def wait_for(self, condition: Callable[[Received], object]) -> None:
+    def wait_until(self, condition: Callable[[Received], object], name: str) -> None:
         """Wait until a condition holds."""
-        pause = Flag()
-        for _ in range(round(PATIENCE_S / 0.02)):
-            if condition(self):
-                return
-            pause.wait(0.02)
-        raise TimeoutError(f"{len(self.frames)} frames, {self.events}, {self.errors}")
+        wait_until(
+            lambda: condition(self), name, lambda: f"{len(self.frames)} frames, {self.events}, {self.errors}"
+        )
 
     def wait_for_data(self, data: list[bytes]) -> None:
         """Wait until frames with these bytes have arrived."""
-        self.wait_for(lambda now: set(data) <= {frame.data for frame in now.frames})
+        self.wait_until(lambda now: set(data) <= {frame.data for frame in now.frames}, "the frames arrive")
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.events]

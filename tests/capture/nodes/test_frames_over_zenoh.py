@@ -90,14 +90,14 @@ def test_frames_of_a_cut_network_arrive_later(
         made = feed.record(10)
         received.wait_for_data(made)
         relay.cut(closes)
-        received.wait_for(lambda now: now.errors)  # the node does not answer
+        received.wait_until(lambda now: now.errors, "the node does not answer")
         assert "camera red: its node does not answer" in str(received.errors[0])
         made += feed.record(60)
         relay.mend()
         made += feed.record(5)
         received.wait_for_data(made)
         assert sorted(frame.data for frame in received.frames) == sorted(made)
-        received.wait_for(lambda now: now.kinds()[-1:] == ["node_gap_filled"])
+        received.wait_until(lambda now: now.kinds()[-1:] == ["node_gap_filled"], "the gap is filled")
         assert received.kinds()[0] == "node_answers"
         assert set(received.kinds()[1:]) == {"node_gap", "node_gap_filled"}
         assert feed.node.finish(has_ended=True) == 0
@@ -113,7 +113,7 @@ def test_node_that_starts_again_sends_its_new_session(tmp_path: Path) -> None:
             received.wait_for_data(made)
         with sending(tmp_path, network, clock=ShiftedClock(Clock(), -HOUR_NS)) as feed:
             again = feed.record(4)
-            received.wait_for(lambda now: len(now.frames) == 7)
+            received.wait_until(lambda now: len(now.frames) == 7, "7 frames arrive")
             assert sorted(frame.data for frame in received.frames[:3]) == made
             assert sorted(frame.data for frame in received.frames[3:]) == sorted(again)
             assert "node_restarted" in received.kinds()
@@ -147,7 +147,7 @@ def test_certificates_limit_each_node_to_its_own_camera(tmp_path: Path) -> None:
                     foreign.put(frames_key(name), data, attachment=header.encode())
                 return b"own" in {frame.data for frame in now.frames}
 
-            from_white.wait_for(is_through)
+            from_white.wait_until(is_through, "a frame of the foreign session arrives")
             later = red.record(3)
             from_red.wait_for_data(later)
             assert sorted(frame.data for frame in from_red.frames) == sorted(made_red + later)
@@ -202,7 +202,10 @@ def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path)
         sending(tmp_path, network),
         receiving(centre) as received,
     ):
-        received.wait_for(lambda now: any("two nodes send as camera red" in str(e) for e in now.errors))
+        received.wait_until(
+            lambda now: any("two nodes send as camera red" in str(e) for e in now.errors),
+            "the second node is refused",
+        )
 
 
 @pytest.mark.slow

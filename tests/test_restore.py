@@ -26,7 +26,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_message
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
-from tests.conftest import Ipsys, small_disk
+from tests.conftest import Ipsys, fill_disk, small_disk
 from tests.live_recordings import go_live, slow
 from tests.tiers import first_fast
 from tests.waiting import wait_until
@@ -272,9 +272,11 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
     calibration: Path,
     tmp_path: Path,
 ) -> None:
-    with small_disk(tmp_path / "disk", 12) as disk:
+    with small_disk(tmp_path / "disk", 1000) as disk:
         log = disk / "a.mcap"
         with going_live(rig, calibration, log, 10_000) as program:
+            wait_for_markers(log, tmp_path / "copy.mcap")
+            fill_disk(disk)
             out, err = program.communicate(timeout=LIMIT_S)
         verified, replayed = ipsys("verify", log), ipsys("replay", log, "--as-live")
         assert equal(log)

@@ -94,6 +94,7 @@ class Node:
         # The channel of the sent messages, after the first one.
         self._channel: GrowingChannel | None = None
         self._session: Any = None
+        self._sent_name = "the markers" if sends_markers else "the frames"
         self._count = self._received = 0
         self._has_ended = self._has_other_version = self._is_refused = False
         # The last request of a centre, the last one for this session, and the first one for another session.
@@ -123,8 +124,8 @@ class Node:
             thread.start()
         if reason is not None:
             self._say(
-                f"centre {self._network} does not answer ({reason}); the node records, and sends the frames "
-                "to a centre that starts later"
+                f"centre {self._network} does not answer ({reason}); the node records, and sends "
+                f"{self._sent_name} to a centre that starts later"
             )
         return self
 
@@ -182,6 +183,16 @@ class Node:
                 break
         return self._count - self._received
 
+    def describe_missing(self, count: int, log: Path) -> str:
+        """Return a line about the frames, or their markers, that the centre does not have.
+
+        Parameters
+        ----------
+        log : the present path of the log, which may have been renamed.
+        """
+        missing = f"{count} frames" if self._sent[0] is not Markers else f"the markers of {count} frames"
+        return f"the centre {self._network} does not have {missing} of camera {self._camera}; {log} has all"
+
     def _send_all(self) -> None:
         import zenoh
 
@@ -224,7 +235,7 @@ class Node:
         self._asked_ns = now_ns
         if request.session == self.session_name:
             if self._accepted_ns is None:
-                self._say(f"the centre {self._network} receives the frames of camera {self._camera}")
+                self._say(f"the centre {self._network} receives {self._sent_name} of camera {self._camera}")
             self._received, self._accepted_ns, self._other_ns = request.received, now_ns, None
         elif request.session:
             self._note_other(now_ns)

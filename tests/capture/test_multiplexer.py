@@ -17,7 +17,7 @@ import simplejpeg
 
 from ipsys_log.capture import multiplexer as attached_module
 from ipsys_log.capture.camera_thread import CameraState, imported_run
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError
+from ipsys_log.capture.frames import Clock, Frame, NodeRefusedError, Open, Say, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing
@@ -214,6 +214,29 @@ def test_lost_camera_is_retried_while_others_continue(monkeypatch: pytest.Monkey
     assert len(data_of(found, "white")) == 45
     first_s, second_s = pauses_s
     assert second_s > first_s > 0
+
+
+def test_refused_node_of_a_lost_camera_is_reported_once() -> None:
+    """The node ends, and is started again with another version: the first error does not name it."""
+    silence, refusal = "camera red: its node does not answer", "camera red: its node has ipsys 0.2.0 now"
+    errors = [SourceError(silence), NodeRefusedError(refusal), NodeRefusedError(refusal)]
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            if len(errors) in (0, 3):
+                yield Frame(b"x", "jpeg", clock.now_ns())
+            if errors:
+                raise errors.pop(0)
+
+        yield sent()
+
+    found = events(messages(LiveCameras(cameras("red"), opened, Clock())))
+    assert [(event.kind, event.text) for event in found[:2]] == [
+        ("camera_lost", f"{silence}; ipsys tries again"),
+        ("node_refused", refusal),
+    ]
+    assert [event.kind for event in found[2:]] == ["camera_back"]
 
 
 def changing(*visits: list[Frame]) -> Open:

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from ipsys_log.capture.frames import Clock, Frame, SourceMessage
+from ipsys_log.capture.frames import Clock, Frame, Say, SourceMessage
 from ipsys_log.capture.nodes.centre import Centre
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
@@ -82,13 +82,14 @@ def sending(
     camera: str = "red",
     clock: Clock | None = None,
     version: str = "0.1.0",
+    say: Say = lambda text: None,
 ) -> Iterator[Feed]:
     """Open a node whose frames the test makes."""
     clock = clock or Clock()
     path = folder / f"{camera}_{free_port()}.mcap"
     with (
         LogWriter.create(path) as log,
-        Node(camera, network, version, path, clock, lambda text: None) as node,
+        Node(camera, network, version, path, clock, say) as node,
     ):
         yield Feed(node, log, camera, clock)
 

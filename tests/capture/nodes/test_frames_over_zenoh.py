@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from tests.capture.nodes.lab_of_nodes import (
 )
 from tests.capture.nodes.tcp_relay import Relay
 from tests.ports import free_port
+from tests.waiting import wait_until
 
 HOUR_NS = 3600 * 1_000_000_000
 
@@ -240,6 +242,42 @@ def test_centre_without_a_node_names_the_command(monkeypatch: pytest.MonkeyPatch
         centre.open(cameras()[0], Clock(), lambda text: None) as items,
     ):
         first_of(items)
+
+
+@pytest.mark.slow
+def test_foreign_authority_is_named_by_centre_and_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The node starts before the centre: neither of them sees the certificate of the other at its start."""
+    monkeypatch.setattr("ipsys_log.capture.nodes.centre._FIRST_ANSWER_S", 0.5)
+    monkeypatch.setattr("ipsys_log.capture.nodes.node._CHECK_NS", 1)
+    own, foreign = (make_certificates(tmp_path / name, "127.0.0.1", "red") for name in ("own", "foreign"))
+    network, said = NodeNetwork("127.0.0.1", free_port(), own), list[str]()
+    with (
+        sending(tmp_path, replace(network, certificates=foreign), say=said.append),
+        Centre(cameras(), network, "0.1.0") as centre,
+    ):
+        with (
+            pytest.raises(SourceError, match=r"no node red answers at 127\.0\.0\.1:\d+;") as error,
+            centre.open(cameras()[0], Clock(), lambda text: None) as items,
+        ):
+            first_of(items)
+        check = f"check that the authority.pem of its host is the same file as {own}/authority.pem"
+        assert f"If it runs there, {check}" in str(error.value)
+        refusal = (
+            f"centre {network}: its certificate is not of the authority in {foreign}/authority.pem; copy "
+            "authority.pem, red.pem, red.key of the centre's authority to this host"
+        )
+        wait_until(lambda: any(line.startswith(refusal) for line in said), "the node refuses", lambda: said)
+        with pytest.raises(IpsysError) as refused_start:
+            sending(tmp_path, replace(network, certificates=foreign)).__enter__()
+        assert str(refused_start.value) == refusal
+        with receiving(centre) as received:
+            with sending(tmp_path, network):
+                received.wait_until(lambda now: "node_answers" in now.kinds(), "the node answers")
+            received.wait_until(lambda now: "does not answer" in str(now.errors), "the node is missed")
+        assert f"If it was started again, {check}" in str(received.errors[-1])
+    assert sum(line.startswith(refusal) for line in said) == 1
 
 
 def test_port_in_use_and_foreign_address_are_refused() -> None:

@@ -39,6 +39,7 @@ from tests.capture.streams import encode
 from tests.live_recordings import record_every_frame
 from tests.s3_server import open_bucket, serve_s3
 from tests.shared_files import make_once
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 # The command line installs handlers for these signals; a test restores them.
@@ -86,6 +87,18 @@ def small_disk(at: Path, megabytes: int) -> Iterator[Path]:
         yield at
     finally:
         subprocess.run(["umount", str(at)], check=True)
+
+
+def fill_disk(at: Path) -> None:
+    """Shrink a small disk to its content and 1 MB, while other programs may write to it."""
+
+    def shrink() -> bool:
+        size = shutil.disk_usage(at).used + (1 << 20)
+        mount = ["mount", "-o", f"remount,size={size}", str(at)]
+        # It fails if the content has become larger meanwhile.
+        return subprocess.run(mount, capture_output=True, check=False).returncode == 0
+
+    wait_until(shrink, f"{at} is almost full", lambda: shutil.disk_usage(at))
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,9 +23,9 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from tests.capture.streams import encode, serve
-from tests.playing import WAIT_LIMIT_S
 from tests.ports import free_port
 from tests.tiers import first_fast
+from tests.waiting import wait_until
 
 H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")
 H265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=20:bframes=0:log-level=none")
@@ -48,10 +47,10 @@ def streamed(lab: Path, folder: Path, *options: str) -> Iterator[str]:
 
 def wait_for_frames(attached: LiveCameras, count: int) -> None:
     """Wait until a camera has sent a number of frames, or is stopped."""
-    end_s = time.monotonic() + WAIT_LIMIT_S
-    while attached.states["red"].frames < count and not attached.is_stopped:
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
+    state = attached.states["red"]
+    wait_until(
+        lambda: state.frames >= count or attached.is_stopped, f"red has sent {count} frames", lambda: state
+    )
 
 
 Machine = Callable[[pytest.MonkeyPatch, LiveCameras], None]

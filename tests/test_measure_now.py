@@ -28,6 +28,7 @@ from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import foreign_read
 from tests.tiers import first_fast
+from tests.waiting import wait_until
 
 PATIENCE_S = 240.0
 RATE_HZ = 10
@@ -125,10 +126,7 @@ def measuring(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Page
             assert line, said
             said += line
         page = Page(said.rpartition("measure at ")[2].strip())
-        end = time.monotonic() + PATIENCE_S
-        while len(page.ask("views")["visible"]) < 3:
-            assert time.monotonic() < end
-            time.sleep(0.1)
+        wait_until(lambda: len(page.ask("views")["visible"]) >= 3, "three markers are visible")
         time.sleep(1.2)
         yield program, page
         if program.poll() is None:

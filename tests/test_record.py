@@ -25,6 +25,7 @@ from tests.capture.streams import encode, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
 from tests.ports import free_port
 from tests.tiers import first_fast
+from tests.waiting import wait_until
 
 NAMES = ("red", "white", "black")
 # a limit far above any duration on a busy machine
@@ -66,10 +67,7 @@ def started(*arguments: object, err: IO[str] | int = subprocess.PIPE) -> subproc
 
 
 def wait_for(log: Path, size: int) -> None:
-    until = time.monotonic() + LIMIT_S
-    while not log.exists() or log.stat().st_size < size:
-        assert time.monotonic() < until, "nothing is recorded"
-        time.sleep(0.05)
+    wait_until(lambda: log.exists() and log.stat().st_size >= size, f"{log} has {size} bytes")
 
 
 def frames(log: Path) -> dict[str, list[bytes]]:
@@ -356,10 +354,11 @@ def test_recorder_that_stood_still_names_its_late_frames(
             time.sleep(0.05)
         program.send_signal(signal.SIGCONT)
         wait_for(log, size + 2_000_000)
-        until = time.monotonic() + LIMIT_S
-        while said.read_text().count("arrive in time again") < len(NAMES):
-            assert time.monotonic() < until, said.read_text()
-            time.sleep(0.05)
+        wait_until(
+            lambda: said.read_text().count("arrive in time again") == len(NAMES),
+            "the frames of all cameras arrive in time again",
+            said.read_text,
+        )
         program.send_signal(signal.SIGINT)
         program.communicate(timeout=LIMIT_S)
     err = said.read_text()

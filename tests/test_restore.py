@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,9 +26,10 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_message
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
-from tests.conftest import Ipsys, small_disk
+from tests.conftest import Ipsys, fill_disk, small_disk
 from tests.live_recordings import go_live, slow
 from tests.tiers import first_fast
+from tests.waiting import wait_until
 
 # a limit far above any duration on a busy machine
 LIMIT_S = 240
@@ -68,11 +68,9 @@ def going_live(rig: Path, model: Path, log: Path, size: int) -> Iterator[subproc
         text=True,
     )
     try:
-        until = time.monotonic() + LIMIT_S
-        while not log.exists() or log.stat().st_size < size:
-            assert time.monotonic() < until, "nothing is recorded"
-            assert program.poll() is None, program.communicate()
-            time.sleep(0.05)
+        wait_until(
+            lambda: log.exists() and log.stat().st_size >= size, f"{log} has {size} bytes", programs=[program]
+        )
         yield program
     finally:
         program.kill()
@@ -81,16 +79,15 @@ def going_live(rig: Path, model: Path, log: Path, size: int) -> Iterator[subproc
 
 def wait_for_markers(log: Path, copy: Path) -> None:
     """Wait until the log that is being recorded has markers of each camera."""
-    until = time.monotonic() + LIMIT_S
-    while True:
+
+    def has_markers() -> bool:
         shutil.copy(log, copy)
         repair(copy)
         with Session([copy]) as session:
             counts = [session.count(f"/runs/edges/cameras/{camera}/markers") for camera in session.images]
-        if counts and all(counts):
-            return
-        assert time.monotonic() < until, counts
-        time.sleep(0.2)
+        return bool(counts) and all(counts)
+
+    wait_until(has_markers, "the log has markers of each camera")
 
 
 def equal(log: Path) -> bool:
@@ -275,9 +272,11 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
     calibration: Path,
     tmp_path: Path,
 ) -> None:
-    with small_disk(tmp_path / "disk", 12) as disk:
+    with small_disk(tmp_path / "disk", 1000) as disk:
         log = disk / "a.mcap"
         with going_live(rig, calibration, log, 10_000) as program:
+            wait_for_markers(log, tmp_path / "copy.mcap")
+            fill_disk(disk)
             out, err = program.communicate(timeout=LIMIT_S)
         verified, replayed = ipsys("verify", log), ipsys("replay", log, "--as-live")
         assert equal(log)

@@ -7,7 +7,16 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage, mid_exposure_ns
+from ipsys_log.capture.frames import (
+    Clock,
+    Frame,
+    NodeRefusedError,
+    Open,
+    Say,
+    SourceError,
+    SourceMessage,
+    mid_exposure_ns,
+)
 from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
@@ -17,7 +26,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.events import NODE_AWAITED
+from ipsys_log.messages.events import NODE_AWAITED, NODE_REFUSED
 from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
@@ -120,6 +129,7 @@ class CameraReader:
         self.camera, self._shared = camera, shared
         self._is_open, self._has_first_frame = threading.Event(), threading.Event()
         self._lost_ns: int | None = None
+        self._lost_text = ""
         self._dropped_before = self._missed_before = self._missed_named_ns = 0
         self._said: set[str] = set()
         self._broken = False
@@ -204,6 +214,13 @@ class CameraReader:
             if self.state.up:
                 self.state.up, self._lost_ns = False, shared.clock.now_ns()
                 self._say("camera_lost", f"{error}; ipsys tries again")
+            elif (
+                isinstance(error, NodeRefusedError)
+                and self._lost_ns is not None
+                and str(error) != self._lost_text
+            ):
+                self._say(NODE_REFUSED, str(error))
+            self._lost_text = str(error)
             return error
         return None
 

@@ -30,6 +30,10 @@ class SourceError(IpsysError):
     """An error of a camera that cannot be opened, or that is disconnected; the camera may come back."""
 
 
+class NodeRefusedError(SourceError):
+    """An error of a node that answers, but whose frames are not recorded until a user changes it."""
+
+
 class AccessRefusedError(SourceError):
     """An error of a camera that needs a user and a password, or refuses the present ones."""
 

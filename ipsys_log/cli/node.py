@@ -125,6 +125,4 @@ def _send(
             pipeline.record(cameras, settings, target, [status, sender], force)
         left = sender.finish(not cameras.is_stopped)
     if left:
-        missing = f"{left} frames of camera {camera}"
-        text = f"the centre {network} does not have {missing}; {status.log} has all frames"
-        remarks.print(text, style="yellow", markup=False)
+        remarks.print(sender.describe_missing(left, status.log), style="yellow", markup=False)

@@ -12,6 +12,7 @@ __all__ = [
     "MARK",
     "NODE_ANSWERS",
     "NODE_AWAITED",
+    "NODE_REFUSED",
     "OPERATOR_KINDS",
     "SEGMENT_ENDED",
     "SEGMENT_STARTED",
@@ -28,6 +29,8 @@ STAMP_UNRELIABLE = "stamp_unreliable"
 CAMERA_MOVED = "camera_moved"
 # The kinds of events for the first answers of the node of a camera, and for a long wait for them.
 NODE_ANSWERS, NODE_AWAITED = "node_answers", "node_awaited"
+# The kind of an event for a node whose frames are not recorded: a second one, or one of another version.
+NODE_REFUSED = "node_refused"
 # The kinds of events of an operator: a remark at an instant, and the start and the end of a named segment.
 MARK, SEGMENT_STARTED, SEGMENT_ENDED = "mark", "segment_started", "segment_ended"
 OPERATOR_KINDS = frozenset((MARK, SEGMENT_STARTED, SEGMENT_ENDED))

@@ -10,12 +10,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ipsys_log.batch.log_work import replay_log
 from ipsys_log.batch.tasks import LogResult
+from tests.waiting import wait_until
 
 # A generous limit: a wait ends with an event.
 PATIENCE_S = 1800.0
@@ -25,22 +26,20 @@ HELD = "held.mcap"
 
 def wait_for(path: Path) -> None:
     """Wait until a file exists and has a content."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not (path.exists() and path.read_text()):
-        assert time.monotonic() < end_s, f"{path} did not appear"
-        time.sleep(0.05)
+    wait_until(lambda: path.exists() and path.read_text(), f"{path} has a content")
 
 
 def read_json(path: Path) -> Any:
     """Wait until another program has written a complete JSON file; return its content."""
-    end_s = time.monotonic() + PATIENCE_S
-    while True:
-        wait_for(path)
-        try:
-            return json.loads(path.read_text())
-        except ValueError:  # the other program still writes
-            assert time.monotonic() < end_s, f"{path} is not complete"
-            time.sleep(0.05)
+    read: list[Any] = []
+
+    def is_complete() -> bool:
+        with suppress(FileNotFoundError, ValueError):  # the other program has not written it all
+            read.append(json.loads(path.read_text()))
+        return bool(read)
+
+    wait_until(is_complete, f"{path} is complete")
+    return read[0]
 
 
 @contextmanager

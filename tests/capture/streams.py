@@ -8,7 +8,6 @@ import socketserver
 import struct
 import subprocess
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 import simplejpeg
+
+from tests.waiting import wait_until
 
 __all__ = ["encode", "ffmpeg", "make_jpegs", "serve", "serve_rtsp"]
 
@@ -70,14 +71,12 @@ def serve(*options: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
 def _await_listening(port: int, program: subprocess.Popen[bytes]) -> None:
     """Check the port without a connection, because FFmpeg accepts only one client."""
     local = f"0100007F:{port:04X}"
-    until = time.monotonic() + _LIMIT_S
-    while time.monotonic() < until:
+
+    def is_listening() -> bool:
         rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-        if any(row[1] == local and row[3] == "0A" for row in rows):  # 0A means that it listens
-            return
-        assert program.poll() is None, f"FFmpeg has ended before it listens at port {port}"
-        time.sleep(0.02)
-    raise TimeoutError(f"nothing listens at port {port}")
+        return any(row[1] == local and row[3] == "0A" for row in rows)  # 0A means that it listens
+
+    wait_until(is_listening, f"FFmpeg listens at port {port}", programs=[program])
 
 
 @contextmanager
@@ -95,11 +94,11 @@ def serve_rtsp(video: Path, clock_shift_s: float = 0.0) -> Iterator[str]:
         command = [ffmpeg(), "-v", "quiet", "-nostdin", *loop, "-f", "rtp", "-sdp_file", str(sdp), target]
         program = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            until = time.monotonic() + _LIMIT_S
-            while not (sdp.exists() and sdp.read_text().endswith("\n") and "m=" in sdp.read_text()):
-                assert time.monotonic() < until, "FFmpeg describes no stream"
-                assert program.poll() is None, "FFmpeg has ended"
-                time.sleep(0.02)
+            wait_until(
+                lambda: sdp.exists() and sdp.read_text().endswith("\n") and "m=" in sdp.read_text(),
+                "FFmpeg describes its stream",
+                programs=[program],
+            )
             server = _RtspServer(("127.0.0.1", 0), _RtspClient)
             server.sdp = sdp.read_text().replace(f"m=video {ports[0]}", "m=video 0")
             server.sockets, server.shift_s = (rtp, rtcp), clock_shift_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -17,10 +17,11 @@ import simplejpeg
 
 from ipsys_log.capture import multiplexer as attached_module
 from ipsys_log.capture.camera_thread import CameraState, imported_run
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError
+from ipsys_log.capture.frames import Clock, Frame, NodeRefusedError, Open, Say, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing
+from tests.waiting import wait_until
 
 # A limit far above any duration on a busy machine.
 LIMIT_S = 240.0
@@ -36,13 +37,6 @@ def events(found: list[Message]) -> list[Event]:
     """Return the events, without those of a busy machine that pauses this program."""
     payloads = [message.payload for message in found if isinstance(message.payload, Event)]
     return [event for event in payloads if event.kind != STAMP_UNRELIABLE]
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not true():
-        assert time.monotonic() < end_s, "nothing happens"
-        time.sleep(0.005)
 
 
 class Standing(Clock):
@@ -125,7 +119,7 @@ def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
 
     attached = LiveCameras(cameras("red"), playing(FRAMES, 200.0, False, before), clock)
     with attached:
-        wait_until(lambda: attached.states["red"].frames == 20)
+        wait_until(lambda: attached.states["red"].frames == 20, "red has sent 20 frames")
         taken_ns = clock.now_ns()
         frames = [message for message in attached if message is not None and message.camera == "red"]
     assert len(frames) == 20
@@ -220,6 +214,29 @@ def test_lost_camera_is_retried_while_others_continue(monkeypatch: pytest.Monkey
     assert len(data_of(found, "white")) == 45
     first_s, second_s = pauses_s
     assert second_s > first_s > 0
+
+
+def test_refused_node_of_a_lost_camera_is_reported_once() -> None:
+    """The node ends, and is started again with another version: the first error does not name it."""
+    silence, refusal = "camera red: its node does not answer", "camera red: its node has ipsys 0.2.0 now"
+    errors = [SourceError(silence), NodeRefusedError(refusal), NodeRefusedError(refusal)]
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            if len(errors) in (0, 3):
+                yield Frame(b"x", "jpeg", clock.now_ns())
+            if errors:
+                raise errors.pop(0)
+
+        yield sent()
+
+    found = events(messages(LiveCameras(cameras("red"), opened, Clock())))
+    assert [(event.kind, event.text) for event in found[:2]] == [
+        ("camera_lost", f"{silence}; ipsys tries again"),
+        ("node_refused", refusal),
+    ]
+    assert [event.kind for event in found[2:]] == ["camera_back"]
 
 
 def changing(*visits: list[Frame]) -> Open:
@@ -362,7 +379,7 @@ def test_frames_dropped_at_the_end_are_reported() -> None:
     frames = {"red": [bytes(1000)] * 40}
     attached = LiveCameras(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
     with attached:
-        wait_until(lambda: attached.states["red"].dropped > 0)
+        wait_until(lambda: attached.states["red"].dropped > 0, "a frame is dropped")
         attached.stop()
         found = [message for message in attached if message is not None]
     (event,) = events(found)
@@ -376,7 +393,7 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
         def sent() -> Iterator[Frame | None]:
             if camera.name == "late":
-                wait_until(lambda: attached.states["early"].frames > 0)
+                wait_until(lambda: attached.states["early"].frames > 0, "the early camera sends")
                 time.sleep(0.3)
                 waiting.append(attached.states["early"].frames)
             for n in range(5):
@@ -439,7 +456,7 @@ def test_frames_before_an_error_are_delivered() -> None:
         if camera == "red" and number == 5:
             raise ZeroDivisionError("a bug")
         if camera == "white" and number == 10:
-            wait_until(lambda: bool(said))
+            wait_until(lambda: said, "the end of red is reported")
 
     found: list[Message] = []
     said: list[str] = []

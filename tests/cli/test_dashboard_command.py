@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from tests.conftest import Ipsys
 from tests.playing import WAIT_LIMIT_S
 from tests.test_bad_input import refused
 from tests.test_extras import CAMERA, RIG
+from tests.waiting import wait_until
 from tests.web.test_access import Caller
 from tests.web.test_dashboard_page import cookie_of, post
 
@@ -79,10 +79,9 @@ def test_addresses_to_view_and_to_operate_are_printed(folder: Path) -> None:
             caller, cookie = Caller(operate), cookie_of(operate)
             assert json.loads(caller.ask("GET", "/api/scene", **cookie_of(view))[1])["may_operate"] is False
             number = post(caller, "/api/operate", {}, **cookie)[1]["operator"]
-            end_s = time.monotonic() + WAIT_LIMIT_S
+            mark = {"operator": number, "text": "pushed"}
             # A request before the first frame is refused; the cameras are opened before the page is served.
-            while post(caller, "/api/mark", {"operator": number, "text": "pushed"}, **cookie)[0] != 200:
-                assert time.monotonic() < end_s
+            wait_until(lambda: post(caller, "/api/mark", mark, **cookie)[0] == 200, "a mark is accepted")
             assert any("mark: pushed" in line for line in lines_of(program, "mark: pushed"))
             program.send_signal(signal.SIGTERM)
             out, err = program.communicate(timeout=WAIT_LIMIT_S)

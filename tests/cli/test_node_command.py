@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -93,6 +94,20 @@ def test_both_logs_have_the_same_frames(tmp_path: Path, with_certificates: bool,
     assert set(at_centre.values()) <= set(at_node.values())
     with Session([tmp_path / "centre.mcap"]) as session:
         assert session.payloads(["/cameras/red/clock"])[0].camera == "red"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("detects", [False, True])
+def test_node_without_a_centre_says_what_was_not_sent(
+    tmp_path: Path, lab_log: Path, detects: bool, ipsys: Ipsys
+) -> None:
+    port, log = write_rigs(tmp_path, "sim:red?stations=0"), tmp_path / "red.mcap"
+    options = ("--detect", "--calibration", lab_log) if detects else ()
+    done = ipsys("node", tmp_path / "node.toml", "--camera", "red", "-o", log, "--seconds", 1, *options)
+    assert done.code == 0, done.err
+    missing = rf"{'the markers of ' if detects else ''}\d+ frames of camera red"
+    line = rf"the centre 127\.0\.0\.1:{port} does not have {missing}; {log} has all"
+    assert re.search(line, " ".join(done.err.split()))
 
 
 def markers_at_node(log: Path, run: str) -> list[bytes]:

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from ipsys_log.simulation.settings import LabSettings
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused
+from tests.waiting import wait_until
 
 LIMIT_S = 240.0
 PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
@@ -229,10 +229,10 @@ def interrupted_when(command: list[object], ready: Callable[[], bool]) -> tuple[
         stdout=side,
         text=True,
     )
-    end_s = time.monotonic() + LIMIT_S
-    while not ready() and program.poll() is None and time.monotonic() < end_s:
-        time.sleep(0.02)
-    program.send_signal(signal.SIGINT)
+    try:
+        wait_until(lambda: ready() or program.poll() is not None, "the command has reached its output")
+    finally:
+        program.send_signal(signal.SIGINT)
     _, err = program.communicate(timeout=LIMIT_S)
     os.close(main)
     os.close(side)

@@ -21,7 +21,7 @@ from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import example
 from tests.ports import free_port
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
-from tests.sinks.zenoh_listener import wait_for
+from tests.waiting import wait_until
 
 receivers: Any = example("ros2_positions")
 STORE = get_typestore(Stores.LATEST)
@@ -86,7 +86,7 @@ def test_relay_passes_only_what_it_is_told_to() -> None:
         closing(receivers.Ros2Positions(("127.0.0.1", port), "ada")) as robot,
     ):
         stream.consume(iter([tracks(n, track("ada", 1.0 + n), track("bob", 9.0)) for n in range(3)]))
-        wait_for(lambda: len(arrived) == 3)
+        wait_until(lambda: len(arrived) == 3, "three poses arrive", lambda: len(arrived))
         for data in arrived[1:]:
             send(data)
         while robot.count < 2:

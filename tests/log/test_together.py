@@ -22,18 +22,12 @@ from ipsys_log.log.repair import repair
 from ipsys_log.log.summary import load_contents
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
+from tests.waiting import wait_until
 
 PER_SESSION = 5
 LIMIT_S = 240.0
 FIRST: list[Row] = [("/image/a", k, k, bytes(4000)) for k in range(10)]
 SCRIPT = Path(__file__).with_name("write_forever.py")
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
 
 
 def session(number: int) -> list[Row]:
@@ -81,8 +75,8 @@ def test_readers_during_appends(tmp_path: Path) -> None:
     for number in range(40):
         append(path, session(number))
         if number == 20:
-            wait_until(lambda: seen or faults)
-    wait_until(lambda: seen[-1] == 40 or faults)
+            wait_until(lambda: seen or faults, "a reader has read the log")
+    wait_until(lambda: seen[-1] == 40 or faults, "a reader has read 40 sessions", lambda: seen[-1])
     done.set()
     for reader in readers:
         reader.join()

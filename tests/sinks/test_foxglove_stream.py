@@ -37,7 +37,7 @@ from ipsys_log.sinks.streams.poses import NewSession
 from tests.node_packages import install
 from tests.sinks.open_sockets import exposed, open_sockets
 from tests.sinks.streaming import RIG, START_NS, STEP_NS, TOPIC, tracks
-from tests.sinks.zenoh_listener import wait_for
+from tests.waiting import wait_until
 
 SECRET = "the-secret"
 _LIMIT_S = 240.0
@@ -70,6 +70,14 @@ def subscribed(client: ClientConnection, *channels: int) -> dict[str, Any]:
     return dict(info)
 
 
+def wait_for_subscription(stream: FoxgloveStream) -> None:
+    """Wait until a client has subscribed to channel 1."""
+    wait_until(
+        lambda: any(one.subscriptions.number_of(1) is not None for one in stream._clients),
+        "a client has subscribed to channel 1",
+    )
+
+
 def decode(channel: Any, data: bytes) -> Any:
     """Decode a message with the schema that the server announced."""
     files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))
@@ -94,8 +102,8 @@ def test_client_of_foxglove_gets_poses(node_home: Path, subprotocol: str) -> Non
         address = stream.describe().split()[-1]
         command = ["node", script, str(node_home), address, subprotocol, "4", "https://app.foxglove.dev"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as client:
-            wait_for(lambda: stream.client_count)
-            wait_for(lambda: any(one.subscriptions.number_of(1) is not None for one in stream._clients))
+            wait_until(lambda: stream.client_count, "a client is connected")
+            wait_for_subscription(stream)
             stream.consume(iter([tracks(n) for n in range(1, 5)]))
             text, _ = client.communicate(timeout=_LIMIT_S)
     rows = [json.loads(line) for line in text.splitlines()]
@@ -117,7 +125,7 @@ def test_messages_have_the_form_of_the_sdk() -> None:
         with opened(stream) as client:
             ours = [json.loads(client.recv(_LIMIT_S)) for _ in range(2)]
             client.send('{"op":"subscribe","subscriptions":[{"id":9,"channelId":1}]}')
-            wait_for(lambda: any(one.subscriptions.number_of(1) for one in stream._clients))
+            wait_for_subscription(stream)
             stream.consume(iter([tracks(1)]))
             data = client.recv(_LIMIT_S)
     theirs = messages_of_sdk(data[13:])
@@ -141,7 +149,7 @@ def messages_of_sdk(payload: Any) -> list[Any]:
             number = rows[1]["channels"][0]["id"]
             row = {"op": "subscribe", "subscriptions": [{"id": 9, "channelId": number}]}
             client.send(json.dumps(row))
-            wait_for(channel.has_sinks)
+            wait_until(channel.has_sinks, "the client of the SDK has subscribed")
             channel.log(payload, log_time=1)
             return [*rows, client.recv(_LIMIT_S)]
     finally:
@@ -169,7 +177,7 @@ def test_session_of_a_replay_begins_at_its_time() -> None:
     begin = Message("", START_NS - 5, START_NS - 5, NewSession(8))
     with streaming(is_replayed=True) as (stream, _), opened(stream) as client:
         subscribed(client)
-        wait_for(lambda: stream.client_count)
+        wait_until(lambda: stream.client_count, "a client is connected")
         stream.consume(iter([tracks(0), begin]))
         times = [client.recv(_LIMIT_S) for _ in range(2)]
     assert times == [struct.pack("<BQ", 2, START_NS), struct.pack("<BQ", 2, START_NS - 5)]
@@ -234,12 +242,12 @@ def test_client_that_publishes_or_sends_garbage_is_disconnected() -> None:
         ):
             with opened(stream) as client:
                 client.send(data)
-                wait_for(partial(ended, client))
+                wait_until(partial(ended, client), f"the connection ends after {data!r}")
         with opened(stream) as client:
             subscribed(client, 1)
             client.send('{"op":"setParameters","parameters":[]}')
             client.send('{"op":"advertise","channels":[{"id":1,"topic":"/cmd"}]}')
-            wait_for(lambda: any(one.subscriptions.number_of(1) for one in stream._clients))
+            wait_for_subscription(stream)
             stream.consume(iter([tracks(1)]))
             assert isinstance(client.recv(_LIMIT_S), bytes)
 
@@ -289,11 +297,11 @@ def test_messages_without_a_subscriber_are_not_serialised(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(foxglove_stream, "encode", encode)
     with streaming() as (stream, _), opened(stream) as client:
-        wait_for(lambda: stream.client_count)
+        wait_until(lambda: stream.client_count, "a client is connected")
         stream.consume(iter([tracks(0)] * 3))
         assert serialised == []
         subscribed(client, 1)
-        wait_for(lambda: any(one.subscriptions.number_of(1) for one in stream._clients))
+        wait_for_subscription(stream)
         stream.consume(iter([tracks(1)]))
         assert isinstance(client.recv(_LIMIT_S), bytes)
     assert serialised == ["Tracks"]
@@ -334,7 +342,10 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
             client.recv(_LIMIT_S)
             client.recv(_LIMIT_S)
             client.send('{"op":"subscribe","subscriptions":[{"id":1,"channelId":2}]}')
-        wait_for(lambda: all(one.subscriptions.number_of(2) for one in stream._clients))
+        wait_until(
+            lambda: all(one.subscriptions.number_of(2) for one in stream._clients),
+            "both clients have subscribed",
+        )
         received = 0
         while not events:
             stream.consume(iter([long]))

@@ -33,7 +33,8 @@ from tests.playing import SteppedClock, cameras, playing
 from tests.ports import free_port
 from tests.sinks.streaming import in_order
 from tests.sinks.test_vrpn_stream import Reader
-from tests.sinks.zenoh_listener import ZenohListener, wait_for
+from tests.sinks.zenoh_listener import ZenohListener
+from tests.waiting import wait_until
 
 _LIMIT_S = 240.0
 _TOPIC = TRACKS.topic_of("poly")
@@ -142,7 +143,10 @@ def recording(lab: Path, calibration: Path, target: Path) -> Iterator[tuple[Clie
     with open_streams(settings, {_TOPIC}, clock.now_ns, warn, heights_m=robots) as streams, closing(clients):
         clients.connect()
         (server,) = [stream for stream in streams if isinstance(stream, FoxgloveStream)]
-        wait_for(lambda: sum(one.subscriptions.number_of(1) == 1 for one in server._clients) == 2)
+        wait_until(
+            lambda: sum(one.subscriptions.number_of(1) == 1 for one in server._clients) == 2,
+            "two clients of Foxglove have subscribed",
+        )
         with attached:
             request = Request(model_from=calibration)
             pipeline.live(attached, first, target, request, consumers=[clock.watch], sinks=streams)
@@ -165,9 +169,16 @@ def test_faulty_clients_change_nothing_for_the_others(
         good = [row for row in recent if row.inside is not False and row.heading_rad is not None]
         expected = {**{f"udp {n}": len(poses) for n in range(3)}, "vrpn": len(good)}
         expected |= {"foxglove": len(recorded), "foxglove 2": len(recorded)}
-        wait_for(lambda: sum(clients.counts.values()) >= sum(expected.values()))
+        wait_until(
+            lambda: sum(clients.counts.values()) >= sum(expected.values()),
+            f"the clients have {expected} messages",
+            lambda: clients.counts,
+        )
         assert dict(clients.counts) == expected
-        wait_for(lambda: sum(len(m.transforms) for m in clients.ros2.messages("/tf")) == len(good) > 0)
+        wait_until(
+            lambda: sum(len(m.transforms) for m in clients.ros2.messages("/tf")) == len(good) > 0,
+            f"the node of ROS 2 has {len(good)} transforms",
+        )
     assert counted == {name: len(rows) for name, rows in sent(lab_log).items()}
     assert skipped == []
     assert not [text for text in events if text.startswith("sink_")], events

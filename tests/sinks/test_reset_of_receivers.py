@@ -15,7 +15,8 @@ from tests.sinks.streaming import START_NS, STEP_NS, write_tracks
 from tests.sinks.test_mavlink_stream import Autopilot
 from tests.sinks.test_ros2_stream import stamp_ns
 from tests.sinks.test_vrpn_stream import Reader
-from tests.sinks.zenoh_listener import ZenohListener, wait_for
+from tests.sinks.zenoh_listener import ZenohListener
+from tests.waiting import wait_until
 
 _LIMIT_S = 240.0
 _LATE, _EARLY = 25, 5  # numbers of poses
@@ -44,7 +45,10 @@ class Receivers:
         )
         self._reader = Reader(stack.enter_context(socket.create_connection(("127.0.0.1", vrpn), _LIMIT_S)))
         self._reader.greet()
-        wait_for(lambda: any(getattr(stream, "client_count", 0) for stream in self.player._streams))
+        wait_until(
+            lambda: any(getattr(stream, "client_count", 0) for stream in self.player._streams),
+            "the VRPN client is connected",
+        )
         self.ros2 = stack.enter_context(closing(ZenohListener(ros2, "/clock", "/ada/pose")))
         self.ros2.tokens()  # the router answers after it has read the subscriptions
         self._reports, self._steps = self._reader.reports(), 0
@@ -76,10 +80,12 @@ def test_seek_resets_the_receivers_of_every_protocol(tmp_path: Path, monkeypatch
     with ExitStack() as stack:
         receivers = Receivers(stack, write_tracks(tmp_path / "x.mcap"))
         (late, before), late_us = receivers.step(), (START_NS + _LATE * STEP_NS) // 1000
-        wait_for(lambda: receivers.clock_us() == late_us)
+        wait_until(lambda: receivers.clock_us() == late_us, f"the clock is {late_us} us", receivers.clock_us)
         receivers.player.seek(0.2)
         (early, after), early_us = receivers.step(), (START_NS + _EARLY * STEP_NS) // 1000
-        wait_for(lambda: receivers.clock_us() == early_us)
+        wait_until(
+            lambda: receivers.clock_us() == early_us, f"the clock is {early_us} us", receivers.clock_us
+        )
     assert set(late.values()) == {late_us}
     assert set(early.values()) == {early_us}
     assert (before["seq"], after["seq"]) == (1, 1)

@@ -27,7 +27,8 @@ from ipsys_log.units import NS_PER_S
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
-from tests.sinks.zenoh_listener import ZenohListener, open_node, wait_for
+from tests.sinks.zenoh_listener import ZenohListener, open_node
+from tests.waiting import wait_until
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -233,7 +234,7 @@ def test_no_message_comes_in_or_passes_through() -> None:
                     return bool(heard)
 
                 assert heard == []
-                wait_for(reached)
+                wait_until(reached, "the second node hears the third one")
         inner.undeclare()  # type: ignore[no-untyped-call]
         assert received == []
 
@@ -256,7 +257,7 @@ def test_second_stream_uses_the_router_that_answers() -> None:
             stream.consume(iter([tracks(next(numbers), track("ada", 1.0))]))
             return bool(listener.samples)
 
-        wait_for(arrives)
+        wait_until(arrives, "a pose arrives")
         with pytest.raises(IpsysError, match=f"--ros2: another ipsys is on port {port} already"):
             Ros2Stream(port, 0, None, PoseSource((), lambda: 0, 1), lambda: 0, lambda *_: None, {})
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from math import cos, sin
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from ipsys_log.sinks.streams.vrpn import VrpnStream
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
+from tests.waiting import wait_until
 
 _LIMIT_S = 240.0
 COOKIE = b"vrpn: ver. 07.38  0".ljust(24, b"\0")
@@ -95,15 +96,8 @@ def connected(server: VrpnStream, cookie: bytes = COOKIE) -> Iterator[Reader]:
     with socket.create_connection(("127.0.0.1", server.port), _LIMIT_S) as sock:
         reader = Reader(sock)
         assert reader.greet(cookie) == COOKIE
-        until(lambda: server.client_count > clients)
+        wait_until(lambda: server.client_count > clients, "the client is connected")
         yield reader
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + _LIMIT_S
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
 
 
 def send(server: VrpnStream, *messages: Message) -> None:
@@ -201,7 +195,7 @@ def test_server_calls_back_the_sender_of_a_datagram_only() -> None:
         with sock:
             reader = Reader(sock)
             assert (address[0], reader.greet()) == ("127.0.0.1", COOKIE)
-            until(lambda: served.server.client_count == 1)
+            wait_until(lambda: served.server.client_count == 1, "the client is connected")
             send(served.server, tracks(0, track("ada", 1.0)))
             assert [report.sender for report in taken(reader, 1)] == ["ada"]
 
@@ -222,7 +216,7 @@ def test_only_a_few_ports_above_1023_are_called(monkeypatch: pytest.MonkeyPatch)
         for sock in waiting:
             for _ in range(3):  # a client repeats its request
                 ask(served.server, f"127.0.0.1 {sock.getsockname()[1]}")
-        until(lambda: len(called) == 4)
+        wait_until(lambda: len(called) == 4, "four ports are called", lambda: called)
         time.sleep(0.3)
         assert called == [sock.getsockname() for sock in waiting[:4]]
         for sock in waiting:
@@ -242,7 +236,7 @@ def test_client_of_something_else_is_disconnected(data: bytes, text: str) -> Non
     with serving() as served:
         with socket.create_connection(("127.0.0.1", served.server.port), _LIMIT_S) as sock:
             sock.sendall(data)
-            until(lambda: len(served.events) == 1)
+            wait_until(lambda: len(served.events) == 1, "the server warns once", lambda: served.events)
             with suppress(ConnectionResetError):  # the server has not read everything
                 while sock.recv(4096):
                     pass
@@ -272,7 +266,10 @@ def test_other_clients_do_not_disturb_a_good_one() -> None:
         reading.start()
         for number, row in enumerate(rows[1:], 2):
             send(served.server, row)
-            until(lambda number=number: len(positions) >= number - 50)  # type: ignore[misc]
+            wait_until(
+                lambda number=number: len(positions) >= number - 50,  # type: ignore[misc]
+                "the good client is at most 50 messages late",
+            )
         reading.join(_LIMIT_S)
         assert positions == [float(n) for n in range(count)]
         assert any("is too slow" in event for event in served.events)

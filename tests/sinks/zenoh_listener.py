@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
-from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -13,7 +11,6 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh import ext
 
 _LIMIT_S = 240.0
-_TURN_S = 0.02
 STORE = get_typestore(Stores.LATEST)
 
 
@@ -75,11 +72,3 @@ class ZenohListener:
 
     def _of(self, topic: str) -> list[Any]:
         return [message for name, _, message, _ in self.samples if name == topic]
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    """Wait until a condition holds."""
-    end_s = time.monotonic() + _LIMIT_S
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(_TURN_S)

@@ -11,10 +11,12 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tests.report.browser import chromium
+from tests.waiting import wait_until
 
 _WIDTH, _HEIGHT = 390, 844
 _PATIENCE_S = 240.0
@@ -136,10 +138,7 @@ class Phone:
 
     def wait(self, script: str) -> None:
         """Wait until an expression is true in the page."""
-        end = time.monotonic() + _PATIENCE_S
-        while not self.holds(script):
-            assert time.monotonic() < end, f"{script}: never, but {self.state()}"
-            time.sleep(0.05)
+        wait_until(partial(self.holds, script), script, self.state)
 
     def holds(self, script: str) -> bool:
         """Return whether an expression is true now.

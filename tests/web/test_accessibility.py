@@ -15,10 +15,10 @@ from ipsys_log.messages import CameraModel, Model
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve, serve_app
 from tests.conftest import Unmeasured
+from tests.waiting import wait_until
 from tests.web.axe import serious_faults
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
 from tests.web.phone import Phone, phone
-from tests.web.test_connections import wait_until
 from tests.web.test_dashboard_browser import press
 from tests.web.test_dashboard_state import LENS, Stream, pairs_of_a_level_camera
 from tests.web.test_measuring_page import Recording, says
@@ -119,7 +119,10 @@ def test_last_steps_of_the_setup_need_only_the_keyboard(browser: Phone, folder: 
         says(browser, "h2", "6. Fit and evaluation")
         focus(browser, "#replay")
         press(browser, "Enter", "\r")
-        wait_until(lambda: setup.session.jobs.present is not None and setup.session.jobs.present.ended)
+        wait_until(
+            lambda: setup.session.jobs.present is not None and setup.session.jobs.present.ended,
+            "the job has ended",
+        )
         says(browser, "#operation", "This device operates")
         # The end of the job leaves the keyboard in the panel.
         browser.wait("document.querySelector('#panel').contains(document.activeElement)")

@@ -28,6 +28,7 @@ from ipsys_log.survey.scene import CameraView
 from ipsys_log.web.connections import PageLimits, derive_limits
 from ipsys_log.web.server import PageServer, ServerExceptions, serve
 from tests.test_measure_now import Lab, still_lab
+from tests.waiting import wait_until
 from tests.web.test_access import Caller
 from tests.web.test_measuring_page import Recording
 
@@ -37,13 +38,6 @@ PATIENCE_S = 240.0
 Answer = TypeVar("Answer")
 DESCRIPTORS = 128
 IDLE_CONNECTIONS = 300
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 @contextmanager
@@ -71,7 +65,11 @@ def recording(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Call
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, text=True) as program,
     ):
         try:
-            wait_until(lambda: program.poll() is not None or "measure at " in errors.read_text())
+            wait_until(
+                lambda: program.poll() is not None or "measure at " in errors.read_text(),
+                "the recorder prints the address of its page",
+                errors.read_text,
+            )
             match = re.search(r"measure at (\S+)", errors.read_text())
             assert match, errors.read_text()
             yield program, Caller(match[1]), errors
@@ -92,14 +90,17 @@ def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> N
     log = tmp_path / "session.mcap"
     with recording(still_lab, log) as (program, caller, errors):
         cookie = sign_in(caller)
-        wait_until(lambda: log.exists() and log.stat().st_size > 0)
+        wait_until(lambda: log.exists() and log.stat().st_size > 0, "the log is not empty")
         with connections(caller, IDLE_CONNECTIONS, "127.0.0.2"):
             before = log.stat().st_size
             for _ in range(10):
                 assert caller.ask("GET", "/api/views", Cookie=cookie)[0] == 200
                 time.sleep(0.1)
-            wait_until(lambda: json.loads(caller.ask("GET", "/api/views", Cookie=cookie)[1])["visible"])
-            wait_until(lambda: log.stat().st_size > before)
+            wait_until(
+                lambda: json.loads(caller.ask("GET", "/api/views", Cookie=cookie)[1])["visible"],
+                "a marker is visible",
+            )
+            wait_until(lambda: log.stat().st_size > before, "the log grows")
             program.send_signal(signal.SIGTERM)
             assert program.wait(PATIENCE_S) == 0, errors.read_text()
     assert "Traceback" not in errors.read_text()
@@ -147,7 +148,7 @@ def test_idle_connections_leave_room_for_a_phone() -> None:
             cookie = sign_in(caller)
             for _ in range(5):
                 assert caller.ask("GET", "/api/scene", Cookie=cookie)[0] == 200
-            wait_until(lambda: sum(map(is_open, held)) <= 6)
+            wait_until(lambda: sum(map(is_open, held)) <= 6, "at most 6 connections are open")
         assert page.exceptions.count == 0
 
 
@@ -162,7 +163,7 @@ def test_phone_keeps_its_connection_beside_new_ones() -> None:
             assert phone.getresponse().read()
             own = phone.sock
             with connections(caller, 30) as held:
-                wait_until(lambda: sum(map(is_open, held)) < 6)
+                wait_until(lambda: sum(map(is_open, held)) < 6, "fewer than 6 connections are open")
                 phone.request("GET", "/api/scene", headers=headers)
                 assert phone.getresponse().status == 200
                 assert phone.sock is own

@@ -19,8 +19,8 @@ from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.capture.nodes.tcp_relay import Relay
 from tests.ports import free_port
+from tests.waiting import wait_until
 from tests.web.phone import Phone, phone
-from tests.web.test_connections import wait_until
 from tests.web.test_measuring_page import says
 from tests.web.test_setup_browser import DESKTOP, Visitor, leave, visit
 from tests.web.test_setup_page import SMALL, Client
@@ -108,7 +108,7 @@ def unread(page: Client, *paths: str) -> Iterator[None]:
 def grows(log: Path, page: Client) -> None:
     """Wait until the recorder has written more, and the server has answered."""
     before = log.stat().st_size
-    wait_until(lambda: log.stat().st_size > before)
+    wait_until(lambda: log.stat().st_size > before, "the log grows")
     assert page.state()["job"]["ended"] is False
 
 
@@ -123,7 +123,7 @@ def test_frozen_page_of_a_measuring_does_not_stop_it(browser: Phone, folder: Pat
             # The images of the camera go on.
             views = [page.ask("/measure/api/views")]
             for _ in range(3):
-                wait_until(lambda: page.ask("/measure/api/views") != views[-1])
+                wait_until(lambda: page.ask("/measure/api/views") != views[-1], "another image is shown")
                 views.append(page.ask("/measure/api/views"))
             assert page.ask("/api/stop", {}) == (200, {})
             assert page.job_ended()["error"] == ""
@@ -146,7 +146,10 @@ def test_frozen_dashboard_of_the_setup_does_not_stop_the_tracking(
     with setup_page(folder) as page:
         page.operate()
         assert page.ask("/api/start", {"action": "live"}) == (200, {})
-        wait_until(lambda: page.state()["pages"]["live"] or page.state()["job"]["ended"])
+        wait_until(
+            lambda: page.state()["pages"]["live"] or page.state()["job"]["ended"],
+            "the dashboard is open, or the job has ended",
+        )
         assert page.state()["job"]["error"] == ""
         browser.open(page.parts.geturl() + "live/", DESKTOP)
         says(browser, "#state", "live")

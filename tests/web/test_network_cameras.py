@@ -22,8 +22,8 @@ from tests.capture.streams import encode, make_jpegs
 from tests.capture.test_rtsp import CODECS, HAS_SERVER, served
 from tests.playing import WAIT_LIMIT_S
 from tests.ports import free_port
+from tests.waiting import wait_until
 from tests.web.phone import Phone, phone
-from tests.web.test_connections import wait_until
 from tests.web.test_measuring_page import says
 from tests.web.test_setup_browser import JOB_ENDED, Visitor, opened
 from tests.web.test_setup_page import Client
@@ -184,7 +184,10 @@ def test_stop_ends_the_wait_for_a_node(folder: Path, monkeypatch: pytest.MonkeyP
     (folder / "lab.toml").write_text(f'{RIG}[nodes]\ncentre = "127.0.0.1:{free_port()}"\n')
     with page_of(folder) as page:
         assert page.ask("/api/address", {"values": {"address": "zenoh:ceiling"}}) == (200, {})
-        wait_until(lambda: any("waits for node" in line for line in page.state()["job"]["lines"]))
+        wait_until(
+            lambda: any("waits for node" in line for line in page.state()["job"]["lines"]),
+            "the job waits for its node",
+        )
         assert page.ask("/api/stop", {}) == (200, {})
         assert page.job_ended()["error"] == ""
         assert page.state()["address"]["fault"] is None

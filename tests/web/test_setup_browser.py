@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,6 @@ from ipsys_log.first_day.steps import Status, read_progress
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.cli.test_simulated_day import errors_m
-from tests.playing import WAIT_LIMIT_S
 from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone, phone
 from tests.web.test_dashboard_browser import press
@@ -38,10 +36,7 @@ class Visitor:
         self.browser, self.inputs = browser, 0
 
     def wait(self, script: str) -> None:
-        end = time.monotonic() + 2 * WAIT_LIMIT_S
-        while not self.browser.holds(script):
-            assert time.monotonic() < end, f"{script}: never, but {self.browser.state()}"
-            time.sleep(0.1)
+        self.browser.wait(script)
 
     def tap(self, selector: str) -> None:
         """Tap a button; the page draws its panel before the button can be hit again."""

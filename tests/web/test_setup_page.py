@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from ipsys_log.rig.file import load_rig
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.playing import WAIT_LIMIT_S
+from tests.waiting import wait_until
 
 SMALL = """name = "lab"
 dictionary = "DICT_4X4_100"
@@ -75,11 +75,8 @@ class Client:
 
     def job_ended(self) -> dict[str, Any]:
         """Wait for the end of the job; return its state."""
-        end = time.monotonic() + WAIT_LIMIT_S
-        while not (state := self.state())["job"]["ended"]:
-            assert time.monotonic() < end, state["job"]
-            time.sleep(0.05)
-        return dict(state["job"])
+        wait_until(lambda: self.state()["job"]["ended"], "the job has ended", lambda: self.state()["job"])
+        return dict(self.state()["job"])
 
 
 @pytest.fixture

@@ -13,10 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
+from ipsys_log.capture.nodes.certificates import AUTHORITY
 from ipsys_log.capture.nodes.network import NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import (
@@ -94,10 +96,27 @@ def node_of(camera: RigCamera) -> str:
 def describe_no_answer(camera: RigCamera, network: NodeNetwork) -> str:
     """Return the text of the error that no node answers for a camera."""
     node = node_of(camera)
-    return (
+    text = (
         f"camera {camera.name}: no node {node} answers at {network}; start it on its host: "
         f"ipsys node lab.toml --camera {node}"
     )
+    if network.certificates is None:
+        return text
+    # Without a connection, the centre cannot see the certificate of the node.
+    return f"{text}. If it runs there, {_describe_authority(network.certificates)}"
+
+
+def _describe_silence(camera: RigCamera, network: NodeNetwork) -> str:
+    """Return the text of the error that the node of a camera does not answer any more."""
+    text = f"camera {camera.name}: its node does not answer; check that it runs, and its network"
+    if network.certificates is None:
+        return text
+    return f"{text}. If it was started again, {_describe_authority(network.certificates)}"
+
+
+def _describe_authority(folder: Path) -> str:
+    authority = folder / AUTHORITY
+    return f"check that the {AUTHORITY} of its host is the same file as {authority}; docs/nodes.md has more"
 
 
 class _Arrival(NamedTuple):
@@ -164,7 +183,7 @@ class Centre:
             period_s = partial(exchange_period_s, nodes=len(self._nodes))
             link = _Link(self._session, camera, self._nodes[camera.name], stream, clock, period_s)
             self._links[camera.name] = link
-        yield chain(link.await_node(self._network, say, self._is_stopped), link.items())
+        yield chain(link.await_node(self._network, say, self._is_stopped), link.items(self._network))
 
 
 def _directly(receive: Callable[[Any], None]) -> Any:
@@ -230,8 +249,14 @@ class _Link:
         if is_first:
             self._early.insert(0, self._stream.report_answer(self._clock.now_ns()))
 
-    def items(self) -> Iterator[Frame | SourceMessage | None]:
-        """Yield the frames and the messages about them."""
+    def items(self, network: NodeNetwork) -> Iterator[Frame | SourceMessage | None]:
+        """Yield the frames and the messages about them.
+
+        Raises
+        ------
+        SourceError
+            The node does not answer any more, or it is refused.
+        """
         yield from self._early
         self._early.clear()
         while True:
@@ -240,7 +265,7 @@ class _Link:
             arrival = self._take()
             if arrival is None:
                 if self._clock.now_ns() - self.heard_ns > _SILENT_NS:
-                    raise SourceError(f"camera {self._camera.name}: its node does not answer")
+                    raise SourceError(_describe_silence(self._camera, network))
                 yield None
                 continue
             yield from arrival.take()

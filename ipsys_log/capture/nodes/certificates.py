@@ -10,11 +10,15 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["CENTRE", "Certificates", "check_centre", "check_certificates"]
+__all__ = ["AUTHORITY", "CENTRE", "Certificates", "check_centre", "check_certificates"]
 
 # The name of the centre in its certificate; the name of a node is that of its camera.
 CENTRE = "centre"
+# The file with the certificate of the authority, the same one on all hosts.
+AUTHORITY = "authority.pem"
 _CONNECT_S, _REFUSAL_S = 3.0, 0.3
+# The codes of OpenSSL for a certificate that another authority has signed.
+_OTHER_AUTHORITY = (7, 18, 19, 20, 21)
 _GUIDE = "docs/nodes.md shows how to make it"
 
 
@@ -34,7 +38,7 @@ class Certificates(NamedTuple):
         >>> Certificates.in_folder(Path("certificates"), "red").key.as_posix()
         'certificates/red.key'
         """
-        return cls(folder / "authority.pem", folder / f"{name}.pem", folder / f"{name}.key")
+        return cls(folder / AUTHORITY, folder / f"{name}.pem", folder / f"{name}.key")
 
 
 def check_certificates(files: Certificates, name: str) -> None:
@@ -113,6 +117,12 @@ def check_centre(host: str, port: int, files: Certificates) -> str | None:
         with socket.create_connection((host, port), _CONNECT_S) as plain:
             _shake_hands(context, plain, host)
     except ssl.SSLCertVerificationError as error:
+        if error.verify_code in _OTHER_AUTHORITY:
+            names = ", ".join(file.name for file in files)
+            raise IpsysError(
+                f"centre {host}:{port}: its certificate is not of the authority in {files.authority}; copy "
+                f"{names} of the centre's authority to this host"
+            ) from error
         raise IpsysError(
             f"centre {host}:{port}: its certificate is not accepted with {files.authority} "
             f"({error.verify_message}); {_GUIDE}"

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Say
-from ipsys_log.capture.nodes.certificates import check_centre
+from ipsys_log.capture.nodes.certificates import Certificates, check_centre
 from ipsys_log.capture.nodes.network import NodeNetwork, open_node_session
 from ipsys_log.capture.nodes.wire import (
     MARKERS_FORMAT,
@@ -42,6 +42,8 @@ _SILENT_NS = 3 * NS_PER_S
 # A centre that has another session for this time refuses this node; it accepts a node that was started again
 # earlier.
 _REFUSED_NS = 10 * NS_PER_S
+# The period of the checks whether a centre that does not ask accepts the certificates.
+_CHECK_NS = 30 * NS_PER_S
 _SESSION_BYTES = 8
 
 
@@ -94,6 +96,10 @@ class Node:
         # The channel of the sent messages, after the first one.
         self._channel: GrowingChannel | None = None
         self._session: Any = None
+        # The certificates, until the centre has refused them; and the time of the last check.
+        self._files: Certificates | None = None
+        self._checked_ns = 0
+        self._sent_name = "the markers" if sends_markers else "the frames"
         self._count = self._received = 0
         self._has_ended = self._has_other_version = self._is_refused = False
         # The last request of a centre, the last one for this session, and the first one for another session.
@@ -112,10 +118,11 @@ class Node:
         ]
 
     def __enter__(self) -> Self:
-        files = self._network.files_of(self._camera)
+        self._files = self._network.files_of(self._camera)
         reason = None
-        if files is not None:
-            reason = check_centre(self._network.host, self._network.port, files)
+        if self._files is not None:
+            reason = check_centre(self._network.host, self._network.port, self._files)
+        self._checked_ns = self._clock.now_ns()
         self._session = open_node_session(self._network, self._camera)
         self._session.declare_queryable(state_key(self._camera), self._answer_state)
         self._session.declare_queryable(missing_key(self._camera), self._enqueue_request)
@@ -123,8 +130,8 @@ class Node:
             thread.start()
         if reason is not None:
             self._say(
-                f"centre {self._network} does not answer ({reason}); the node records, and sends the frames "
-                "to a centre that starts later"
+                f"centre {self._network} does not answer ({reason}); the node records, and sends "
+                f"{self._sent_name} to a centre that starts later"
             )
         return self
 
@@ -182,6 +189,16 @@ class Node:
                 break
         return self._count - self._received
 
+    def describe_missing(self, count: int, log: Path) -> str:
+        """Return a line about the frames, or their markers, that the centre does not have.
+
+        Parameters
+        ----------
+        log : the present path of the log, which may have been renamed.
+        """
+        missing = f"{count} frames" if self._sent[0] is not Markers else f"the markers of {count} frames"
+        return f"the centre {self._network} does not have {missing} of camera {self._camera}; {log} has all"
+
     def _send_all(self) -> None:
         import zenoh
 
@@ -224,7 +241,7 @@ class Node:
         self._asked_ns = now_ns
         if request.session == self.session_name:
             if self._accepted_ns is None:
-                self._say(f"the centre {self._network} receives the frames of camera {self._camera}")
+                self._say(f"the centre {self._network} receives {self._sent_name} of camera {self._camera}")
             self._received, self._accepted_ns, self._other_ns = request.received, now_ns, None
         elif request.session:
             self._note_other(now_ns)
@@ -245,6 +262,18 @@ class Node:
                 "this one; end one of them, or give it another --camera"
             )
 
+    def _check_later_centre(self) -> None:
+        """Report once if a centre that has started later refuses the certificates, and so never asks."""
+        now_ns = self._clock.now_ns()
+        if self._files is None or self._asked_ns is not None or now_ns - self._checked_ns < _CHECK_NS:
+            return
+        self._checked_ns = now_ns
+        try:
+            check_centre(self._network.host, self._network.port, self._files)
+        except IpsysError as error:
+            self._files = None
+            self._say(f"{error}; the node records on. Start it again with the right files")
+
     def _enqueue_request(self, query: Any) -> None:
         try:
             self._requests.put_nowait(query)
@@ -257,6 +286,7 @@ class Node:
             try:
                 query = self._requests.get(timeout=_TURN_S)
             except Empty:
+                self._check_later_centre()
                 continue
             with query:
                 request = FrameRequest.decode(query.payload.to_bytes()) if query.payload is not None else None

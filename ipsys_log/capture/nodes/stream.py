@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Iterator
 
 from ipsys_log.analysis.node_clock import ClockHistory, Exchange
-from ipsys_log.capture.frames import Frame, SourceError, SourceMessage, mid_exposure_ns
+from ipsys_log.capture.frames import Frame, NodeRefusedError, SourceError, SourceMessage, mid_exposure_ns
 from ipsys_log.capture.nodes.wire import FrameHeader, FrameRequest, NodeState, StateRequest
 from ipsys_log.capture.video_packets import is_decodable_start
 from ipsys_log.messages import EVENTS_TOPIC, ClockEstimate, Event, RigCamera, clock_topic
-from ipsys_log.messages.events import NODE_ANSWERS
+from ipsys_log.messages.events import NODE_ANSWERS, NODE_REFUSED
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["NodeStream"]
@@ -125,8 +125,11 @@ class NodeStream:
         ------
         SourceError
             The node has another version of ipsys, or two nodes send as this camera from the start.
+        NodeRefusedError
+            The node was started again, and has another version of ipsys now.
         """
-        self._check_version(state)
+        if not self._session:
+            self._check_first_version(state)
         if second := self._find_second(state, sent_ns):
             yield from self._refuse(second, back_ns)
             if second == state.session:
@@ -134,6 +137,7 @@ class NodeStream:
         if state.session != self._session:
             if self._rival is not None and sent_ns - self._rival[1] < _RESTARTED_NS:
                 return
+            self._check_next_version(state)
             self._began_ns = sent_ns
             yield from self._begin(state, back_ns)
         self._state, self._asked_ns, self._is_unsure = state, max(sent_ns, self._asked_ns), False
@@ -199,11 +203,19 @@ class NodeStream:
         if not self._missing:
             yield from self._close_gap(now_ns)
 
-    def _check_version(self, state: NodeState) -> None:
+    def _check_first_version(self, state: NodeState) -> None:
         if state.version != self._version:
             raise SourceError(
                 f"camera {self._camera.name}: its node has ipsys {state.version}, but this machine has ipsys "
                 f"{self._version}; install one version on both"
+            )
+
+    def _check_next_version(self, state: NodeState) -> None:
+        if state.version != self._version:
+            name, own = self._camera.name, self._version
+            raise NodeRefusedError(
+                f"camera {name}: its node has ipsys {state.version} now, but this machine has ipsys {own}, "
+                f"so its frames are not recorded; install ipsys {own} on its host, and start the node again"
             )
 
     def _find_second(self, state: NodeState, sent_ns: int) -> str:
@@ -233,7 +245,7 @@ class NodeStream:
         if session not in self._refused:
             self._refused.add(session)
             text = f"camera {name}: two nodes send as camera {name}, and the second one is refused; {advice}"
-            yield self._event("node_refused", text, now_ns)
+            yield self._event(NODE_REFUSED, text, now_ns)
 
     def _begin(self, state: NodeState, now_ns: int) -> Items:
         """Begin a session: of the first one, only new frames; of a later one, all."""

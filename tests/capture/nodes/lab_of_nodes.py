@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from ipsys_log.capture.frames import Clock, Frame, SourceMessage
+from ipsys_log.capture.frames import Clock, Frame, Say, SourceMessage
 from ipsys_log.capture.nodes.centre import Centre
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
@@ -20,6 +20,7 @@ from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ClockEstimate, CompressedImage, Event, Message, RigCamera, image_topic
 from ipsys_log.runs.output import write_message
 from tests.ports import free_port
+from tests.waiting import wait_until
 
 __all__ = ["Feed", "Received", "ShiftedClock", "make_certificates", "receiving", "sending"]
 
@@ -81,13 +82,14 @@ def sending(
     camera: str = "red",
     clock: Clock | None = None,
     version: str = "0.1.0",
+    say: Say = lambda text: None,
 ) -> Iterator[Feed]:
     """Open a node whose frames the test makes."""
     clock = clock or Clock()
     path = folder / f"{camera}_{free_port()}.mcap"
     with (
         LogWriter.create(path) as log,
-        Node(camera, network, version, path, clock, lambda text: None) as node,
+        Node(camera, network, version, path, clock, say) as node,
     ):
         yield Feed(node, log, camera, clock)
 
@@ -101,18 +103,15 @@ class Received:
     estimates: list[ClockEstimate] = field(default_factory=list)
     errors: list[Exception] = field(default_factory=list)
 
-    def wait_for(self, condition: Callable[[Received], object]) -> None:
+    def wait_until(self, condition: Callable[[Received], object], name: str) -> None:
         """Wait until a condition holds."""
-        pause = Flag()
-        for _ in range(round(PATIENCE_S / 0.02)):
-            if condition(self):
-                return
-            pause.wait(0.02)
-        raise TimeoutError(f"{len(self.frames)} frames, {self.events}, {self.errors}")
+        wait_until(
+            lambda: condition(self), name, lambda: f"{len(self.frames)} frames, {self.events}, {self.errors}"
+        )
 
     def wait_for_data(self, data: list[bytes]) -> None:
         """Wait until frames with these bytes have arrived."""
-        self.wait_for(lambda now: set(data) <= {frame.data for frame in now.frames})
+        self.wait_until(lambda now: set(data) <= {frame.data for frame in now.frames}, "the frames arrive")
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.events]

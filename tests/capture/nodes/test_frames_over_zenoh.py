@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from tests.capture.nodes.lab_of_nodes import (
 )
 from tests.capture.nodes.tcp_relay import Relay
 from tests.ports import free_port
+from tests.waiting import wait_until
 
 HOUR_NS = 3600 * 1_000_000_000
 
@@ -90,14 +92,14 @@ def test_frames_of_a_cut_network_arrive_later(
         made = feed.record(10)
         received.wait_for_data(made)
         relay.cut(closes)
-        received.wait_for(lambda now: now.errors)  # the node does not answer
+        received.wait_until(lambda now: now.errors, "the node does not answer")
         assert "camera red: its node does not answer" in str(received.errors[0])
         made += feed.record(60)
         relay.mend()
         made += feed.record(5)
         received.wait_for_data(made)
         assert sorted(frame.data for frame in received.frames) == sorted(made)
-        received.wait_for(lambda now: now.kinds()[-1:] == ["node_gap_filled"])
+        received.wait_until(lambda now: now.kinds()[-1:] == ["node_gap_filled"], "the gap is filled")
         assert received.kinds()[0] == "node_answers"
         assert set(received.kinds()[1:]) == {"node_gap", "node_gap_filled"}
         assert feed.node.finish(has_ended=True) == 0
@@ -113,7 +115,7 @@ def test_node_that_starts_again_sends_its_new_session(tmp_path: Path) -> None:
             received.wait_for_data(made)
         with sending(tmp_path, network, clock=ShiftedClock(Clock(), -HOUR_NS)) as feed:
             again = feed.record(4)
-            received.wait_for(lambda now: len(now.frames) == 7)
+            received.wait_until(lambda now: len(now.frames) == 7, "7 frames arrive")
             assert sorted(frame.data for frame in received.frames[:3]) == made
             assert sorted(frame.data for frame in received.frames[3:]) == sorted(again)
             assert "node_restarted" in received.kinds()
@@ -147,7 +149,7 @@ def test_certificates_limit_each_node_to_its_own_camera(tmp_path: Path) -> None:
                     foreign.put(frames_key(name), data, attachment=header.encode())
                 return b"own" in {frame.data for frame in now.frames}
 
-            from_white.wait_for(is_through)
+            from_white.wait_until(is_through, "a frame of the foreign session arrives")
             later = red.record(3)
             from_red.wait_for_data(later)
             assert sorted(frame.data for frame in from_red.frames) == sorted(made_red + later)
@@ -202,7 +204,10 @@ def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path)
         sending(tmp_path, network),
         receiving(centre) as received,
     ):
-        received.wait_for(lambda now: any("two nodes send as camera red" in str(e) for e in now.errors))
+        received.wait_until(
+            lambda now: any("two nodes send as camera red" in str(e) for e in now.errors),
+            "the second node is refused",
+        )
 
 
 @pytest.mark.slow
@@ -237,6 +242,42 @@ def test_centre_without_a_node_names_the_command(monkeypatch: pytest.MonkeyPatch
         centre.open(cameras()[0], Clock(), lambda text: None) as items,
     ):
         first_of(items)
+
+
+@pytest.mark.slow
+def test_foreign_authority_is_named_by_centre_and_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The node starts before the centre: neither of them sees the certificate of the other at its start."""
+    monkeypatch.setattr("ipsys_log.capture.nodes.centre._FIRST_ANSWER_S", 0.5)
+    monkeypatch.setattr("ipsys_log.capture.nodes.node._CHECK_NS", 1)
+    own, foreign = (make_certificates(tmp_path / name, "127.0.0.1", "red") for name in ("own", "foreign"))
+    network, said = NodeNetwork("127.0.0.1", free_port(), own), list[str]()
+    with (
+        sending(tmp_path, replace(network, certificates=foreign), say=said.append),
+        Centre(cameras(), network, "0.1.0") as centre,
+    ):
+        with (
+            pytest.raises(SourceError, match=r"no node red answers at 127\.0\.0\.1:\d+;") as error,
+            centre.open(cameras()[0], Clock(), lambda text: None) as items,
+        ):
+            first_of(items)
+        check = f"check that the authority.pem of its host is the same file as {own}/authority.pem"
+        assert f"If it runs there, {check}" in str(error.value)
+        refusal = (
+            f"centre {network}: its certificate is not of the authority in {foreign}/authority.pem; copy "
+            "authority.pem, red.pem, red.key of the centre's authority to this host"
+        )
+        wait_until(lambda: any(line.startswith(refusal) for line in said), "the node refuses", lambda: said)
+        with pytest.raises(IpsysError) as refused_start:
+            sending(tmp_path, replace(network, certificates=foreign)).__enter__()
+        assert str(refused_start.value) == refusal
+        with receiving(centre) as received:
+            with sending(tmp_path, network):
+                received.wait_until(lambda now: "node_answers" in now.kinds(), "the node answers")
+            received.wait_until(lambda now: "does not answer" in str(now.errors), "the node is missed")
+        assert f"If it was started again, {check}" in str(received.errors[-1])
+    assert sum(line.startswith(refusal) for line in said) == 1
 
 
 def test_port_in_use_and_foreign_address_are_refused() -> None:

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.capture.frames import Frame, SourceError, SourceMessage
+from ipsys_log.capture.frames import Frame, NodeRefusedError, SourceError, SourceMessage
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import FrameHeader, FrameRequest, NodeState, StateRequest
 from ipsys_log.messages import ClockEstimate, Event, RigCamera
 from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
-ONE, TWO = "00000000000000a1", "00000000000000b2"
+ONE, TWO, THREE = "00000000000000a1", "00000000000000b2", "00000000000000c3"
 KEYFRAME = b"\0\0\0\1\x67parameters\0\0\0\1\x65image"
 HOUR_NS = 3600 * NS_PER_S
 
@@ -234,6 +234,37 @@ def test_node_that_ends_leaves_its_camera_to_the_second_one() -> None:
 def test_other_version_is_refused_with_both_versions() -> None:
     with pytest.raises(SourceError, match=r"its node has ipsys 0\.2\.0, but this machine has ipsys 0\.1\.0;"):
         Bench().state(count=7, version="0.2.0")
+
+
+def test_node_that_changes_its_version_is_refused_until_it_fits() -> None:
+    bench = Bench()
+    bench.state(count=7)
+    bench.frame(7)
+    for _ in range(20):  # perhaps the first node answers again
+        bench.state(count=2, session=TWO, version="0.2.0")
+    with pytest.raises(NodeRefusedError) as error:
+        bench.state(count=2, session=TWO, version="0.2.0")
+    assert str(error.value) == (
+        "camera red: its node has ipsys 0.2.0 now, but this machine has ipsys 0.1.0, so its frames are not "
+        "recorded; install ipsys 0.1.0 on its host, and start the node again"
+    )
+    bench.frame(0, session=TWO)
+    for _ in range(22):
+        bench.state(count=0, session=THREE)
+    bench.frame(0, session=THREE)
+    assert bench.numbers() == [7, 0]
+    assert [event.kind for event in bench.events] == ["node_restarted"]
+
+
+def test_second_node_of_another_version_does_not_stop_the_first() -> None:
+    bench = Bench()
+    for number in range(60):
+        bench.state(count=number)
+        if number > 30:
+            bench.state(count=0, session=TWO, after_s=0, version="0.2.0")
+        bench.frame(number)
+    assert bench.numbers() == list(range(60))
+    assert [event.kind for event in bench.events] == ["node_refused"]
 
 
 def test_times_are_those_of_the_centre_also_with_an_exposure() -> None:

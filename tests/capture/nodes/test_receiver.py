@@ -6,9 +6,10 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from ipsys_log.messages import CompressedImage, Event, RigCamera
 from ipsys_log.piped_process import PipedProcess
 from tests.capture.nodes.lab_of_nodes import PATIENCE_S, Feed, sending
 from tests.ports import free_port
+from tests.waiting import wait_until
 
 VERSION = "0.1.0"
 
@@ -82,28 +84,40 @@ def test_frames_pass_and_end_with_their_node(tmp_path: Path) -> None:
 def test_recording_goes_on_after_the_end_of_the_process(tmp_path: Path) -> None:
     """The system ends a process if memory lacks. A new process receives the frames from then on."""
     network, names = local(), ("red", "white")
-    events: list[Event] = []
-    later: set[str] = set()
+    events, senders = list[Event](), set[str]()
     with (
         Receiver(cameras(*names), network, VERSION) as receiver,
         sending_always(tmp_path, network, *names),
         LiveCameras(cameras(*names), receiver.choose_opener(open_source), Clock()) as live,
     ):
+        messages = iter(live)
+
+        def wait(condition: Callable[[], bool], name: str) -> None:
+            """Take messages until a condition holds."""
+
+            def is_met() -> bool:
+                for message in islice(messages, 20):
+                    if message is not None and isinstance(message.payload, Event):
+                        events.append(message.payload)
+                    elif message is not None and isinstance(message.payload, CompressedImage):
+                        senders.add(message.payload.frame_id)
+                return condition()
+
+            wait_until(is_met, name, lambda: f"frames of {senders}, {events}")
+
+        def cameras_with(kind: str) -> set[str | None]:
+            return {event.camera for event in events if event.kind == kind}
+
+        wait(lambda: senders == set(names), "frames of both cameras arrive")
         assert receiver._process is not None
         first = receiver._process.process
-        for message in live:
-            if message is None:
-                continue
-            if isinstance(message.payload, Event):
-                events.append(message.payload)
-            elif isinstance(message.payload, CompressedImage):
-                if first.poll() is None:
-                    os.kill(first.pid, signal.SIGKILL)
-                    first.wait()
-                elif all(("camera_back", name) in [(e.kind, e.camera) for e in events] for name in names):
-                    later.add(message.payload.frame_id)
-            if later == set(names):
-                live.stop()
+        os.kill(first.pid, signal.SIGKILL)
+        first.wait()
+        wait(lambda: cameras_with("camera_lost") == set(names), "both cameras are lost")
+        wait(lambda: cameras_with("camera_back") == set(names), "both cameras are back in a new process")
+        senders.clear()
+        wait(lambda: senders == set(names), "the new process passes on frames of both cameras")
+        live.stop()
     lost = [event for event in events if event.kind == "camera_lost"]
     assert {event.camera for event in lost} == set(names)
     assert all("the process that receives its frames has ended by signal 9" in event.text for event in lost)

@@ -33,11 +33,13 @@ class AskedClock(Clock):
         return now_ns
 
 
-def asked_node(folder: Path, session: str | None) -> tuple[Node, AskedClock, list[str]]:
+def asked_node(
+    folder: Path, session: str | None, sends_markers: bool = False
+) -> tuple[Node, AskedClock, list[str]]:
     """Return a node with a frame, whose centre asks for a session; None: for that of the node."""
     clock, said = AskedClock(), list[str]()
     log = create(folder / "red.mcap", [(image_topic("red"), 1, 1, b"frame")])
-    node = Node("red", NodeNetwork("127.0.0.1", 1), "0.1.0", log, clock, said.append)
+    node = Node("red", NodeNetwork("127.0.0.1", 1), "0.1.0", log, clock, said.append, sends_markers)
     image = CompressedImage(1, "red", b"frame", "jpeg")
     node(Message(image_topic("red"), 1, 1, image, "red"))
     clock.node, clock.session = node, node.session_name if session is None else session
@@ -74,3 +76,11 @@ def test_node_that_starts_again_is_not_called_refused(tmp_path: Path) -> None:
         for _ in range(4):
             clock.now_ns()
     assert said == ["the centre 127.0.0.1:1 receives the frames of camera red"]
+
+
+def test_node_that_sends_markers_says_so(tmp_path: Path) -> None:
+    node, clock, said = asked_node(tmp_path, None, sends_markers=True)
+    clock.now_ns()
+    assert said == ["the centre 127.0.0.1:1 receives the markers of camera red"]
+    missing = "the centre 127.0.0.1:1 does not have the markers of 2 frames of camera red; red.mcap has all"
+    assert node.describe_missing(2, Path("red.mcap")) == missing

@@ -5,10 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from threading import Event as Flag
 from typing import Any
 
 import pytest
@@ -22,8 +21,8 @@ from tests.capture.nodes.lab_of_nodes import make_certificates
 from tests.capture.nodes.namespaces import CENTRE_IP, RELAY_IP, Hosts, in_host, three_hosts
 from tests.capture.nodes.tcp_relay import DELAYS_S
 from tests.conftest import ROOT
+from tests.waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 600.0
 PORT = 7449
 MS = NS_PER_S // 1000
 # The clock of the node is ahead by this time.
@@ -59,18 +58,6 @@ def started(*command: str) -> Iterator[subprocess.Popen[str]]:
 
 def module(host: str, name: str, *arguments: object) -> list[str]:
     return in_host(host, sys.executable, "-m", f"tests.capture.nodes.{name}", *map(str, arguments))
-
-
-def wait_for(condition: Callable[[], bool], programs: list[subprocess.Popen[str]]) -> None:
-    """Wait for a condition, as long as the programs run."""
-    pause = Flag()
-    for _ in range(round(PATIENCE_S / 0.1)):
-        if condition():
-            return
-        for program in programs:
-            assert program.poll() is None, program.communicate()[0]
-        pause.wait(0.1)
-    raise TimeoutError
 
 
 def read_new(channel: GrowingChannel, read: list[Any]) -> list[Any]:
@@ -110,12 +97,17 @@ def record_on_hosts(hosts: Hosts, folder: Path) -> None:
             )
         )
         programs = [node, centre]
-        wait_for((folder / "centre.mcap").exists, programs)
+        wait_until((folder / "centre.mcap").exists, "the centre records", programs=programs)
         for line in relay.stdout:
             if line == "calm\n":
                 break
         clocks, estimates = GrowingChannel(folder / "centre.mcap", clock_topic("red")), list[ClockEstimate]()
-        wait_for(lambda: any(map(is_sharp, read_new(clocks, estimates))), programs)
+        wait_until(
+            lambda: any(map(is_sharp, read_new(clocks, estimates))),
+            "an estimate of the clock is exact",
+            lambda: estimates[-1:],
+            programs,
+        )
         stop(node)
         frames = GrowingChannel(folder / "centre.mcap", image_topic("red")), list[CompressedImage]()
         made = images(folder / "red.mcap")
@@ -124,7 +116,7 @@ def record_on_hosts(hosts: Hosts, folder: Path) -> None:
             arrived = {made.index(payload.data) for payload in read_new(*frames)}
             return arrived == set(range(min(arrived), len(made)))
 
-        wait_for(has_all_since_its_first, [centre])
+        wait_until(has_all_since_its_first, "the centre has all frames since its first", programs=[centre])
         stop(centre)
 
 

@@ -6,14 +6,14 @@ one image to positions in the other one: with the right offset, a smooth map fit
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.path_pairs import PathPair, common_instants
+from ipsys_log.analysis.path_pairs import PathPair, common_instants, gap_limit_s
 from ipsys_log.analysis.time_offset_search import search_offsets_s
 from ipsys_log.errors import FitError
 
@@ -21,6 +21,8 @@ __all__ = ["ClockOffset", "MarkerPath", "estimate_clock_offset"]
 
 Array = NDArray[np.float64]
 Span = tuple[float, float]
+Cameras = tuple[str, str]
+Rows = tuple[Array, Array]
 
 # A marker with a smaller extent of its path in px is stationary.
 _LEAST_EXTENT_PX = 10.0
@@ -35,9 +37,14 @@ _MOVING_SHARE = 0.1
 # The search has steps of at most 0.25 s. The refinement covers more than its error on both sides. It also
 # covers clocks that differ by less than 3 s: the usual case, also with a small common field of view.
 _REFINED_S, _GRID_STEP_S, _NEAR_STEPS = 0.3, 0.025, 10
+# Low points of the grid with a misfit of at most this multiple of the lowest one are refined.
+_LOW_MISFIT = 3.0
 # Residuals of the maps above this share of the spread of the positions are those of unrelated paths. Another
 # offset is a rival of the best one if the ratio of their misfits is less than this.
 _LARGEST_MISFIT, _RIVAL_MISFIT, _MOST_FITS = 0.02, 2.0, 12
+# An offset with a large sigma is a rival, too, if its fit has at least this share of the instants of the best
+# one. Paths that overlap for a short time agree at many offsets.
+_RIVAL_SHARE = 0.5
 # The positions between two frames are interpolated: the error of the offset is about 0.015 frame intervals at
 # 10 Hz, with robots that stop and go. With a larger sigma, a robot at 0.5 m/s would be more than 1 cm off.
 _INTERVAL_SHARE, _LARGEST_SIGMA_S = 0.02, 0.02
@@ -72,16 +79,18 @@ class _Fit(NamedTuple):
     """The maps at an offset.
 
     ``misfit`` is the ratio of the residuals to the spread of the positions, for the degrees of freedom.
+    ``instants`` is the number of positions.
     """
 
     offset_s: float
     misfit: float
+    instants: int
 
 
 class _Pair(NamedTuple):
     """A marker in the images of two cameras: positions (n, 3) without unit, by recording."""
 
-    cameras: tuple[str, str]
+    cameras: Cameras
     marker_id: int
     path: PathPair
 
@@ -100,7 +109,8 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
     Raises
     ------
     FitError
-        No marker moves in both recordings, or their paths agree at no offset, or at several offsets.
+        No marker moves in both recordings, or the paths have too few common instants, agree at no offset or
+        at several offsets, or do not determine the offset well enough.
 
     References
     ----------
@@ -115,6 +125,8 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
     candidates_s = [equal_s + step * _REFINED_S for step in range(-_NEAR_STEPS, _NEAR_STEPS + 1)]
     candidates_s += _search(pairs)
     fits = [fit for near_s in candidates_s if (fit := _refine(pairs, near_s)) is not None]
+    if not fits and not any(_degrees(_on_grid(pairs, near_s).values()) for near_s in candidates_s):
+        raise FitError("their common markers have too few common instants")
     offset_s, sigma_s = _unique(pairs, sorted(fits, key=lambda fit: fit.misfit))
     markers = tuple(sorted({pair.marker_id for pair in pairs}))
     return ClockOffset(equal_s - offset_s, sigma_s, markers)
@@ -146,6 +158,7 @@ def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> tuple[float, float]
         There is no such fit, or there are several.
     """
     best: tuple[_Fit, float] | None = None
+    blurred: list[_Fit] = []  # fits with a small misfit and a large sigma
     for fit in fits[:_MOST_FITS]:
         limit = _LARGEST_MISFIT if best is None else _RIVAL_MISFIT * best[0].misfit
         if fit.misfit > limit:
@@ -154,13 +167,27 @@ def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> tuple[float, float]
             continue
         sigma_s = _sigma_s(pairs, fit.offset_s)
         if sigma_s > _LARGEST_SIGMA_S:
+            blurred.append(fit)
             continue
         if best is not None:
             raise FitError("the paths of their common markers agree at several offsets")
         best = fit, sigma_s
+    if best is None and blurred:
+        raise FitError(
+            "the paths of their common markers agree at no offset with a standard deviation of at most "
+            f"{_LARGEST_SIGMA_S:g} s"
+        )
     if best is None:
         raise FitError("the paths of their common markers agree at no offset")
+    if any(_contradicts(fit, best[0]) for fit in blurred):
+        raise FitError("the paths of their common markers agree at several offsets")
     return best[0].offset_s, best[1]
+
+
+def _contradicts(blurred: _Fit, best: _Fit) -> bool:
+    """Return whether a fit with a large sigma is a rival: at another offset, with similarly many instants."""
+    is_apart = abs(blurred.offset_s - best.offset_s) >= _REFINED_S
+    return is_apart and blurred.instants >= _RIVAL_SHARE * best.instants
 
 
 def _since_start(paths: Iterable[MarkerPath]) -> tuple[list[MarkerPath], float]:
@@ -227,44 +254,74 @@ def _refine(
     """
     from scipy.optimize import minimize_scalar
 
-    by_cameras = {pair.cameras: [one for one in pairs if one.cameras == pair.cameras] for pair in pairs}
-    degrees = {cameras: _degree(of_two, near_s, left_out) for cameras, of_two in sorted(by_cameras.items())}
-    views = [(by_cameras[cameras], degree) for cameras, degree in degrees.items() if degree]
-    grid_s = near_s + np.linspace(-reach_s, reach_s, 2 * round(reach_s / _GRID_STEP_S) + 1)
-    misfits = np.array([_fit(views, offset_s, left_out).misfit for offset_s in grid_s])
+    views = _on_grid(pairs, near_s, reach_s, left_out)
+    grid_s, degrees = list(views), _degrees(views.values())
+    misfits = np.array([_fit(of_offset, degrees, offset_s).misfit for offset_s, of_offset in views.items()])
     best = int(misfits.argmin())
-    if not views or best in (0, len(grid_s) - 1):
+    if not degrees or best in (0, len(grid_s) - 1):
         return None
-    result = minimize_scalar(
-        lambda offset_s: np.log(_fit(views, float(offset_s), left_out).misfit),
-        bounds=(grid_s[best - 1], grid_s[best + 1]),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
-    return _fit(views, float(result.x), left_out)
+    # The minimum may be narrower than a step of the grid, so another low point can be the best one.
+    inner = misfits[1:-1]
+    is_low = (inner <= misfits[:-2]) & (inner <= misfits[2:]) & (inner <= _LOW_MISFIT * misfits[best])
+    fits = []
+    for low in (np.flatnonzero(is_low) + 1).tolist():
+        result = minimize_scalar(
+            lambda offset_s: np.log(_fit(_instants(pairs, float(offset_s), left_out), degrees, 0.0).misfit),
+            bounds=(grid_s[low - 1], grid_s[low + 1]),
+            method="bounded",
+            options={"xatol": 1e-6},
+        )
+        offset_s = float(result.x)
+        fits.append(_fit(_instants(pairs, offset_s, left_out), degrees, offset_s))
+    return min(fits, key=lambda fit: fit.misfit)
 
 
-def _degree(pairs: Sequence[_Pair], offset_s: float, left_out: Span | None) -> int:
-    """Return the degree of the map between two images; 0 if the instants are too few for any map."""
-    rows = [_moving_instants(pair.path, offset_s, left_out)[0] for pair in pairs]
-    count = sum(map(len, rows))
-    fitting = (n for n in _DEGREES if count >= _INSTANTS_PER_TERM * _map_terms(rows, n).shape[1])
+def _on_grid(
+    pairs: Sequence[_Pair], near_s: float, reach_s: float = _REFINED_S, left_out: Span | None = None
+) -> dict[float, dict[Cameras, list[Rows]]]:
+    """Return the instants of :func:`_instants` by offset, for a grid of offsets in ascending order."""
+    grid_s = near_s + np.linspace(-reach_s, reach_s, 2 * round(reach_s / _GRID_STEP_S) + 1)
+    return {offset_s: _instants(pairs, offset_s, left_out) for offset_s in grid_s.tolist()}
+
+
+def _instants(pairs: Sequence[_Pair], offset_s: float, left_out: Span | None) -> dict[Cameras, list[Rows]]:
+    """Return for each two cameras the positions of each marker in both images, while it moves.
+
+    Instants of the second recording between the times of ``left_out`` are left out.
+    """
+    views: dict[Cameras, list[Rows]] = {}
+    for pair in pairs:
+        views.setdefault(pair.cameras, []).append(_moving_instants(pair.path, offset_s, left_out))
+    return views
+
+
+def _degrees(grid: Collection[dict[Cameras, list[Rows]]]) -> dict[Cameras, int]:
+    """Return the degree of the map between each two images with enough instants at all offsets of a grid.
+
+    With fewer instants at one offset than at others, a map of the same degree fits better there.
+    """
+    degrees: dict[Cameras, int] = {}
+    for cameras in sorted({cameras for views in grid for cameras in views}):
+        degree = min(_degree([first for first, _ in views[cameras]]) for views in grid)
+        if degree:
+            degrees[cameras] = degree
+    return degrees
+
+
+def _degree(parts: Sequence[Array]) -> int:
+    """Return the degree of a map of points (n, 2), by marker; 0 if the points are too few for any map."""
+    count = sum(map(len, parts))
+    fitting = (n for n in _DEGREES if count >= _INSTANTS_PER_TERM * _map_terms(parts, n).shape[1])
     return next(fitting, 0)
 
 
-def _fit(views: Sequence[tuple[Sequence[_Pair], int]], offset_s: float, left_out: Span | None) -> _Fit:
-    """Fit the maps between the images at an offset.
-
-    Parameters
-    ----------
-    views : for each two cameras, their pairs and the degree of their map.
-    left_out : instants of the second recording between these times are left out.
-    """
+def _fit(views: dict[Cameras, list[Rows]], degrees: dict[Cameras, int], offset_s: float) -> _Fit:
+    """Fit the maps of some degrees between the images at an offset, to the instants of :func:`_instants`."""
     residuals = spreads = 0.0
-    for pairs, degree in views:
-        rows = [_moving_instants(pair.path, offset_s, left_out) for pair in pairs]
-        terms = _map_terms([first for first, _ in rows], degree)
-        second = np.concatenate([row for _, row in rows])
+    total = 0
+    for cameras, degree in degrees.items():
+        terms = _map_terms([first for first, _ in views[cameras]], degree)
+        second = np.concatenate([row for _, row in views[cameras]])
         count, coefficient_count = terms.shape
         if count <= coefficient_count:
             continue
@@ -273,7 +330,8 @@ def _fit(views: Sequence[tuple[Sequence[_Pair], int]], offset_s: float, left_out
         spread = max(float(((second - second.mean(axis=0)) ** 2).sum()), 1e-12)
         residuals += residual * count / (count - coefficient_count)
         spreads += spread
-    return _Fit(offset_s, float(np.sqrt(residuals / spreads)) if spreads else 1.0)
+        total += count
+    return _Fit(offset_s, float(np.sqrt(residuals / spreads)) if spreads else 1.0, total)
 
 
 def _moving_instants(path: PathPair, offset_s: float, left_out: Span | None) -> tuple[Array, Array]:
@@ -327,5 +385,13 @@ def _sigma_s(pairs: Sequence[_Pair], offset_s: float) -> float:
     variance_s2 = (_PARTS - 1) / _PARTS * float(((offsets_s - offsets_s.mean()) ** 2).sum())
     if variance_s2 < _LEAST_VARIANCE_S2:
         return float("inf")
-    interval_s = float(np.median(np.concatenate([np.diff(pair.path.true_s) for pair in pairs])))
-    return float(np.hypot(np.sqrt(variance_s2), _INTERVAL_SHARE * interval_s))
+    return float(np.hypot(np.sqrt(variance_s2), _INTERVAL_SHARE * _interval_s(pairs)))
+
+
+def _interval_s(pairs: Sequence[_Pair]) -> float:
+    """Return the mean interval between the two frames around an instant, over all instants, in s."""
+    steps_s = [np.diff(pair.path.true_s) for pair in pairs]
+    bridged_s = np.concatenate(
+        [of_one[of_one <= gap_limit_s(pair.path.true_s)] for of_one, pair in zip(steps_s, pairs, strict=True)]
+    )
+    return float((bridged_s**2).sum() / bridged_s.sum())

@@ -78,7 +78,8 @@ def _estimate(session: Session, earlier: Sequence[MarkerPath], own: Sequence[Mar
     except FitError as error:
         raise IpsysError(
             f"{session}: its clock offset cannot be estimated from markers in its images and in those of the "
-            f"earlier logs: {error}; let a robot stop and go where both see it, or give {option}"
+            f"earlier logs: {error}; let a robot stop and go where both see it, run ipsys detect on a log "
+            f"with skipped frames, or give {option}"
         ) from None
     return LogOffset(round(estimate.offset_s * NS_PER_S), estimate.sigma_s)
 

@@ -192,9 +192,8 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     assert "channels have the messages of the cut" in day("verify", "part.mcap")
     day("cut", "a.mcap", "-o", "red.mcap", "--camera", "red")
     day("cut", "a.mcap", "-o", "rest.mcap", "--camera", "white", "--camera", "black")
-    merged = json.loads(day("merge", "red.mcap", "rest.mcap", "-o", "both.mcap", "--json"))
-    # One program recorded both, so their clocks are equal.
-    assert abs(merged["logs"][1]["offset_ns"]) < 30_000_000
+    # A busy machine skips frames, so the markers of a live run may not determine the offset.
+    day("merge", "red.mcap", "rest.mcap", "-o", "both.mcap", "--offset", "rest=0")
     day("exclude", "session.mcap", "p001", "--reason", "the tape sagged")
     day("exclude", "session.mcap", "p001", "--readmit", "--reason", "the tape was straight")
     day("compact", "session.mcap", "--dry-run")
@@ -224,8 +223,16 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("export", "a.mcap", "-o", "coco", "--format", "coco")
     for stage in ("detect", "camera-frame", "fit", "locate", "fuse", "smooth"):
         day(stage, "session.mcap")
-    day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
+    size = ("--width", 960, "--height", 540, "--rate-hz", 10)
+    day("simulate", "-o", "s.mcap", *size, "--stations", 4, "--drive-s", 10)
     day("check", "s.mcap")
+    day("detect", "s.mcap")
+    day("cut", "s.mcap", "-o", "s_red.mcap", "--camera", "red")
+    others = ("--camera", "white", "--camera", "black")
+    day("cut", "s.mcap", "-o", "s_rest.mcap", *others, "--exclude-topics", "/measurements")
+    merged = json.loads(day("merge", "s_red.mcap", "s_rest.mcap", "-o", "s_both.mcap", "--json"))
+    # The cameras of the simulated session have one clock.
+    assert abs(merged["logs"][1]["offset_ns"]) < 30_000_000
     day("catalogue", ".", "-o", "catalogue.parquet")
     # These have tests of their own: a page, public data, weeks of logs, robots, workers, and nodes.
     day.commands |= {"setup", "import", "drift", "drive", "batch", "node"}

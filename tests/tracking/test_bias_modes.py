@@ -175,7 +175,9 @@ def test_camera_of_a_hall_has_nodes_in_its_view_only(joint: Model, monkeypatch: 
     modes, model = calibration_modes(joint, rig_with(None)), restore_joint(joint)[joint.cameras[0].camera]
     edges = [model.origin_m[:2] + np.array([reach_m, 0.0]) for reach_m in (1.6, 1.8)]
     near, far = (modes.at(joint.cameras[0].camera, np.array([place_m]), np.zeros(1)) for place_m in edges)
-    np.testing.assert_array_equal(near[:, 0], far[:, 0])
+    # The shares of equal nodes are rounded: they depend on the place in its cell.
+    rounding = 8 * np.finfo(np.float64).eps * np.abs(far[:, 0]).max()
+    np.testing.assert_allclose(near[:, 0], far[:, 0], rtol=0, atol=rounding)
 
 
 @pytest.mark.usefixtures("size")

@@ -37,6 +37,7 @@ BENCHMARKS = {
     "startup": "ipsys --help and ipsys info",
     "robot_run": "control error and true error of robots at waypoints, without and with faults",
     "joint": "error over the floor of calibrations, in simulated labs",
+    "contradictions": "inputs that contradict the measurements: named, true error, coverage",
     "hall": "joint calibration of halls of 3 to 24 cameras: error, time, memory",
     "tracks": "error of the tracks of driving robots, in simulated labs",
     "track_cost": "time of a message with the positions of 20 robots",

@@ -1,0 +1,11 @@
+"""Faults of files of camera intrinsics: see ``contradictions.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fault_trials import Fault
+
+__all__ = ["FAULTS"]
+
+FAULTS: Sequence[Fault] = ()

@@ -3,6 +3,7 @@
     python benchmarks/contradictions.py --fault-seeds 100:108      # every fault; random labs for 8 seeds
     python benchmarks/contradictions.py --fault tape               # faults with this in their name
     python benchmarks/contradictions.py --package ../before        # the same inputs for another checkout
+    python benchmarks/contradictions.py --before ../before         # false alarms in honest labs instead
 
 This checkout makes the inputs; the package under test answers them through its commands. Faults that need
 the folder of faulty inputs read it from IPSYS_CASES. The table is that of docs/accuracy.md.
@@ -27,6 +28,7 @@ import faulty_streams
 import faulty_tapes
 import unfitting_cameras
 from fault_trials import Fault, Outcome, Trial
+from honest_labs import compare_honest_labs
 from results import Report, command
 from scenes import CACHE
 
@@ -47,6 +49,9 @@ FAULTS: Sequence[Fault] = (
 def measure(options: argparse.Namespace) -> Report:
     """Try every fault, and compare the answers with the ground truth."""
     report = Report("contradictions")
+    if options.before is not None:
+        compare_honest_labs(report, options)
+        return report
     faults = [fault for fault in FAULTS if options.fault in fault.name]
     if options.smoke:
         faults = [fault for fault in faults if not fault.is_random][:1]
@@ -54,7 +59,7 @@ def measure(options: argparse.Namespace) -> Report:
     rows = [f"{'fault':<50} {'named':>8} {'mm':>8} {'in 95 %':>8}"]
     for fault in faults:
         seeds = range(first, last) if fault.is_random else range(first, first + 1)
-        outcomes = [_try(fault, seed, options.package) for seed in seeds]
+        outcomes = [_try(fault, seed, Path(options.package)) for seed in seeds]
         rows.append(_row(fault, outcomes))
         report.details[fault.name] = [asdict(outcome) for outcome in outcomes]
     report.tables.append("\n".join(rows))
@@ -82,8 +87,10 @@ def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--fault", default="", metavar="TEXT", help="only faults with this in their name")
     parser.add_argument("--fault-seeds", default="100:108", metavar="FIRST:END", help="of random labs")
     parser.add_argument(
-        "--package", type=Path, default=Path(__file__).parent.parent, help="checkout under test"
+        "--package", default=str(Path(__file__).parent.parent), metavar="FOLDER", help="checkout under test"
     )
+    parser.add_argument("--before", metavar="FOLDER", help="checkout to compare answers to honest labs with")
+    parser.add_argument("--honest-seeds", default="500:540", metavar="FIRST:END", help="of honest labs")
 
 
 if __name__ == "__main__":

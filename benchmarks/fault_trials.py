@@ -1,4 +1,4 @@
-"""One fault of an input, tried on this checkout or another one: the noun of the benchmark ``contradictions``."""
+"""A fault of an input, tried on this checkout or on another one, and the answer."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def cases_folder() -> Path:
 class Outcome:
     """The answer of the program to a faulty input.
 
-    ``is_named``: the output names the fault. ``error_mm``: median true error of the positions, or None without
-    positions. ``coverage``: share of the positions whose true error is in the stated 95 % region.
+    ``is_named``: the output names the fault. ``error_mm``: median true error of the positions, or None
+    without positions. ``coverage``: share of the positions whose true error is in the stated 95 % region.
     ``figure`` is a further result in words, such as "4 of 180 accepted".
     """
 
@@ -53,7 +53,7 @@ class Trial:
     package: Path
 
     def ipsys(self, *arguments: object) -> str:
-        """Run ``ipsys ARGUMENTS`` of the package under test; return its output and its errors as one text."""
+        """Run ``ipsys ARGUMENTS`` of the package under test; return its output and errors as one text."""
         answer = subprocess.run(
             [sys.executable, "-m", "ipsys_log", *map(str, arguments)],
             cwd=self.folder,
@@ -63,6 +63,7 @@ class Trial:
             stderr=subprocess.STDOUT,
             text=True,
             timeout=_TIMEOUT_S,
+            check=False,
         )
         return answer.stdout
 

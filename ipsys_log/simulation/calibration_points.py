@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.marker_cells import PlacedMarker, black_cells, print_outline
-from ipsys_log.geometry.poses import pose_facing_up
+from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation
 from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
 from ipsys_log.simulation.cameras import Camera, sees
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
@@ -67,11 +67,18 @@ class SimulatedPoint:
 
 def place_marker(where: SimulatedPose, settings: LabSettings) -> PlacedMarker:
     """Return the print of a marker at a pose."""
-    return PlacedMarker(
-        where.marker_id,
-        settings.marker_length_m,
-        pose_facing_up(where.x_m, where.y_m, where.z_m, where.heading_rad),
-    )
+    world_from_marker = pose_facing_up(where.x_m, where.y_m, where.z_m, where.heading_rad)
+    if settings.top_tilt_deg:
+        world_from_marker = world_from_marker @ _marker_from_top(where.marker_id, settings)
+    return PlacedMarker(where.marker_id, settings.marker_length_m, world_from_marker)
+
+
+def _marker_from_top(marker_id: int, settings: LabSettings) -> Array:
+    """Return the constant tilt of a marker on its robot, (4, 4), about a horizontal axis."""
+    rng = random_stream(settings.seed, Purpose.TOPS, marker_id)
+    tilt_rad, axis_rad = np.radians(rng.uniform(0.0, settings.top_tilt_deg)), rng.uniform(-np.pi, np.pi)
+    axis = np.array([np.cos(axis_rad), np.sin(axis_rad), 0.0])
+    return make_pose(rotation(tilt_rad * axis), np.zeros(3))
 
 
 def cameras_seeing(where: SimulatedPose, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:

@@ -42,6 +42,7 @@ class Purpose(IntEnum):
     WHEELS = 18
     RELAY = 19
     WEEKS = 20
+    TOPS = 21
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
@@ -75,6 +76,7 @@ _RANGES = {
     "tape_sigma_m": (0.0, 0.2),
     "ruler_sigma_m": (0.0, 0.1),
     "tape_angle_deg": (0.0, 60.0),
+    "top_tilt_deg": (0.0, 60.0),
 }
 
 
@@ -110,6 +112,7 @@ class LabSettings:
     mount_height_m, tilt_deg : approximate height of the cameras, and range of their tilts.
     tape_sigma_m, ruler_sigma_m : sigma of a measured distance, and of a measured height.
     tape_angle_deg : least angle between the two tapes at a calibration point.
+    top_tilt_deg : largest tilt of a marker on its robot. Each marker has its own constant tilt up to this.
 
     Raises
     ------
@@ -146,6 +149,7 @@ class LabSettings:
     tape_sigma_m: float = 0.003
     ruler_sigma_m: float = 0.001
     tape_angle_deg: float = 15.0
+    top_tilt_deg: float = 0.0
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():

@@ -1,4 +1,4 @@
-"""Bundle adjustment: joint least squares of intrinsics and board poses over all corners.
+"""Bundle adjustment: joint least squares of intrinsics, bending of the board, and board poses.
 
 The pose of an image affects only the corners of this image. So the six unknowns of each pose are
 eliminated before the solution for the intrinsics (Schur complement). The cost of a step grows linearly with
@@ -7,7 +7,7 @@ the number of corners.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.lens_models import LensModel, project_points, project_with_slopes
 
 __all__ = [
+    "USUAL_BENDING_M",
     "Corners",
     "LensFit",
     "Normal",
@@ -28,6 +29,9 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
+# Usual bending of a board (sagitta over half of its size), and the residual that such a bending costs in the
+# prior. The corners of a few images outweigh it.
+USUAL_BENDING_M, _PULL_PX = 0.0003, 0.1
 _LEAST_GAIN = 1e-9
 _MOST_DAMPING = 1e12
 
@@ -47,6 +51,12 @@ class Corners:
     image_count: int
 
     @property
+    def arches(self) -> Array:
+        """The height of each corner for a sagitta of 1 in x and in y: x^2 and y^2 with edges at 1, (n, 2)."""
+        planar = self.board_m[:, :2]
+        return np.asarray((planar / np.abs(planar).max(axis=0)) ** 2)
+
+    @property
     def starts(self) -> NDArray[np.intp]:
         """The index of the first corner of each image."""
         return np.searchsorted(self.image_numbers, np.arange(self.image_count))
@@ -63,21 +73,32 @@ class Corners:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensFit:
-    """The intrinsics (p,), and each board pose in camera coordinates: (f, 3, 3) and (f, 3) in m."""
+    """The intrinsics (p,), and each board pose in camera coordinates: (f, 3, 3) and (f, 3) in m.
+
+    ``bending_m`` (2,) is the bending of the board in all images, in x and in y: the depth of its edges behind
+    its middle.
+    """
 
     intrinsics: Array
     rotations: Array
     positions_m: Array
     cost: float = np.inf
+    bending_m: Array = field(default_factory=lambda: np.zeros(2))
+
+    @property
+    def unknowns(self) -> Array:
+        """The intrinsics and the bending, (p + 2,)."""
+        return np.append(self.intrinsics, self.bending_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
     """The normal equations of the weighted corners.
 
-    ``lens`` (f, q, q) and ``lens_gradient`` (f, q) are the parts of the intrinsics for each image. ``poses``
-    (f, 6, 6) and ``pose_gradient`` (f, 6) are the parts of the poses, ``between`` (f, 6, q) are the mixed
-    parts. ``pull`` (q, q) and ``pull_gradient`` (q,) are the prior that draws coefficients to 0.
+    ``lens`` (f, q, q) and ``lens_gradient`` (f, q) are the parts of the intrinsics and the bending for each
+    image. ``poses`` (f, 6, 6) and ``pose_gradient`` (f, 6) are the parts of the poses, ``between`` (f, 6, q)
+    are the mixed parts. ``pull`` (q, q) and ``pull_gradient`` (q,) are the prior that draws coefficients and
+    bending to 0. ``squares`` (f,) are the weighted squares of the residuals.
     """
 
     lens: Array
@@ -87,11 +108,13 @@ class Normal:
     between: Array
     pull: Array
     pull_gradient: Array
+    squares: Array
 
 
 def camera_points(fit: LensFit, corners: Corners) -> Array:
     """Return the corners in camera coordinates, (n, 3) in m."""
-    rotated = np.einsum("nij,nj->ni", fit.rotations[corners.image_numbers], corners.board_m)
+    bent_m = corners.board_m + np.outer(corners.arches @ fit.bending_m, (0.0, 0.0, 1.0))
+    rotated = np.einsum("nij,nj->ni", fit.rotations[corners.image_numbers], bent_m)
     return np.asarray(rotated + fit.positions_m[corners.image_numbers])
 
 
@@ -115,13 +138,21 @@ def corner_weights(residuals_px: Array, scale_px: float | None) -> Array:
 
 
 def _cost(model: LensModel, fit: LensFit, corners: Corners, scale_px: float | None) -> float:
-    return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.intrinsics**2)
+    return _weights(residuals(model, fit, corners), scale_px)[1] + float(_pull(model) @ fit.unknowns**2)
+
+
+def _pull(model: LensModel) -> Array:
+    """Return the weight of the prior that draws each intrinsic and each bending to 0, (p + 2,)."""
+    return np.append(model.pull, np.full(2, (_PULL_PX / USUAL_BENDING_M) ** 2))
 
 
 def normal_equations(
     model: LensModel, fit: LensFit, corners: Corners, basis: Array, scale_px: float | None
 ) -> Normal:
-    """Return the normal equations of a step; ``basis`` (p, q) has the free directions of the intrinsics."""
+    """Return the normal equations of a step.
+
+    ``basis`` (p + 2, q) has the free directions of the intrinsics and the bending.
+    """
     points_m = camera_points(fit, corners)
     pixels, by_point, by_lens = project_with_slopes(model, fit.intrinsics, points_m)
     residuals_px = pixels - corners.pixels
@@ -129,7 +160,9 @@ def normal_equations(
     # Columns: the intrinsics (q), rotation and translation of the board (6), and the residual.
     count = basis.shape[1]
     rows = np.empty((len(points_m), 2, count + 7))
-    rows[..., :count] = by_lens @ basis
+    normals = fit.rotations[corners.image_numbers, :, 2]
+    by_bending = (by_point @ normals[:, :, None]) * corners.arches[:, None]
+    rows[..., :count] = np.concatenate([by_lens, by_bending], axis=2) @ basis
     # A small rotation w moves a point by w x (R X).
     by_x, by_y, by_z = (by_point[..., n] for n in range(3))
     x, y, z = x[:, None], y[:, None], z[:, None]
@@ -140,15 +173,16 @@ def normal_equations(
     rows[..., count + 6] = residuals_px
     rows *= np.sqrt(_weights(residuals_px, scale_px)[0])[:, None, None]
     squares = np.stack([_squares(part) for part in np.split(rows, corners.starts[1:])])
-    lens, pose = slice(count), slice(count, count + 6)
+    lens, pose, pull = slice(count), slice(count, count + 6), _pull(model)
     return Normal(
         squares[:, lens, lens],
         squares[:, lens, -1],
         squares[:, pose, pose],
         squares[:, pose, -1],
         squares[:, pose, lens],
-        (basis.T * model.pull) @ basis,
-        basis.T @ (model.pull * fit.intrinsics),
+        (basis.T * pull) @ basis,
+        basis.T @ (pull * fit.unknowns),
+        squares[:, -1, -1],
     )
 
 
@@ -189,7 +223,12 @@ def _apply_step(fit: LensFit, lens_step: Array, pose_steps: Array) -> LensFit:
     from scipy.spatial.transform import Rotation
 
     turns = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix()
-    return LensFit(fit.intrinsics + lens_step, turns @ fit.rotations, fit.positions_m + pose_steps[:, 3:])
+    return LensFit(
+        fit.intrinsics + lens_step[:-2],
+        turns @ fit.rotations,
+        fit.positions_m + pose_steps[:, 3:],
+        bending_m=fit.bending_m + lens_step[-2:],
+    )
 
 
 def adjust(
@@ -205,7 +244,8 @@ def adjust(
     Parameters
     ----------
     model, start, corners : the lens model, the first fit, and the corners to fit.
-    basis : (p, q), the directions in which the intrinsics may change; (p, 0) keeps them constant.
+    basis : (p + 2, q), the directions in which the intrinsics and the bending of the board may change;
+        (p + 2, 0) keeps them constant.
     scale_px : scale of Cauchy's loss, which gives outliers a small weight; None: plain squares.
     most_steps : the largest number of steps.
 

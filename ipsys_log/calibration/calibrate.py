@@ -65,6 +65,8 @@ class CalibrationResult:
     camera, lens : name of the camera, and its intrinsics.
     names, values, sigmas : of the parameters; the standard deviations are 0 if not fitted.
     square : whether fx = fy was assumed.
+    bending_m, bending_sigma_m : depth of the edges of the board behind its middle, in x and in y, and its
+        standard deviation, (2,).
     rms_px, median_px : of the reprojection errors: the root of the mean of dx^2 + dy^2, over all corners of
         all used images.
     examined_count, seen : numbers of examined images, and of images that show the board.
@@ -83,6 +85,8 @@ class CalibrationResult:
     values: Array
     sigmas: Array
     square: bool
+    bending_m: Array
+    bending_sigma_m: Array
     rms_px: float
     median_px: float
     examined_count: int
@@ -253,6 +257,8 @@ def _build_result(
         lens,
         sigmas,
         solved.square,
+        solved.fit.bending_m,
+        solved.bending_sigma_m,
         float(np.sqrt((distances**2).mean())),
         float(np.median(distances)),
         search.count,

@@ -6,7 +6,7 @@ plane of the board. No equation divides by a depth, so the rays may also come fr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import Corners, LensFit, adjust, residuals
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.calibration.uncertainty import group_similar_images, lens_covariance
+from ipsys_log.calibration.uncertainty import group_similar_images, held_out_squares, lens_covariance
 
 __all__ = [
     "ExcludedImage",
@@ -116,9 +116,13 @@ def _fit_distortion(model: LensModel, fit: LensFit, corners: Corners) -> LensFit
     )
 
 
-def fitted_basis(model: LensModel, square: bool) -> Array:
-    """Return the free directions of the intrinsics, (p, q); a common one for fx and fy if ``square``."""
-    basis = np.eye(len(model.names))[:, : 4 + model.fitted]
+def fitted_basis(model: LensModel, square: bool, bent: bool = False) -> Array:
+    """Return the free directions of the intrinsics and of the bending of the board, (p + 2, q).
+
+    fx and fy have a common direction if ``square``. The board stays flat unless it is ``bent``.
+    """
+    count = len(model.names)
+    basis = np.delete(np.eye(count + 2), np.s_[4 + model.fitted : count + (0 if bent else 2)], axis=1)
     if square:
         basis[1, 0] = 1.0
         basis = np.delete(basis, 1, axis=1)
@@ -180,9 +184,9 @@ _LEAST_CORNERS = 6
 _MOST_ROUNDS = 8
 # A smaller error is never an outlier: pixels are not more accurate.
 _NEAR_PX = 0.05
-# Pixels count as square, unless fx and fy differ by this share and by three standard deviations, or by ten
-# standard deviations.
-_SQUARE, _SURE, _QUITE_SURE = 0.01, 3.0, 10.0
+# Pixels are square unless the squares of held-out images become smaller without this, by this many standard
+# errors of the change.
+_HELD_OUT_GAIN = 1.0
 # Factors of other focal lengths to try, least difference of their fits in standard deviations, and steps.
 _OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40
 
@@ -199,7 +203,8 @@ class ExcludedImage:
 class SolveResult:
     """The result of a calibration.
 
-    ``covariance`` (p, p) is the covariance of the intrinsics. ``corners`` are the corners of the fit,
+    ``covariance`` (p, p) is the covariance of the intrinsics, ``bending_sigma_m`` (2,) the standard deviation
+    of the bending of the board. ``corners`` are the corners of the fit,
     ``image_numbers`` the numbers of their images, ``residuals_px`` (n, 2) their residuals in px. ``excluded``
     lists the images that were left out, ``outlier_corners`` counts the single corners left out of other
     images.
@@ -209,6 +214,7 @@ class SolveResult:
     model: LensModel
     fit: LensFit
     covariance: Array
+    bending_sigma_m: Array
     corners: Corners
     image_numbers: NDArray[np.intp]
     residuals_px: Array
@@ -232,17 +238,18 @@ def solve(
     """
     start = start or find_start(model, corners, size_px)
     purged = _purge(model, start, corners, square=True)
-    fit, covariance, groups, square = _finish(model, purged, size_px)
+    square = _are_pixels_square(model, purged, size_px)
     if not square:
         # Outliers of the fit with square pixels may fit now.
         purged = _purge(model, start, corners, square=False)
-        fit, covariance, groups, square = _finish(model, purged, size_px)
-    used_corners = purged.corners
-    far = int(np.isin(corners.image_numbers, purged.image_numbers).sum()) - len(used_corners.image_numbers)
-    residuals_px = residuals(model, fit, used_corners)
+    fit, used = purged.fit, purged.corners
+    groups, basis = group_similar_images(model, fit, used, size_px), fitted_basis(model, square, bent=True)
+    free = lens_covariance(model, fit, used, basis, loss_scale_px(model, fit, used), groups)
+    covariance = basis @ free @ basis.T
+    far = int(np.isin(corners.image_numbers, purged.image_numbers).sum()) - len(used.image_numbers)
     return SolveResult(
-        model, fit, covariance, used_corners, purged.image_numbers, residuals_px, purged.excluded, far,
-        groups, square,
+        model, fit, covariance[:-2, :-2], np.sqrt(np.diag(covariance)[-2:]), used, purged.image_numbers,
+        residuals(model, fit, used), purged.excluded, far, int(groups.max()) + 1, square,
     )  # fmt: skip
 
 
@@ -257,7 +264,7 @@ class _Purged(NamedTuple):
 
 def _purge(model: LensModel, fit: LensFit, corners: Corners, square: bool) -> _Purged:
     """Fit, leave out outliers, and fit again, until there are no outliers."""
-    basis, numbers, all_excluded = fitted_basis(model, square), np.arange(corners.image_count), []
+    basis, numbers, all_excluded = fitted_basis(model, square, bent=True), np.arange(corners.image_count), []
     for _ in range(_MOST_ROUNDS):
         fit = adjust(model, fit, corners, basis, loss_scale_px(model, fit, corners))
         keep_mask, excluded = _split_outliers(corners, residuals(model, fit, corners))
@@ -266,25 +273,21 @@ def _purge(model: LensModel, fit: LensFit, corners: Corners, square: bool) -> _P
         all_excluded += [ExcludedImage(int(numbers[one.number]), one.reason) for one in excluded]
         corners, remaining = corners.select(keep_mask)
         numbers = numbers[remaining]
-        fit = LensFit(fit.intrinsics, fit.rotations[remaining], fit.positions_m[remaining])
+        fit = replace(fit, rotations=fit.rotations[remaining], positions_m=fit.positions_m[remaining])
     return _Purged(fit, corners, numbers, tuple(all_excluded))
 
 
-def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[LensFit, Array, int, bool]:
-    """Return the last fit, its covariance (p, p), the number of groups, and whether fx = fy was assumed."""
-    start, corners = purged.fit, purged.corners
-    groups = group_similar_images(model, start, corners, size_px)
-    results = []
-    for square in (False, True):
-        basis = fitted_basis(model, square)
-        fit = adjust(model, start, corners, basis, loss_scale_px(model, start, corners))
-        covariance = lens_covariance(model, fit, corners, basis, loss_scale_px(model, fit, corners), groups)
-        results.append((fit, basis @ covariance @ basis.T, int(groups.max()) + 1, square))
-    free, covariance = results[0][:2]
-    ratio = np.array([1.0, -1.0]) / free.intrinsics[:2]
-    sigma = float(np.sqrt(ratio @ covariance[:2, :2] @ ratio))
-    off = abs(float(np.log(free.intrinsics[0] / free.intrinsics[1])))
-    return results[0] if off > max(_SURE * sigma, min(_SQUARE, _QUITE_SURE * sigma)) else results[1]
+def _are_pixels_square(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> bool:
+    """Return whether separate fx and fy do not fit images better that were left out of the fit."""
+    fit, corners = purged.fit, purged.corners
+    groups, scale_px = group_similar_images(model, fit, corners, size_px), loss_scale_px(model, fit, corners)
+    squares = []
+    for square in (True, False):
+        basis = fitted_basis(model, square, bent=True)
+        fit = adjust(model, fit, corners, basis, scale_px)
+        squares.append(held_out_squares(model, fit, corners, basis, scale_px, groups))
+    gains = squares[0] - squares[1]
+    return bool(gains.mean() <= _HELD_OUT_GAIN * gains.std(ddof=1) / np.sqrt(len(gains)))
 
 
 def determines_focal_length(solved: SolveResult) -> bool:
@@ -295,12 +298,12 @@ def determines_focal_length(solved: SolveResult) -> bool:
     """
     model, fit, corners = solved.model, solved.fit, solved.corners
     # All free directions except the focal length.
-    rest = fitted_basis(model, square=True)[:, 1:]
+    rest = fitted_basis(model, square=True, bent=True)[:, 1:]
     scale_px = loss_scale_px(model, fit, corners)
     most = fit.cost + (_WORSE * _spread(solved.residuals_px)) ** 2
     for factor in _OTHER_FOCALS:
         lens, nearer = fit.intrinsics * ([factor] * 2 + [1.0] * (len(fit.intrinsics) - 2)), [1.0, 1.0, factor]
-        other = LensFit(lens, fit.rotations, fit.positions_m * nearer)
+        other = replace(fit, intrinsics=lens, positions_m=fit.positions_m * nearer)
         for basis in (rest[:, :0], rest):
             other = adjust(model, other, corners, basis, scale_px, _OTHER_STEPS)
         if other.cost < most:

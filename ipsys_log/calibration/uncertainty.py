@@ -7,12 +7,14 @@ linear step from the fit shows their size, and the change of the other parameter
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import (
+    USUAL_BENDING_M,
     Corners,
     LensFit,
     camera_points,
@@ -24,7 +26,7 @@ from ipsys_log.calibration.bundle_adjustment import (
 from ipsys_log.calibration.image_selection import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
 
-__all__ = ["group_similar_images", "lens_covariance", "model_change"]
+__all__ = ["group_similar_images", "held_out_squares", "lens_covariance", "model_change"]
 
 Array = NDArray[np.float64]
 
@@ -52,7 +54,7 @@ def model_change(
     scale_px: float | None,
     variance: float,
 ) -> Array:
-    """Return the change of the intrinsics along ``basis`` with a richer model, (q,).
+    """Return the change of the unknowns along ``basis`` with a richer model, (q,).
 
     The change shrinks to 0 for less significant terms: noise alone mostly causes no change.
 
@@ -113,14 +115,13 @@ def _enrich(model: LensModel, fit: LensFit, basis: Array, terms: _Terms) -> tupl
 
     names = tuple(f"e{n}" for n in range(count))
     richer = model._replace(coefficients=(*model.coefficients, *names), distort_with_slopes=distort)
+    # The terms come after the intrinsics, and before the bending.
+    lens_count = len(fit.intrinsics)
     wider = np.zeros((len(basis) + count, basis.shape[1] + count))
-    wider[: len(basis), : basis.shape[1]] = basis
-    wider[len(basis) :, basis.shape[1] :] = np.eye(count)
-    return (
-        richer,
-        LensFit(np.append(fit.intrinsics, np.zeros(count)), fit.rotations, fit.positions_m),
-        wider,
-    )
+    wider[:lens_count, : basis.shape[1]] = basis[:lens_count]
+    wider[lens_count : lens_count + count, basis.shape[1] :] = np.eye(count)
+    wider[lens_count + count :, : basis.shape[1]] = basis[lens_count:]
+    return richer, replace(fit, intrinsics=np.append(fit.intrinsics, np.zeros(count))), wider
 
 
 # Near boards form one group. The limit of the distance is halved up to so many times, until there are enough
@@ -159,9 +160,9 @@ def lens_covariance(
     scale_px: float | None,
     groups: NDArray[np.intp],
 ) -> Array:
-    """Return the covariance (q, q) of the intrinsics along ``basis``.
+    """Return the covariance (q, q) of the unknowns along ``basis``.
 
-    Corners of one image share errors (a bent board, blur), and these errors differ between images. With
+    Corners of one image share errors (motion, blur), and these errors differ between images. With
     the assumption of independent errors, the covariance is too small. A jackknife over whole groups needs
     no such assumption; each group is left out in one linear step. With few groups the jackknife is
     uncertain itself: seven images may agree by chance. So it is averaged with the covariance of least
@@ -187,8 +188,30 @@ def lens_covariance(
     covariance = widening * (share * jackknife + (1 - share) * variance * squares)
     shift = model_change(model, fit, corners, basis, scale_px, variance)
     # A parameter with a prior at 0 has an error of its usual size.
-    drawn = inverse @ (normal.pull * (model.usual if np.isfinite(model.usual) else 0.0))
+    usual = np.append(np.full(len(fit.intrinsics), model.usual), np.full(2, USUAL_BENDING_M))
+    drawn = inverse @ normal.pull @ (np.linalg.pinv(basis) * np.where(np.isfinite(usual), usual, 0.0))
     return np.asarray(covariance + np.outer(shift, shift) + drawn @ drawn.T)
+
+
+def held_out_squares(
+    model: LensModel,
+    fit: LensFit,
+    corners: Corners,
+    basis: Array,
+    scale_px: float | None,
+    groups: NDArray[np.intp],
+) -> Array:
+    """Return the squared residuals of each group of images for the fit without this group, (g,) in px^2.
+
+    Each group is left out in one linear step from the fit of all images; the poses of its boards are fitted.
+    """
+    normal = normal_equations(model, fit, corners, basis, scale_px)
+    matrices, gradients = reduce_to_lens(normal)
+    of_group = (groups == np.arange(groups.max() + 1)[:, None]).astype(float)
+    own, pulls = np.einsum("gf,fij->gij", of_group, matrices), of_group @ gradients
+    shifts = np.linalg.solve(matrices.sum(axis=0) + normal.pull - own, pulls[..., None])[..., 0]
+    linear = 2 * np.einsum("gi,gi->g", pulls, shifts)
+    return np.asarray(of_group @ normal.squares + linear + np.einsum("gi,gij,gj->g", shifts, own, shifts))
 
 
 def _jackknife(whole: Array, matrices: Array, gradients: Array, groups: NDArray[np.intp]) -> Array:

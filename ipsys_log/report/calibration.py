@@ -11,6 +11,7 @@ from rich.table import Table
 
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.calibration.image_selection import ExcludedSighting
+from ipsys_log.units import MM_PER_M
 
 __all__ = ["calibration_json", "calibration_lines", "calibration_table"]
 
@@ -40,6 +41,10 @@ def calibration_lines(found: CalibrationResult) -> list[str]:
     coverage, counts = found.coverage, [f"{len(found.used)} used"]
     counts += [f"{len(found.dropped)} bad"] if found.dropped else []
     counts += [f"{len(found.spare)} not needed"] if found.spare else []
+    bending = " and ".join(
+        f"{MM_PER_M * value:.2f} +- {MM_PER_M * sigma:.2f} mm in {axis}"
+        for axis, value, sigma in zip("xy", found.bending_m, found.bending_sigma_m, strict=True)
+    )
     lines = [
         f"reprojection error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px, "
         f"{len(found.pixels)} corners",
@@ -47,6 +52,7 @@ def calibration_lines(found: CalibrationResult) -> list[str]:
         f"coverage: {coverage.share:.0%} of the image, up to {_degrees(coverage.widest_rad)} from the axis",
         f"          {coverage.position_count} board positions, "
         f"{coverage.tilted} tilted by 25 degrees or more",
+        f"bending of the board: {bending}",
     ]
     if found.outlier_corners:
         corners = "corner" if found.outlier_corners == 1 else "corners"
@@ -83,6 +89,8 @@ def calibration_json(found: CalibrationResult) -> dict[str, Any]:
         "parameters": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_deviations": dict(zip(found.names, found.sigmas.tolist(), strict=True)),
         "square_pixels": found.square,
+        "board_bending_m": found.bending_m.tolist(),
+        "board_bending_standard_deviations_m": found.bending_sigma_m.tolist(),
         "rms_px": found.rms_px,
         "median_px": found.median_px,
         "corners": len(found.pixels),

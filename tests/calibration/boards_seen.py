@@ -71,13 +71,16 @@ def seen(
     noise_px: float = 0.1,
     shared_px: float = 0.0,
     lens: tuple[float, ...] | None = None,
+    bending_m: float = 0.0,
 ) -> Corners:
     """Return board corners in images all over the field of view. Each corner has noise.
 
-    The corners of an image also share an error: a smooth warp, as of a curved board.
+    The corners of an image also share an error: a smooth warp. The board is bent along its rows: its ends are
+    behind its middle by ``bending_m``.
     """
-    truth, board_m = lens or TRUTH[name], grid_m()
-    places = board_m[:, :2] / board_m[:, :2].max()
+    truth, flat_m = lens or TRUTH[name], grid_m()
+    board_m = flat_m + np.outer((flat_m[:, 0] / flat_m[:, 0].max()) ** 2, (0, 0, bending_m))
+    places = flat_m[:, :2] / flat_m[:, :2].max()
     warp = np.column_stack([places[:, 0] ** 2, places[:, 1] ** 2, places[:, 0] * places[:, 1]])
     found: list[Array] = []
     while len(found) < pictures:
@@ -88,7 +91,7 @@ def seen(
         shared = warp @ rng.normal(0, shared_px, (3, 2)) if shared_px else 0.0
         found.append(pixels + rng.normal(0, noise_px, pixels.shape) + shared)
     numbers = np.repeat(np.arange(pictures), len(board_m))
-    return Corners(np.tile(board_m, (pictures, 1)), np.concatenate(found), numbers, pictures)
+    return Corners(np.tile(flat_m, (pictures, 1)), np.concatenate(found), numbers, pictures)
 
 
 def fisheye_rays(lens: tuple[float, ...], pixels: Array) -> Array:

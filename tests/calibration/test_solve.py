@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle_adjustment import Corners
+from ipsys_log.calibration.bundle_adjustment import Corners, adjust
 from ipsys_log.calibration.lens_models import LENS_MODELS
-from ipsys_log.calibration.solve import SolveResult, find_start, pose_from_rays, solve
+from ipsys_log.calibration.solve import SolveResult, find_start, fitted_basis, pose_from_rays, solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, seen
 from tests.tiers import first_fast
 
@@ -54,21 +54,29 @@ def test_more_noise_is_more_uncertainty() -> None:
 
 
 def test_opencv_finds_the_same_pinhole() -> None:
-    """On the same corners, the results agree within a part of the sigma.
-
-    Only doubtful corners have other weights.
-    """
-    corners = seen("pinhole", np.random.default_rng(3))
-    found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
+    """On the same corners of a flat board, plain least squares have the same minimum."""
+    model, corners = LENS_MODELS["pinhole"], seen("pinhole", np.random.default_rng(3))
+    start = find_start(model, corners, SIZE_PX)
+    fit = adjust(model, start, corners, fitted_basis(model, square=True), None)
     bounds = [*corners.starts, len(corners.image_numbers)]
     boards = [corners.board_m[a:b].astype(np.float32) for a, b in pairwise(bounds)]
     pixels = [corners.pixels[a:b].astype(np.float32) for a, b in pairwise(bounds)]
-    start = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    guess = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_USE_INTRINSIC_GUESS
-    _, k, d, _, _ = cv2.calibrateCamera(boards, pixels, SIZE_PX, start, np.zeros(5), flags=flags)
+    _, k, d, _, _ = cv2.calibrateCamera(boards, pixels, SIZE_PX, guess, np.zeros(5), flags=flags)
     theirs = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:5]])
-    assert found.square
-    assert (np.abs(found.fit.intrinsics - theirs) < 0.35 * np.sqrt(np.diag(found.covariance))).all()
+    np.testing.assert_allclose(fit.intrinsics, theirs, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["fisheye", "pinhole"])
+def test_bent_board_gives_its_bending_and_true_intrinsics(name: str) -> None:
+    """Taken as flat, the board gives the pinhole a focal length that is 1.7 % too short, 7 sigmas."""
+    corners = seen(name, np.random.default_rng(1), noise_px=0.05, bending_m=0.0005)
+    found = solve(LENS_MODELS[name], corners, SIZE_PX)
+    errors = (found.fit.intrinsics - TRUTH[name]) / np.sqrt(np.diag(found.covariance))
+    assert (np.abs(errors) < 3).all()
+    assert (np.abs(found.fit.bending_m - (0.0005, 0.0)) < 3 * found.bending_sigma_m).all()
+    assert (found.bending_sigma_m < 0.0001).all()
 
 
 def test_pixels_that_are_not_square() -> None:

@@ -26,7 +26,7 @@ _RESETS = 256
 _UNKNOWN_YAW_SIGMA_RAD = 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _LocalPose:
     """A pose in the axes north, east, down, in m and rad; velocities along the axes of the robot.
 

@@ -52,6 +52,7 @@ from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, channel_of
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_inputs
+from ipsys_log.runs.continuation import continue_newest
 from ipsys_log.runs.execute import sign
 from ipsys_log.runs.graph import stages_until
 from ipsys_log.runs.one_pass import OnePass
@@ -102,6 +103,8 @@ def replay(
     """
     check_jobs(jobs)
     stages = stages_until(until)
+    if until is not None:
+        request = continue_newest(request, paths, stages[-1])
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)

@@ -50,6 +50,7 @@ from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, channel_of
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.continuation import continue_newest
@@ -264,7 +265,9 @@ def live(
     if path is None:
         raise IpsysError(f"{target}: its runs have no records yet; find the log, and run: ipsys repair LOG")
     if fault is not None:
-        raise IpsysError(f"{fault}; {path} has all frames; to process them: ipsys replay {path}") from fault
+        raise IpsysError(
+            f"{fault}; {path} has all frames; to process them: ipsys replay {shell_words(path)}"
+        ) from fault
     try:
         outcomes = sign(path, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:
@@ -272,7 +275,7 @@ def live(
     if frames.skipped:
         cameras.say(
             f"{frames.skipped.total()} frames skipped: processing could not keep up. All are recorded. To "
-            f"process all: ipsys replay {path}; --as-live excludes the skipped frames"
+            f"process all: ipsys replay {shell_words(path)}; --as-live excludes the skipped frames"
         )
     show.check()
     return outcomes

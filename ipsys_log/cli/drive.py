@@ -12,6 +12,7 @@ from ipsys_log.cli.console import console, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
 from ipsys_log.cli.options import AsJson, Force, NewLog, OneLog, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.closed_loop.settings import RobotRun
@@ -128,4 +129,4 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
         print(json.dumps(robot_run_json(result), indent=2))  # noqa: T201
         return
     console.print(robot_run_tables(result))
-    console.print(f"{output} written; its figure: ipsys report {output}", markup=False)
+    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}", markup=False)

@@ -78,8 +78,7 @@ def measure(options: argparse.Namespace) -> Report:
 def _run(calibrated: Path, seed: int, case: str, options: argparse.Namespace) -> RobotRun:
     lab = read_lab(calibrated, LabSettings(markers=1, rate_hz=options.frame_rate))
     paths = choose_paths(1, [_SHORT] if options.smoke else [])
-    program = Path(__file__).resolve().parent.parent / PROGRAM
-    return RobotRun(lab, paths, program, over=options.over, lockstep=True, port=0, seed=seed, **_FAULTS[case])
+    return RobotRun(lab, paths, PROGRAM, over=options.over, lockstep=True, port=0, seed=seed, **_FAULTS[case])
 
 
 def _driven(run: RobotRun, log: Path, request: Request) -> RobotRunResult:

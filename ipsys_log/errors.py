@@ -55,7 +55,11 @@ class SizeError(IpsysError):
 
 def os_error_text(error: OSError) -> str:
     """Return an error of the operating system in one line, with the name of its file."""
-    cause = f"the disk is full; {disk_advice(error)}" if is_full(error) else str(error.strerror or error)
+    cause = str(error.strerror or error)
+    if is_full(error):
+        cause = f"the disk is full; {disk_advice(error)}"
+    elif error.errno == errno.EIO:
+        cause = f"cannot be read or written ({cause}); {disk_advice(error)}"
     return f"{error.filename}: {cause}" if error.filename else cause
 
 

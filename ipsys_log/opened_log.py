@@ -20,6 +20,7 @@ from ipsys_log.log.log_files import find_logs
 from ipsys_log.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, TRACKS, TRUTH, Channel
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
@@ -323,7 +324,7 @@ class Log:
                 name for name in sorted(self._session.run_names()) if self._session.topics(channel, name)
             ]
             which = f"run {run} has no {channel.name}" if run else f"no run has {channel.name}"
-            advice = f"; compute them: ipsys replay {self.paths[-1]}" if not known else ""
+            advice = f"; compute them: ipsys replay {shell_words(self.paths[-1])}" if not known else ""
             raise IpsysError(f"{self._session}: {which} (it is in: {', '.join(known) or 'none'}){advice}")
         return name
 

@@ -50,8 +50,10 @@ from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, channel_of
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_inputs
+from ipsys_log.runs.continuation import continue_newest
 from ipsys_log.runs.execute import sign
 from ipsys_log.runs.graph import stages_until
 from ipsys_log.runs.one_pass import OnePass
@@ -102,6 +104,8 @@ def replay(
     """
     check_jobs(jobs)
     stages = stages_until(until)
+    if until is not None:
+        request = continue_newest(request, paths, stages[-1])
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)
@@ -261,7 +265,9 @@ def live(
     if path is None:
         raise IpsysError(f"{target}: its runs have no records yet; find the log, and run: ipsys repair LOG")
     if fault is not None:
-        raise IpsysError(f"{fault}; {path} has all frames; to process them: ipsys replay {path}") from fault
+        raise IpsysError(
+            f"{fault}; {path} has all frames; to process them: ipsys replay {shell_words(path)}"
+        ) from fault
     try:
         outcomes = sign(path, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:
@@ -269,7 +275,7 @@ def live(
     if frames.skipped:
         cameras.say(
             f"{frames.skipped.total()} frames skipped: processing could not keep up. All are recorded. To "
-            f"process all: ipsys replay {path}; --as-live excludes the skipped frames"
+            f"process all: ipsys replay {shell_words(path)}; --as-live excludes the skipped frames"
         )
     show.check()
     return outcomes

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 import unicodedata
 from collections.abc import Sequence
 
-__all__ = ["join_names", "plain_text"]
+__all__ = ["join_names", "plain_text", "shell_words"]
 
 # Control characters, invisible ones that change the direction of text, bytes of a file name that are not
 # UTF-8, and separators of lines.
@@ -46,6 +47,17 @@ def _escape(sign: str) -> str:
     if number < 0x100:
         return f"\\x{number:02x}"
     return f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
+
+
+def shell_words(*names: object) -> str:
+    """Return names of files as words of a suggested command: a shell reads each of them as one word.
+
+    Examples
+    --------
+    >>> print("ipsys info", shell_words("a b.mcap", "c.mcap"))
+    ipsys info 'a b.mcap' c.mcap
+    """
+    return " ".join(shlex.quote(str(name)) for name in names)
 
 
 def join_names(names: Sequence[str], most: int = 5) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import subprocess
 import sys
@@ -338,6 +340,28 @@ def test_a_bug_keeps_its_traceback(ipsys: Ipsys, lab: Path, monkeypatch: pytest.
     monkeypatch.setattr("ipsys_log.pipeline.check_inputs", broken)
     with pytest.raises(KeyError, match="a bug"):
         ipsys("replay", lab)
+
+
+@pytest.mark.parametrize("command", ["info", "check", "replay"])
+def test_read_error_of_the_disk_is_one_line(
+    ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """The bytes from the middle of the file on cannot be read. This is no damage of the log."""
+    middle, read = lab.stat().st_size // 2, os.pread
+
+    def fail(fd: int, length: int, offset: int) -> bytes:
+        if offset >= middle:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return read(fd, length, offset)
+
+    monkeypatch.setattr(os, "pread", fail)
+    done = ipsys(command, lab)
+    assert done.code != 0
+    assert "the disk or its connection has failed: copy the log to another disk" in " ".join(
+        (done.out + done.err).split()
+    )
+    assert lab.name in done.out + done.err
+    assert "ipsys repair" not in done.out + done.err
 
 
 def test_the_real_command_too(tmp_path: Path) -> None:

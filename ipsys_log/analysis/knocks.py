@@ -51,7 +51,7 @@ class Knock(NamedTuple):
     text: str
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _History:
     """Values over the last seconds, and the time since when they have changed."""
 

@@ -15,6 +15,7 @@ from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.errors import LogError, WriteError, is_full
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import RigCamera
+from ipsys_log.plain_text import shell_words
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
 __all__ = [
@@ -144,7 +145,7 @@ def describe_disk_failure(path: Path, fault: OSError) -> str:
     """Describe what to do with a log that may be incomplete on a failed disk."""
     return (
         f"{path}: {describe_disk_fault(fault)} during the recording; messages may be missing. To check the "
-        f"log: ipsys repair {path}. Record to another disk"
+        f"log: ipsys repair {shell_words(path)}. Record to another disk"
     )
 
 

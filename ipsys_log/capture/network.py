@@ -231,8 +231,8 @@ def _open(address: str, label: str) -> InputContainer:
     try:
         if host is not None:  # udp://:5000 is sent to this machine
             socket.getaddrinfo(host, None)
-    except socket.gaierror as error:
-        if error.errno == socket.EAI_NONAME:
+    except (socket.gaierror, UnicodeError) as error:  # UnicodeError: a part of the name is empty or too long
+        if isinstance(error, UnicodeError) or error.errno == socket.EAI_NONAME:
             raise SourceError(f"{label}: the host {host!r} does not exist; check the address") from error
         raise SourceError(
             f"{label}: the name {host!r} cannot be resolved ({error.strerror}); check the network, "

@@ -32,6 +32,7 @@ from ipsys_log.messages import (
     Measurement,
     Message,
 )
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.output import serialize, write_message
 
 __all__ = [
@@ -296,7 +297,9 @@ def open_recording(
                 if log.settle():
                     raise
                 resources.pop_all()  # a torn log cannot be ended, and a hanging write would block here
-                text = f"{path}: interrupted during writing; to check the log: ipsys repair {path}"
+                text = (
+                    f"{path}: interrupted during writing; to check the log: ipsys repair {shell_words(path)}"
+                )
                 raise IpsysError(text) from error
     except WriteError as error:
         raise IpsysError(describe_disk_full(path, error)) from error

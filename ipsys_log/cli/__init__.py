@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import sys
 import textwrap
@@ -29,7 +30,7 @@ def main() -> None:
         sys.stderr.close()  # the reader of the pipe, such as head, has ended
         sys.exit(0)
     except OSError as error:
-        if error.filename is None and not is_full(error):
+        if error.filename is None and not is_full(error) and error.errno != errno.EIO:
             raise
         sys.exit(_complain(os_error_text(error)))
     except InterruptError as interrupt:

@@ -14,6 +14,7 @@ from ipsys_log.cli.batch_options import DERIVED, EXPORT, FOLDER, LOGS, OUTDATED,
 from ipsys_log.cli.batch_progress import batch_bar
 from ipsys_log.cli.console import console, remarks, say
 from ipsys_log.cli.options import check_present
+from ipsys_log.cli.signals import say_kept
 from ipsys_log.cli.stages import build_command, options_until, replay_options
 
 if TYPE_CHECKING:
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
 __all__ = ["add_commands"]
 
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
+_KEPT = "complete results are kept; nothing else is changed"
+_KEPT_BY_SCHEDULER = (
+    "complete results are kept; the workers of the scheduler complete the logs that they have begun, and no "
+    "others"
+)
 _REPEAT = " After a failure or an interrupt, repeat the command: it computes only what is missing."
 
 
@@ -204,7 +210,9 @@ def _collect(task: BatchTask, paths: Sequence[LogLocation], settings: WorkerSett
     from ipsys_log.batch.workers import most_tasks, open_workers
 
     by_log: dict[str, LogResult] = {}
-    with open_workers(settings, most_tasks(paths) if task.divides else len(paths)) as workers:
+    kept = _KEPT if settings.scheduler is None else _KEPT_BY_SCHEDULER
+    count = most_tasks(paths) if task.divides else len(paths)
+    with say_kept(lambda _: kept), open_workers(settings, count) as workers:
         say(f"dashboard: {workers.dashboard}")
         with batch_bar(len(paths)) as (show, show_pieces):
             for result in run_batch(workers, task, paths, show_pieces):

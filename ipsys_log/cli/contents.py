@@ -12,6 +12,7 @@ import typer
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import AsJson, LogList, ReadLogs, log_argument
 from ipsys_log.cli.signals import writes_nothing
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
@@ -143,7 +144,10 @@ def _wanted(session: Session, topics: list[str]) -> list[str]:
     named = [topic for words in topics for topic in words.split(",") if topic]
     for topic in named:
         if topic not in known:
-            raise IpsysError(f"{session}: has no topic {topic}; to list the topics: ipsys info {session}")
+            raise IpsysError(
+                f"{session}: has no topic {topic}; to list the topics: "
+                f"ipsys info {shell_words(*session.paths)}"
+            )
     return named or sorted(known)
 
 

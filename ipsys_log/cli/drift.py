@@ -10,6 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, LogList, OtherLog, RigFile, log_argument, other_log_option
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.survey.drift_reading import DriftReading
@@ -102,7 +103,7 @@ def _fix(reading: DriftReading) -> str | None:
     run = append_mended_model(last, reading.source, reading.paths[0], changes, valid_from_ns)
     say(
         f"{reading.paths[-1]}: run {run} has the model with the new poses of {', '.join(changes)}; to use "
-        f"it: ipsys live --model-from {reading.paths[-1]} --model joint"
+        f"it: ipsys live --model-from {shell_words(reading.paths[-1])} --model joint"
     )
     return run
 

@@ -12,6 +12,7 @@ from ipsys_log.cli.console import console, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
 from ipsys_log.cli.options import AsJson, Force, NewLog, OneLog, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.closed_loop.settings import RobotRun
@@ -59,8 +60,11 @@ def drive(
     robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
-        Path, typer.Option("--program", metavar="FILE", help="The program of the robots.")
-    ] = Path("examples/robot/robot.py"),
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--program", metavar="FILE", help="The program of the robots (default: the example of ipsys)."
+        ),
+    ] = None,
     over: Annotated[
         str, typer.Option("--over", metavar="udp|vrpn|ros2", help="The stream of the positions.")
     ] = "udp",
@@ -92,7 +96,7 @@ def drive(
     This is the robot experiment of the paper (sect. 4.3). Images are drawn, recorded, processed and streamed
     as by live. The log has the commands of the robots and the ground truth, too."""
     allow_interrupt("stopped before the drive began; no log was written")
-    from ipsys_log.closed_loop.settings import RobotRun, choose_paths, parse_failure, read_lab
+    from ipsys_log.closed_loop.settings import PROGRAM, RobotRun, choose_paths, parse_failure, read_lab
     from ipsys_log.runs.options import Request
     from ipsys_log.simulation.settings import LabSettings
 
@@ -100,7 +104,7 @@ def drive(
     run = RobotRun(
         read_lab(model_from, LabSettings(seed=lab_seed, markers=max(robots, 1), rate_hz=rate_hz)),
         choose_paths(robots, path or ()),
-        program,
+        program or PROGRAM,
         over,
         loss,
         delay_ms / 1000,
@@ -128,4 +132,4 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
         print(json.dumps(robot_run_json(result), indent=2))  # noqa: T201
         return
     console.print(robot_run_tables(result))
-    console.print(f"{output} written; its figure: ipsys report {output}", markup=False)
+    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}", markup=False)

@@ -10,6 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import AsJson, appended_log_argument
+from ipsys_log.plain_text import shell_words
 
 __all__ = ["add_commands"]
 
@@ -55,4 +56,4 @@ def exclude(
     console.print(
         f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}", markup=False
     )
-    remarks.print(f"next: ipsys replay {log}", markup=False)
+    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)

@@ -11,6 +11,7 @@ import typer
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.local_files import read_files
 from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appended_log_option, log_option
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.exchange.import_truth import TruthOptions
@@ -309,8 +310,9 @@ def _refuse_log(path: Path) -> None:
         return  # a folder, or no file: the importer reports it
     if is_log:
         raise IpsysError(
-            f"{path}: is already a log and needs no import. To list its contents: ipsys info {path}; "
-            f"to process it: ipsys replay {path}"
+            f"{path}: is already a log and needs no import. To list its contents: "
+            f"ipsys info {shell_words(path)}; "
+            f"to process it: ipsys replay {shell_words(path)}"
         )
 
 

@@ -27,6 +27,7 @@ from ipsys_log.cli.options import (
     log_option,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement
@@ -230,7 +231,7 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
             f"model, and about {_GOOD} for a good one",
             markup=False,
         )
-    remarks.print(f"next: ipsys replay {log}", markup=False)
+    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:

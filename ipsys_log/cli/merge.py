@@ -11,6 +11,7 @@ import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, LogList, NewLog, Overwrite, log_argument
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
@@ -63,7 +64,7 @@ def merge(
     console.print(
         f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}", markup=False
     )
-    remarks.print(f"next: ipsys replay {output}", markup=False)
+    remarks.print(f"next: ipsys replay {shell_words(output)}", markup=False)
 
 
 def _show(logs: Sequence[LogLocation], offsets: Sequence[LogOffset], result: MergeResult) -> None:

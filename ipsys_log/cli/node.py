@@ -11,6 +11,7 @@ from ipsys_log.cli.console import remarks, say
 from ipsys_log.cli.open_cameras import Lab, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import Calibrations, Corners, Force, log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.capture.nodes.network import NodeNetwork
@@ -74,7 +75,7 @@ def node(
 
     check_installed("node needs", "zenoh")
     if not camera:
-        raise IpsysError(f"{rig}: name the camera of this host: ipsys node {rig} --camera NAME")
+        raise IpsysError(f"{rig}: name the camera of this host: ipsys node {shell_words(rig)} --camera NAME")
     if corners is not None and not detect:
         raise IpsysError(f"--corners {corners}: has no effect without --detect")
     lab = prepare_lab(rig, [camera], calibration, with_lenses=detect)

@@ -182,10 +182,10 @@ def open_cameras(
         # A log without a recording grows only with measured points.
         growing = None if doing and seconds is None else expected
         monitor = stack.enter_context(CameraMonitor(lab.rig))
-        status = LiveStatus(attached.states, monitor, output, monotonic, growing)
+        status = LiveStatus(attached.states, monitor, output, monotonic, growing, None if doing else say)
         stack.callback(status.close)
         _say_room(lab, attached, free_room(output, expected), seconds, doing)
-        say(doing or f"recording into {output}; Ctrl-C to end")
+        say(doing or "the cameras are open; Ctrl-C to end")
         if panel:
             stack.enter_context(_on_screen(status))
         yield attached, first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run), status

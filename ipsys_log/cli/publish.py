@@ -11,6 +11,7 @@ import typer
 from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import say_kept
+from ipsys_log.plain_text import shell_words
 
 __all__ = ["add_commands"]
 
@@ -72,7 +73,10 @@ def pack(
 
     if card_form is not None:
         write_card_form(card_form)
-        remarks.print(f"{card_form} written: fill it in, then: ipsys pack LOG -o dataset --card {card_form}")
+        remarks.print(
+            f"{card_form} written: fill it in, then: "
+            f"ipsys pack LOG -o dataset --card {shell_words(card_form)}"
+        )
         return
     if not logs or output is None:
         raise IpsysError("pack needs logs and a dataset: ipsys pack lab.mcap -o dataset --card card.toml")

@@ -13,6 +13,7 @@ import typer
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import NewLog, OtherLog, other_log_option
 from ipsys_log.cli.signals import say_kept
+from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
@@ -105,7 +106,7 @@ def _init_simulated(path: Path) -> None:
     console.print(
         f"{tape} written: the tape measurements of its {len(lines) - 1} stationary markers", markup=False
     )
-    console.print(f"next: ipsys align --rig {path}", markup=False)
+    console.print(f"next: ipsys align --rig {shell_words(path)}", markup=False)
 
 
 def _rig_of(log: LogLocation) -> str:

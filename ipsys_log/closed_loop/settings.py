@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 PORT = 9870
-PROGRAM = Path("examples/robot/robot.py")
+PROGRAM = Path(__file__).parent / "example_robot" / "robot.py"
 # The first path is that of the paper (sect. 4.3). The paths of the other robots cross it at other times.
 PATHS: tuple[tuple[Waypoint, ...], ...] = (
     (Waypoint(0.5, 0.5), Waypoint(0.5, 2.5), Waypoint(2.5, 2.5), Waypoint(4.5, 4.5)),
@@ -111,8 +111,8 @@ class RobotRun:
         """
         if not self.program.is_file():
             raise IpsysError(
-                f"--program {self.program}: does not exist; name the program of the robots, such as "
-                f"{PROGRAM} in the source of ipsys"
+                f"--program {self.program}: does not exist; name the program of the robots, or leave "
+                "--program out for the example of ipsys"
             )
         self._check_stream()
         if not 0 <= self.loss < 1:

@@ -27,6 +27,7 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.file import check_name
 from ipsys_log.runs.output import append_run, open_target
 from ipsys_log.runs.provenance import check_run_name, fingerprint, free_name
@@ -84,7 +85,8 @@ def import_detections(
         if session is not None and session.images:
             raise IpsysError(
                 f"{session}: has images, in which ipsys detects the markers itself; import into a part "
-                f"without images: ipsys cut {session} -o part.mcap --exclude-topics '/cameras/*/image'"
+                f"without images: "
+                f"ipsys cut {shell_words(*session.paths)} -o part.mcap --exclude-topics '/cameras/*/image'"
             )
         if options.rig is None and (session is None or not session.topics(RIG)):
             raise IpsysError(f"{session or file}: has no rig; add --rig FILE")

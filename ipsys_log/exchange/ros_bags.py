@@ -123,7 +123,7 @@ def read_bag(
     with _open_bag(path) as reader:
         connections = [connection for connection in reader.connections if connection.topic in camera_of]
         total = sum(connection.msgcount for connection in connections)
-        log_ns = int(reader.start_time) - len(given) - 2
+        log_ns = max(int(reader.start_time) - len(given) - 2, 0)  # a simulated clock starts at 0
         if rig is not None:
             yield Message(RIG_TOPIC, log_ns, log_ns, rig)
         for camera, lens in sorted(given.items()):

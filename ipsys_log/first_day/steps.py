@@ -12,7 +12,7 @@ from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.first_day.lab_folder import FitFacts, LabFolder, LogFacts
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.models.table import min_pairs
-from ipsys_log.plain_text import join_names
+from ipsys_log.plain_text import join_names, shell_words
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import check_references
 
@@ -202,7 +202,7 @@ def _points_step(rig: Rig | None, logs: tuple[LogFacts, ...], missing: str) -> S
 
 
 def _accuracy_step(calibration: list[Path], logs: tuple[LogFacts, ...], fit: FitFacts | None) -> StepState:
-    names = " ".join(path.name for path in calibration) or "calibration.mcap"
+    names = shell_words(*(path.name for path in calibration)) or "calibration.mcap"
     title, command = "Fit and evaluation", f"ipsys replay {names}"
     if fit is not None and not fit.stale:
         text = "fitted" if fit.mean_cm is None else f"mean position error {fit.mean_cm:.1f} cm"
@@ -216,7 +216,7 @@ def _accuracy_step(calibration: list[Path], logs: tuple[LogFacts, ...], fit: Fit
 def _live_step(
     calibration: list[Path], logs: tuple[LogFacts, ...], fit: FitFacts | None, missing: str
 ) -> StepState:
-    model = calibration[-1].name if calibration else "calibration.mcap"
+    model = shell_words(calibration[-1].name) if calibration else "calibration.mcap"
     command = f"ipsys live --rig lab.toml --model-from {model} -o live.mcap --web"
     tracked = [log.path.name for log in logs if log.tracked]
     if tracked:

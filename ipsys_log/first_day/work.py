@@ -269,7 +269,7 @@ def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
 def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
     """Record all cameras into a new log for some seconds."""
     with _open_lab(folder, job) as lab:
-        job.say(f"recording into {log.name} for {seconds:g} s")
+        job.say(f"the cameras are open; {log.name} gets {seconds:g} s")
         enough = _Enough(lab.cameras, seconds, job)
         pipeline.record(lab.cameras, lab.settings, log, [enough])
 

@@ -12,6 +12,7 @@ from typing import Protocol
 from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import BoundError, ReadLimits
 from ipsys_log.log.location import LogLocation
+from ipsys_log.plain_text import shell_words
 
 __all__ = ["FileBytes", "LogBytes", "file_identity", "open_for_reading"]
 
@@ -92,7 +93,7 @@ class FileBytes:
         if self.patches:
             return self._patched(offset, self._unpatched(offset, length))
         if end <= self.tail_offset:
-            data = os.pread(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
+            data = self._read_once(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
             return data if len(data) == length else self._pread(self.fd, offset, length)
         return self._unpatched(offset, length)
 
@@ -136,7 +137,9 @@ class FileBytes:
 
     def fault(self, offset: int, reason: str) -> LogError:
         """Return the error for damage at `offset`."""
-        return LogError(f"{self.path} is damaged at byte {offset}: {reason}. Run: ipsys repair {self.path}")
+        return LogError(
+            f"{self.path} is damaged at byte {offset}: {reason}. Run: ipsys repair {shell_words(self.path)}"
+        )
 
     def refusal(self, reason: str) -> BoundError:
         """Return the error for a log that exceeds the limits. Such a log may be undamaged."""
@@ -156,14 +159,21 @@ class FileBytes:
                 os.close(fd)
         self.fd = self.tail_fd = -1
 
+    def _read_once(self, fd: int, length: int, offset: int) -> bytes:
+        """Read at most `length` bytes; an error of the disk names the file. It is no damage of the log."""
+        try:
+            return os.pread(fd, length, offset)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from None
+
     def _pread(self, fd: int, offset: int, length: int) -> bytes:
-        data = os.pread(fd, min(length, _MOST_PER_CALL), offset)
+        data = self._read_once(fd, min(length, _MOST_PER_CALL), offset)
         if len(data) == length:
             return data
         parts = [data]
         length_read = len(data)
         while data and length_read < length:
-            data = os.pread(fd, min(length - length_read, _MOST_PER_CALL), offset + length_read)
+            data = self._read_once(fd, min(length - length_read, _MOST_PER_CALL), offset + length_read)
             parts.append(data)
             length_read += len(data)
         if length_read < length:

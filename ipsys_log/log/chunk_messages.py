@@ -145,7 +145,7 @@ _SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message reco
 _new = tuple.__new__  # RawMessage(...) calls a Python function and takes twice as long
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class RangeCache:
     """A cache of the byte ranges read last. Its memory is bounded, even if many chunks overlap in time."""
 

@@ -32,7 +32,7 @@ _VARINT, _FIXED64, _LENGTH = 0, 1, 2
 _MOST_SHAPES = 64  # for messages of one length; the other messages are read one by one
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Column:
     """The values of a field, (n,), or (n, k) for a list of k numbers; and the mask of missing values, (n,).
 
@@ -43,7 +43,7 @@ class Column:
     missing: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Columns:
     """The items of messages: the number of the message of each item, (n,) ascending, and its fields."""
 

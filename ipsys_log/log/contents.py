@@ -152,6 +152,9 @@ class Contents:
         self.end_ns = end_ns if self.end_ns is None else max(self.end_ns, end_ns)
 
 
+_LOST_SCHEMA = Schema("", "", b"")
+
+
 def free_id(known: Mapping[int, object]) -> int | None:
     """Return the lowest id above all known ids, else a free id below, else None."""
     above = max(known, default=0) + 1
@@ -177,6 +180,11 @@ def group_by_topic(contents: Contents) -> tuple[Mapping[str, StoredChannel], Map
                 record.topic, schema, record.message_encoding, metadata, count
             )
             continue
+        # Repair writes an empty schema in place of a lost one: it is that of the other channels of the topic.
+        if first.schema == _LOST_SCHEMA:
+            first = replace(first, schema=schema)
+        elif schema == _LOST_SCHEMA:
+            schema = first.schema
         if (_kind(first.schema), first.message_encoding) != (_kind(schema), record.message_encoding):
             conflicts[record.topic] = _difference(record.topic, first, schema, record.message_encoding)
         channels[record.topic] = replace(first, message_count=first.message_count + count)

@@ -12,6 +12,7 @@ from typing import Protocol
 from ipsys_log.errors import LogError, WriteError, disk_advice
 from ipsys_log.log.hashing import Buffer, extend
 from ipsys_log.log.journal import Storage, replace_tail, roll_back, write_all
+from ipsys_log.plain_text import shell_words
 
 __all__ = ["NewFile", "Output", "PendingAppend", "cannot_write"]
 
@@ -58,7 +59,7 @@ class NewFile:
             write_all(self.storage, self.fd, data, self.offset)
         except OSError as error:
             self._failed = True
-            advice = f"to save the written part: ipsys repair {self.path}"
+            advice = f"to save the written part: ipsys repair {shell_words(self.path)}"
             outcome = advice if self.target is None else f"nothing was written: {disk_advice(error)}"
             raise cannot_write(self.target or self.path, error, outcome) from None
         self.offset += len(data)
@@ -170,11 +171,11 @@ class PendingAppend:
             )  # fmt: skip
             return
         if size == self.size:
-            outcome = f"the log is unchanged: {disk_advice(error)}"
+            outcome = f"nothing of this result was written, and the log is whole: {disk_advice(error)}"
         else:
             outcome = (
                 f"no recorded data are lost, and ipsys can read the old log with {self.path.name}.journal "
-                f"beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
+                f"beside it; {disk_advice(error)}, and run: ipsys repair {shell_words(self.path)}"
             )
         raise cannot_write(self.path, error, outcome) from None
 

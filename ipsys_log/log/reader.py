@@ -40,6 +40,7 @@ from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
 from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
 from ipsys_log.log.summary import NoFooterError
+from ipsys_log.plain_text import shell_words
 
 __all__ = ["LogReader", "stored_hashes"]
 
@@ -289,7 +290,9 @@ class LogReader:
             The log has no such topic, or a record of it is damaged.
         """
         if topic not in self.channels:
-            raise LogError(f"{self.path} has no topic {topic}. To list the topics: ipsys info {self.path}")
+            raise LogError(
+                f"{self.path} has no topic {topic}. To list the topics: ipsys info {shell_words(self.path)}"
+            )
         state = self._known_hash(topic)
         if state is None:
             state = ChannelHash()

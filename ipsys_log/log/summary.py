@@ -15,6 +15,7 @@ from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, parse, parse_chunk_index, to_bytes, walk
 from ipsys_log.log.scan import scan
+from ipsys_log.plain_text import shell_words
 
 __all__ = [
     "TEMPORARY_TAIL_MARK",
@@ -186,7 +187,9 @@ def _footer(view: LogBytes) -> tuple[int, int, bool]:
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
         # A file is repaired in place; an object at a URL cannot be.
         is_file = isinstance(path, Path)
-        steps = f"Run: ipsys repair {path}" if is_file else "Download the log, and repair the file"
+        steps = (
+            f"Run: ipsys repair {shell_words(path)}" if is_file else "Download the log, and repair the file"
+        )
         raise NoFooterError(
             f"{path} has no end: its recorder was killed, or the file was cut off. Its messages can be "
             f"saved. {steps}"

@@ -15,6 +15,7 @@ from ipsys_log.images.decode import decode_grey
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, RawImage
 from ipsys_log.messages.channels import CHANNELS, CUTS, MARKERS
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.provenance import newest_run
@@ -43,7 +44,10 @@ def marker_corners(session: Session) -> dict[tuple[str, int], list[NDArray[np.fl
     """
     run = newest_run(session, MARKERS)
     if run is None:
-        raise IpsysError(f"{session}: has no markers, which --blur keeps sharp; run: ipsys detect {session}")
+        raise IpsysError(
+            f"{session}: has no markers, which --blur keeps sharp; run: "
+            f"ipsys detect {shell_words(*session.paths)}"
+        )
     return {
         (str(message.camera), message.log_time_ns): [
             np.asarray(marker.corners_px, dtype=np.float64) for marker in message.payload.markers

@@ -9,6 +9,7 @@ from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.messages.channels import CHANNELS, MARKERS, MEASUREMENTS, RECORD
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.cut_selection import CutOptions
 from ipsys_log.runs.graph import stage_named
 from ipsys_log.runs.provenance import newest_run
@@ -34,7 +35,8 @@ def kept_channels(session: Session, without_images: bool) -> set[str]:
         kept |= {*session.topics(MARKERS, run_name), RECORD.topic_of(run_name)}
     elif session.images:
         raise IpsysError(
-            f"{session}: has no markers, which a pack without images needs; run: ipsys detect {session}"
+            f"{session}: has no markers, which a pack without images needs; run: "
+            f"ipsys detect {shell_words(*session.paths)}"
         )
     return kept
 

@@ -33,7 +33,7 @@ from ipsys_log.units import CM_PER_M
 __all__ = ["Accuracy", "accuracy_json", "gather_outliers", "read_accuracy", "read_trajectories"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
     """The evaluation of one model, and the errors of its tracks if the log has ground truth.
 

@@ -20,8 +20,8 @@ from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.capture.recorded_file import RecordedFile
-from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.units import CM_PER_M, format_bytes, format_duration
+from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
+from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 
 __all__ = [
     "LiveStatus",
@@ -48,6 +48,7 @@ class LiveStatus:
     target : the log that is written.
     now_s : clock for the rates.
     expected_bytes_per_s : growth of the log, until it can be measured; None if it does not grow with time.
+    say : called once, with the path of the log, when the first frame is in the file.
 
     Attributes
     ----------
@@ -61,11 +62,14 @@ class LiveStatus:
         target: Path,
         now_s: Callable[[], float],
         expected_bytes_per_s: float | None = None,
+        say: Callable[[str], None] | None = None,
     ) -> None:
         self._states, self._monitor, self._target, self._now_s = states, monitor, target, now_s
         self.log, self._size = target, 0
         self._file: RecordedFile | None = None
         self._begin_s = now_s()
+        self._say, self._size_with_frame = say, 0
+        self._span_ns: tuple[int, int] | None = None
         self._expected_bytes_per_s = expected_bytes_per_s
         self._before: dict[str, tuple[float, int, int]] = {}
         self._rates: dict[str, tuple[float, float]] = {}
@@ -79,13 +83,30 @@ class LiveStatus:
 
     def __call__(self, message: Message | None) -> None:
         """Handle one recorded message."""
-        self._open_log()
+        self._announce(message)
         self._monitor(message)
         if message is None:
             return
+        begin_ns, end_ns = self._span_ns or (message.log_time_ns, message.log_time_ns)
+        self._span_ns = min(begin_ns, message.log_time_ns), max(end_ns, message.log_time_ns)
         self._overlap(message)
         if isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
+
+    def _announce(self, message: Message | None) -> None:
+        """Report the recording as soon as the file has grown by the first frame."""
+        file = self._open_log()
+        if self._say is None or file is None:
+            return
+        if self._size_with_frame and file.size >= self._size_with_frame:
+            self._say(f"recording into {self._target}; Ctrl-C to end")
+            self._say = None
+        elif not self._size_with_frame and message is not None:
+            frame = message.payload
+            if isinstance(frame, (CompressedImage, CompressedVideo)):
+                self._size_with_frame = file.size + len(frame.data)
+            elif isinstance(frame, Markers):
+                self._size_with_frame = file.size + 1
 
     def close(self) -> None:
         """Note the path and the size of the finished log."""
@@ -133,8 +154,9 @@ class LiveStatus:
 
     def summary(self) -> list[str]:
         """Return the lines that describe a finished recording."""
-        took_s = self._now_s() - self._begin_s
-        lines = [f"{self.log} written: {took_s:.1f} s, {format_bytes(self._size)}"]
+        begin_ns, end_ns = self._span_ns or (0, 0)
+        span_s = (end_ns - begin_ns) / NS_PER_S
+        lines = [f"{self.log} written: {span_s:.1f} s, {format_bytes(self._size)}"]
         for name, state in self._states.items():
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
             missed = f", {state.missed} lost before arrival" if state.missed else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, POSITIONS, TRACKS
 from ipsys_log.models.table import CORNER_MODELS, MODELS
-from ipsys_log.plain_text import plain_text
+from ipsys_log.plain_text import plain_text, shell_words
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
@@ -137,10 +136,10 @@ def _tracks(session: Session) -> dict[str, Any]:
 
 def _commands(session: Session, findings: Findings) -> dict[str, str]:
     """Return the commands that print or draw the content of the sections, by name."""
-    logs = " ".join(shlex.quote(path.name) for path in session.paths)
+    logs = shell_words(*(path.name for path in session.paths))
     usual = {*MODELS, *(CORNER_MODELS if has_corners(session) else ())}
     named = () if usual == {*findings.models} else findings.models
-    models = "".join(f" --model {shlex.quote(model)}" for model in named)
+    models = "".join(f" --model {shell_words(model)}" for model in named)
     return {
         "report": f"ipsys report {logs}",
         "errors": f"ipsys evaluate {logs}{models} --details",

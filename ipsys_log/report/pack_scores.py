@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION
+from ipsys_log.plain_text import shell_words
 from ipsys_log.publish.packing import PackResult
 from ipsys_log.publish.scores import Score
 from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
@@ -29,7 +30,8 @@ def pack_text(result: PackResult) -> str:
     models = len({score.model for score in result.scores})
     return wrap_text(
         f"{result.path} written: {len(result.files)} files, {format_bytes(result.size)}, expected scores of "
-        f"{models} {'model' if models == 1 else 'models'}. To check it: ipsys score {result.path}"
+        f"{models} {'model' if models == 1 else 'models'}. To check it: "
+        f"ipsys score {shell_words(result.path)}"
     )
 
 

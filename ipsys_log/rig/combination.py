@@ -7,6 +7,7 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig
+from ipsys_log.plain_text import shell_words
 
 __all__ = ["combine_rigs"]
 
@@ -63,7 +64,8 @@ def _combine_value(name: str, one: Any, other: Any, where: tuple[str, str], plac
         return _combine_entries(name, one, other, where)
     raise IpsysError(
         f"{where[0]} and {where[1]} contradict each other: {name} of {place} is {one!r} and {other!r}; "
-        f"correct one rig, or leave it out: ipsys cut {where[1]} -o part.mcap --exclude-topics /rig"
+        f"correct one rig, or leave it out: "
+        f"ipsys cut {shell_words(where[1])} -o part.mcap --exclude-topics /rig"
     )
 
 

@@ -25,6 +25,7 @@ from ipsys_log.messages import (
     RigStream,
 )
 from ipsys_log.passwords import hide_password
+from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.checks import check_units
 
 __all__ = [
@@ -180,17 +181,21 @@ def load_rig(path: Path) -> Rig:
             raise IpsysError(f"{path}: is too large for a rig file; to write one: ipsys init lab.toml")
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise IpsysError(f"{path}: does not exist; to write a rig file: ipsys init {path}") from error
+        raise IpsysError(
+            f"{path}: does not exist; to write a rig file: ipsys init {shell_words(path)}"
+        ) from error
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise IpsysError(f"{path}: is not a text file; to write a rig file: ipsys init {path}") from error
+        raise IpsysError(
+            f"{path}: is not a text file; to write a rig file: ipsys init {shell_words(path)}"
+        ) from error
     except tomllib.TOMLDecodeError as error:
         raise IpsysError(_not_toml(path, error)) from error
     except (ValueError, RecursionError) as error:  # a number or nesting that Python's parser refuses
         raise IpsysError(
             f"{path}: a number has thousands of digits, or tables are nested thousands deep; "
-            f"to write a rig file: ipsys init {path.name}"
+            f"to write a rig file: ipsys init {shell_words(path.name)}"
         ) from error
     for key, item in _ITEMS.items():
         rows = table.get(key, [])

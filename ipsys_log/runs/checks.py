@@ -71,7 +71,7 @@ def check_inputs(
             _check_distortion(session, request, cameras)
         if CAMERA_POINTS in written:
             _check_sizes(session, request)
-        if MODEL in written and request.model_from is None:
+        if MODEL in written and request.model_from is None and request.model_run is None:
             check_measurements(session, request, models)
         if POSITIONS in written:
             check_heights(session, request, models)

@@ -79,7 +79,7 @@ class _Keep(Enum):
     ALL = "all messages"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Selection:
     """The selected part of a log.
 

@@ -15,6 +15,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages.channels import MARKERS
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.merge import open_logs
 from ipsys_log.runs.merge_plan import LogOffset, check_logs_differ
 from ipsys_log.runs.options import Progress
@@ -96,7 +97,7 @@ def _marker_paths(session: Session, zero_ns: int) -> list[MarkerPath]:
     if run is None:
         raise IpsysError(
             f"{session}: has no markers, so its clock offset cannot be estimated; run: ipsys detect "
-            f"{session}, or give all offsets: --offset {session.paths[0].stem}=SECONDS"
+            f"{shell_words(*session.paths)}, or give all offsets: --offset {session.paths[0].stem}=SECONDS"
         )
     rows: defaultdict[tuple[str, int], list[tuple[int, float, float]]] = defaultdict(list)
     for message in session.messages(session.topics(MARKERS, run)):

@@ -17,6 +17,7 @@ from ipsys_log.log.merged_logs import MergeSource
 from ipsys_log.log.shifted_times import check_shift
 from ipsys_log.messages import Cut, FrameTransforms, Merge, Rig, Run
 from ipsys_log.messages.channels import CUTS, MEASUREMENTS, MERGES, POSES, RECORD, RIG
+from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.combination import combine_rigs
 from ipsys_log.runs.origins import own_inputs
 from ipsys_log.runs.renaming import rename_channels, rename_frames, rename_record, rename_topic
@@ -75,14 +76,16 @@ def check_logs_differ(sessions: Sequence[Session]) -> None:
             if other is not session:
                 raise IpsysError(
                     f"two cameras have the same name: {camera} is in {other} and in {session}; parts of one "
-                    f"recording need no merge: ipsys replay {other} {session}"
+                    f"recording need no merge: "
+                    f"ipsys replay {shell_words(*other.paths)} {shell_words(*session.paths)}"
                 )
     new_ids = find_new_ids(session.payloads(session.topics(MEASUREMENTS)) for session in sessions)
     for session, ids in zip(sessions, new_ids, strict=True):
         for name in ids:
             raise IpsysError(
                 f"{session}: an earlier log has a measurement with the id {name}, too; leave those of "
-                f"one log out: ipsys cut {session} -o part.mcap --exclude-topics /measurements"
+                f"one log out: "
+                f"ipsys cut {shell_words(*session.paths)} -o part.mcap --exclude-topics /measurements"
             )
 
 
@@ -188,7 +191,8 @@ def _plan_intrinsics(sessions: Sequence[Session], settings: _Settings) -> None:
             if not all(same_intrinsics(lens, first[0]) for lens in (*first, *session.payloads([topic]))):
                 raise IpsysError(
                     f"{owner} and {session} contradict each other: the intrinsics of camera {camera} differ; "
-                    f"leave one out: ipsys cut {session} -o part.mcap --exclude-topics {topic}"
+                    f"leave one out: ipsys cut {shell_words(*session.paths)} -o part.mcap "
+                    f"--exclude-topics {shell_words(topic)}"
                 )
             equal[topic] = owner.calibrations[camera]
 

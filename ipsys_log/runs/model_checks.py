@@ -21,6 +21,7 @@ from ipsys_log.messages.channels import (
     Channel,
 )
 from ipsys_log.models.table import AppliedModel, min_pairs, needs_height, reads_corners
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.select import copied_run, fitted_in, has_corners
@@ -52,8 +53,8 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
     if not places:
         raise FitError(
             f"{session}: has no measurements to fit a model to; enter some with "
-            f"'ipsys measure {session.paths[-1]}', or apply a model of another log with --model-from "
-            "calibration.mcap"
+            f"'ipsys measure {shell_words(session.paths[-1])}', or apply a model of another log with "
+            "--model-from calibration.mcap"
         )
     train, _ = split_ids([place.measurement for place in places], request.options())
     world_m = _check_places(places)

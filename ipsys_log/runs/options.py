@@ -26,6 +26,7 @@ class Request:
         all models.
     rig, lenses : used instead of those of the log, as a new run. Camera intrinsics by camera.
     model_from : another log; its newest fitted model is applied and copied into the log.
+    model_run : a run of the log whose model was copied from another log; it is applied again.
     train, seed : the subset to fit on, or the seed of the random split if no measurement has a label.
     run : name for the new run of the last stages; without it, the name comes from the model.
     corners : method of corner detection: ``edges`` or ``stock``; None: edges, if all cameras have intrinsics.
@@ -44,6 +45,7 @@ class Request:
     rig: Rig | None = None
     lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
     model_from: LogLocation | None = None
+    model_run: str | None = None
     train: str = "train"
     seed: int = 0
     run: str | None = None
@@ -67,7 +69,8 @@ class Request:
             "train": self.train,
             "seed": str(self.seed),
             "as_live": "yes" if self.as_live else "",
-            "model_from": "yes" if self.model_from is not None else "",
+            "model_from": "yes" if self.model_from is not None or self.model_run is not None else "",
+            "model_run": self.model_run or "",
             **self.parameters,
         }
         return {name: value for name, value in options.items() if value}

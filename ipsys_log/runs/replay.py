@@ -28,7 +28,7 @@ from ipsys_log.runs.provenance import Outcome, imported_inputs
 __all__ = ["Replay"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Replay:
     """The work of one replay.
 

@@ -15,6 +15,7 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Model, Rig
 from ipsys_log.messages.channels import MARKERS, MODEL, RIG
 from ipsys_log.models.table import CORNER_MODELS, MODELS, check_name
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import complete_runs, newest_run
 from ipsys_log.runs.view import LogView
@@ -93,7 +94,9 @@ def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
             return model, topic
     wanted = f"model {name}" if name else "model"
     option = f" --model {name}" if name else ""
-    raise IpsysError(f"{other}: has no fitted {wanted}; to fit one: ipsys fit {other}{option}")
+    raise IpsysError(
+        f"{other}: has no fitted {wanted}; to fit one: ipsys fit {shell_words(*other.paths)}{option}"
+    )
 
 
 def _model_topics(session: Session) -> list[str]:

@@ -24,6 +24,7 @@ from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import IMPORTED, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
@@ -83,7 +84,8 @@ def verify(
         if not records and (run is not None or not session.cuts):
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
-                f"to compute one: ipsys replay {paths[-1]}; to list the runs: ipsys runs {paths[-1]}"
+                f"to compute one: ipsys replay {shell_words(paths[-1])}; "
+                f"to list the runs: ipsys runs {shell_words(paths[-1])}"
             )
         checked = {output.topic for record in records for output in record.outputs}
         repeated = [
@@ -96,7 +98,8 @@ def verify(
         topics_of = {id(record): _topics(session, record, say) for record in repeated}
         if not repeated and not session.cuts:
             raise IpsysError(
-                f"{session}: has no run that can be verified; for the reasons: ipsys runs {paths[-1]}"
+                f"{session}: has no run that can be verified; for the reasons: "
+                f"ipsys runs {shell_words(paths[-1])}"
             )
         comparisons = []
         for name in sorted(names):
@@ -195,7 +198,8 @@ def _compared_runs(
     both = names[0] & names[1] if runs[0] is None else names[0]
     if not both:
         raise IpsysError(
-            f"{one} and {other} have no run with the same name; to list the runs of one: ipsys runs {one}; "
+            f"{one} and {other} have no run with the same name; to list the runs of one: "
+            f"ipsys runs {shell_words(*one.paths)}; "
             "give the runs with --run"
         )
     return both, both if runs[1] is None else names[1]

@@ -19,6 +19,7 @@ from ipsys_log.messages.channels import (
     TRACKS,
     TRUTH,
 )
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import choose_runs, model_in_force
 
@@ -89,7 +90,8 @@ def choose_topics(session: Session, run: str | None = None, names: Sequence[str]
     for name in names:
         if name not in known:
             raise IpsysError(
-                f"--topics {name}: the log has no such topic; to list them: ipsys info {session}"
+                f"--topics {name}: the log has no such topic; to list them: "
+                f"ipsys info {shell_words(*session.paths)}"
             )
     of_tracks = [name for name in dict.fromkeys(names) if name in tracks]
     if len(of_tracks) != 1:
@@ -129,6 +131,6 @@ def read_scene(session: Session, chosen: PlayedTopics, rig: Rig | None) -> Playe
 
 def _command(session: Session) -> str:
     """Return the command that makes the tracks."""
-    logs = " ".join(map(str, session.paths))
+    logs = shell_words(*session.paths)
     model = "" if session.topics(MEASUREMENTS) else " --model-from calibration.mcap"
     return f"to make them: ipsys replay {logs}{model}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 
-from ipsys_log.errors import IpsysError, UnreadError, reason_without
+from ipsys_log.errors import IpsysError, UnreadError, os_error_text, reason_without
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.contents import StoredChannel, camera_of_topic
 from ipsys_log.log.damage.findings import Watch
@@ -14,6 +14,7 @@ from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages.channels import clock_topic
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.options import Progress
 from ipsys_log.soundness.channels import (
     check_events,
@@ -69,13 +70,15 @@ def _check_log(path: LogLocation, others: Sequence[LogLocation], progress: Progr
             findings += _check_contents(path, others, progress)
     except UnreadError as error:
         findings.append(LogFinding("file", UNREAD, reason_without(path, error)))
+    except OSError as error:  # of the disk
+        findings.append(LogFinding("file", UNREAD, reason_without(path, IpsysError(os_error_text(error)))))
     except IpsysError as error:
         findings.append(LogFinding("file", BROKEN, reason_without(path, error)))
     return LogCheck(path, tuple(findings))
 
 
 def _check_file(path: LogLocation, progress: Progress) -> Iterator[LogFinding]:
-    advice = f"run: ipsys repair {path}"
+    advice = f"run: ipsys repair {shell_words(path)}"
     with LogReader(path) as reader:
         times = MessageTimes(_stamped_topics(reader.channels))
         total = reader.size // _BYTES_PER_MB

@@ -115,6 +115,8 @@ SEED = StageParameter(
     least=0,
 )
 
+_CONTINUES = "\n\nWithout --model, the command continues the newest run, with its model and settings."
+
 # Each stage comes after the stages that write its channels.
 ENTRIES: tuple[StageEntry, ...] = (
     StageEntry(
@@ -139,9 +141,13 @@ ENTRIES: tuple[StageEntry, ...] = (
         "evaluates all models; joint only if the log has images or markers.",
         prints=("plots", "details"),
     ),
-    StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),
-    StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),
-    StageEntry(name="smooth", help="Smooth the tracks by the sightings before and after each pose."),
+    StageEntry(name="locate", help="Apply a model: compute world positions from each camera." + _CONTINUES),
+    StageEntry(
+        name="fuse", help="Filter the positions of all cameras into one track per robot." + _CONTINUES
+    ),
+    StageEntry(
+        name="smooth", help="Smooth the tracks by the sightings before and after each pose." + _CONTINUES
+    ),
 )
 
 

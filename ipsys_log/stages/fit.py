@@ -126,6 +126,8 @@ def model_run(model: str) -> str:
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     name = options["model"]
+    if "model_run" in options:
+        return options["model_run"]
     if not has_measurements(view):
         copied = next((run for run, model in view.copied(MODEL) if model.name == name), None)
         if copied is not None:

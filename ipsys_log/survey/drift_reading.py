@@ -14,6 +14,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Rig
 from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.mended_model import find_model
 from ipsys_log.runs.provenance import newest_run
 
@@ -144,7 +145,9 @@ def _read_log(path: LogLocation, name: str, rig: Rig | None) -> _Log:
             )
         run = newest_run(session, MARKERS)
         if run is None:
-            raise IpsysError(f"{path}: has no detected markers; to detect them: ipsys detect {path}")
+            raise IpsysError(
+                f"{path}: has no detected markers; to detect them: ipsys detect {shell_words(path)}"
+            )
         ids = {marker.id for marker in rigs[-1].reference_markers}
         windows = DriftLog(name, read_windows(session, run, ids))
         return _Log(path, rigs[-1], image_sizes(session, run), windows)

@@ -19,7 +19,7 @@ _FEWEST_FRAMES = 10
 _AGREES_M, _AGREES_RAD = 0.01, 0.05
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Offset:
     """The mean pose of a marker relative to the reference marker of its robot: x, y, z and heading, (4,)."""
 
@@ -40,7 +40,7 @@ class _Offset:
         self.mean = self.mean + change / self.frames
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Bodies:
     """The robots with several markers.
 

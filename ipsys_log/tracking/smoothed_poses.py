@@ -98,7 +98,7 @@ def _filter(
     return tracks
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Smoother:
     """The smoother of tracks with ``count`` sightings; ``progress`` gets the share of its work."""
 

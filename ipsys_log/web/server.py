@@ -210,7 +210,7 @@ def _listen(host: str, port: int, option: str) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
-    except socket.gaierror as error:
+    except (socket.gaierror, UnicodeError) as error:
         raise IpsysError(
             f"--host {host}: is not an address of this machine; use 0.0.0.0 for all its addresses"
         ) from error

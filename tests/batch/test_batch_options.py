@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -16,6 +19,7 @@ from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import BatchTask, LogResult, perform
 from ipsys_log.batch.workers import most_tasks, open_workers
 from ipsys_log.cli import batch as batch_command
+from ipsys_log.cli.signals import Interrupted
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.log_files import expand_folders
@@ -233,3 +237,25 @@ def test_logs_of_one_name_are_exported_to_distinct_files(
     tables = [Path("out", name, "lab.csv").read_bytes() for name in ("mon", "tue")]
     assert tables[0] == tables[1]
     assert sorted(path.name for path in Path("out").iterdir()) == ["mon", "tue"]
+
+
+@pytest.mark.parametrize("scheduler", [None, "tls://head:8786"])
+def test_interrupt_says_what_workers_of_a_scheduler_do(
+    scheduler: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Workers of this machine end with the command; those of a scheduler go on with their logs."""
+
+    @contextmanager
+    def open_none(*_: object) -> Iterator[Any]:
+        yield SimpleNamespace(dashboard="")
+
+    def interrupt(*_: object) -> None:
+        raise Interrupted(130, "interrupted")
+
+    monkeypatch.setattr("ipsys_log.batch.workers.open_workers", open_none)
+    monkeypatch.setattr(batch_command, "say", interrupt)
+    log = Path(shutil.copy(ROOT / "sample_logs/paper_lab.mcap", tmp_path))
+    with pytest.raises(Interrupted) as interrupted:
+        batch_command._collect(BatchTask(perform, {}), [log], WorkerSettings(scheduler))
+    assert ("nothing else is changed" in interrupted.value.text) == (scheduler is None)
+    assert ("complete the logs that they have begun" in interrupted.value.text) == (scheduler is not None)

@@ -17,8 +17,9 @@ from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
 from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.cli.open_cameras import open_cameras, prepare_lab
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Rig, RigCamera
+from ipsys_log.messages import CompressedImage, Message, Rig, RigCamera
 from ipsys_log.report.cameras import LiveStatus
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, small_disk
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2)
@@ -117,6 +118,31 @@ def test_displayed_disk_time_uses_the_measured_rate(tmp_path: Path, monkeypatch:
         line, style = status_line(status)
         assert line.endswith("600.0 MB left on the disk, enough for 5 minutes")
         assert "red" in style
+
+
+def test_recording_is_reported_when_the_first_frame_is_on_the_disk(tmp_path: Path) -> None:
+    """The rig comes before the frame, and the frame waits in memory at first."""
+    log, now_s = tmp_path / "a.mcap", [0.0]
+    said: list[str] = []
+    log.write_bytes(bytes(100))
+    image = CompressedImage(0, "red", bytes(5_000), "jpeg")
+    with CameraMonitor(RIG) as monitor:
+        status = LiveStatus({}, monitor, log, lambda: now_s[0], None, said.append)
+        status(Message("/rig", 10 * NS_PER_S, 10 * NS_PER_S, RIG))
+        log.write_bytes(bytes(2_000))
+        status(Message("/cameras/red/image", 11 * NS_PER_S, 11 * NS_PER_S, image, "red"))
+        log.write_bytes(bytes(6_000))
+        status(None)
+        assert said == []
+        log.write_bytes(bytes(7_100))
+        status(None)
+        status(None)
+        assert said == [f"recording into {log}; Ctrl-C to end"]
+        # The log has two seconds, whatever the opening of the cameras and the end of the log take.
+        status(Message("/cameras/red/image", 12 * NS_PER_S, 12 * NS_PER_S, image, "red"))
+        now_s[0] = 900.9
+        status.close()
+        assert status.summary()[0] == f"{log} written: 2.0 s, 7.1 kB"
 
 
 def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:

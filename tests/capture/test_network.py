@@ -192,6 +192,12 @@ def test_name_that_leads_nowhere_says_why(code: int, said: str, monkeypatch: pyt
         take("rtsp://camera.lab/live", 1)
 
 
+@pytest.mark.parametrize("host", ["camera..local", f"{'a' * 64}.local"])
+def test_name_with_an_impossible_part_is_refused(host: str) -> None:
+    with pytest.raises(SourceError, match=f"the host '{host}' does not exist"):
+        take(f"rtsp://{host}/stream", 1)
+
+
 def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", LIMIT_S)
     make_jpegs(tmp_path, 3)

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.closed_loop.settings import PROGRAM
 from ipsys_log.log.dataset import Session
-from tests.conftest import ROOT, Ipsys
-
-PROGRAM = ROOT / "examples/robot/robot.py"
+from tests.conftest import Ipsys
 
 REFUSED = {
     ("--robots", "9"): "--robots 9: give 1 to 3",
@@ -36,8 +35,8 @@ REFUSED = {
     "relay",
     ("--loss", "1.5"): "--loss 1.5: give a share from 0 to below 1, such as 0.05",
     ("--delay-ms", "-1"): "--delay-ms -1: give a delay from 0 to 10000 ms",
-    ("--program", "none.py"): "--program none.py: does not exist; name the program of the robots, such as "
-    "examples/robot/robot.py in the source of ipsys",
+    ("--program", "none.py"): "--program none.py: does not exist; name the program of the robots, or leave "
+    "--program out for the example of ipsys",
 }
 
 

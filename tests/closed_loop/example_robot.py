@@ -6,9 +6,9 @@ import importlib
 import sys
 from types import ModuleType
 
-from tests.conftest import ROOT
+from ipsys_log.closed_loop.settings import PROGRAM
 
-FOLDER = ROOT / "examples" / "robot"
+FOLDER = PROGRAM.parent
 
 
 def example(name: str) -> ModuleType:

@@ -19,7 +19,7 @@ from ipsys_log.messages import Event, RobotPath, WheelCommand
 from ipsys_log.messages.channels import COMMANDS, EVENTS, IMAGES, PATHS, TRACKS, TRUTH
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
-from tests.conftest import ROOT, Ipsys
+from tests.conftest import Ipsys
 from tests.shared_files import make_once
 
 pytestmark = pytest.mark.slow
@@ -30,7 +30,7 @@ SHORT = "robot_0=2,2.2 2.3,2.2"
 def settings_of(replayed_log: Path, *paths: str, robots: int = 1, rate_hz: float = 4.0) -> RobotRun:
     lab = read_lab(replayed_log, LabSettings(markers=robots, rate_hz=rate_hz))
     return RobotRun(
-        lab, choose_paths(robots, paths), ROOT / PROGRAM, lockstep=True, port=0, tick_hz=10.0, longest_s=120
+        lab, choose_paths(robots, paths), PROGRAM, lockstep=True, port=0, tick_hz=10.0, longest_s=120
     )
 
 

@@ -53,7 +53,7 @@ def make(store: Any, kind: str, stamp_ns: int, values: dict[str, Any], is_ros1: 
     return types[kind](header=head, **fields)
 
 
-def write_ros1(folder: Path, rows: Sequence[Row]) -> Path:
+def write_ros1(folder: Path, rows: Sequence[Row], start_ns: int = NS + 20_000_000) -> Path:
     store, path = get_typestore(Stores.ROS1_NOETIC), folder / "drive.bag"
     with Writer1(path) as writer:
         known: dict[str, Any] = {}
@@ -61,7 +61,7 @@ def write_ros1(folder: Path, rows: Sequence[Row]) -> Path:
             if topic not in known:
                 known[topic] = writer.add_connection(topic, kind, typestore=store)
             data = store.serialize_ros1(make(store, kind, stamp_ns, values, True), kind)
-            writer.write(known[topic], NS + number * STEP + 20_000_000, data)
+            writer.write(known[topic], start_ns + number * STEP, data)
     return path
 
 

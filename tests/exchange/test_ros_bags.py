@@ -131,6 +131,18 @@ def test_images_without_stamps_have_the_time_of_the_bag(tmp_path: Path, ipsys: I
     assert [m.publish_time_ns for m in messages] == [m.payload.timestamp for m in messages] == arrivals
 
 
+def test_bag_of_a_clock_that_starts_at_0_is_read(tmp_path: Path, ipsys: Ipsys) -> None:
+    bag = write_ros1(tmp_path, [compressed(n, jpeg(), stamp=False) for n in range(2)], start_ns=0)
+    rig = tmp_path / "lab.toml"
+    assert ipsys("init", rig).code == 0
+    done = ipsys("import", "ros", bag, "-o", tmp_path / "log.mcap", "--rig", rig)
+    assert done.code == 0, done.err
+    with Session([tmp_path / "log.mcap"]) as session:
+        # The rig is the first message, at 0.
+        assert [m.log_time_ns for m in session.messages(session.images.values())] == [1, STEP]
+        assert session.payloads(["/rig"])
+
+
 def test_uncalibrated_camera_has_no_intrinsics(tmp_path: Path, ipsys: Ipsys) -> None:
     bag = write_ros1(tmp_path, [info(0, [0.0] * 9), compressed(1, jpeg())])
     assert ipsys("import", "ros", bag, "-o", tmp_path / "log.mcap").code == 0

@@ -1,5 +1,6 @@
 """A repair saves all readable data, loses no byte, reports unknown losses, and is atomic."""
 
+import os
 import random
 import struct
 import zlib
@@ -15,9 +16,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.contents import Contents, Schema, group_by_topic
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, to_bytes
 from ipsys_log.log.repair import repair
+from tests.conftest import ROOT
 from tests.log.conftest import IMAGE, POINT, Row, as_row, create, linear_rows, stock_rows
 from tests.log.crash import Recorder, crashes
 from tests.log.damage import QUICK, non_seeking_rows
@@ -387,3 +391,29 @@ def test_repair_hash_of_channel_is_that_of_its_messages(tmp_path: Path) -> None:
         again = create(tmp_path / "b.mcap", [as_row(message) for message in reader.messages()])
     with LogReader(again) as reader:
         assert reader.channel_hash("/a") == stored
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_topic_with_a_lost_schema_is_read_with_the_other_one(lost: int) -> None:
+    """Repair knows the channel, but not its schema; another channel of the topic has it."""
+    contents = Contents()
+    contents.schemas = {key: mcap.Schema(key, b"{}", "jsonschema", "A") for key in (1, 2)}
+    contents.schemas[lost] = mcap.Schema(lost, b"", "", "")
+    contents.channels = {key: mcap.Channel(key, "/a", "json", {}, key) for key in (1, 2)}
+    channels, conflicts = group_by_topic(contents)
+    assert conflicts == {}
+    assert channels["/a"].schema == Schema("A", "jsonschema", b"{}")
+
+
+def test_repaired_log_is_not_refused(tmp_path: Path) -> None:
+    """The schema of one of the channels of a topic was lost with the beginning of the log."""
+    cases = Path(os.environ.get("IPSYS_CASES", ROOT / "../shared/cases"))
+    if not cases.is_dir():
+        pytest.skip(f"no folder {cases} with faulty inputs: set IPSYS_CASES")
+    log = tmp_path / "log.mcap"
+    log.write_bytes((cases / "damage/appended_1_3196.mcap").read_bytes())
+    assert repair(log).changed
+    with Session([log]) as session:
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        assert sum(1 for _ in session.messages([t for t in topics if not t.startswith("/lost/")])) > 900
+        assert session.payloads(["/measurements"])

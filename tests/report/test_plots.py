@@ -16,13 +16,14 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 
+from ipsys_log.analysis.trajectory_errors import TrajectoryErrors
 from ipsys_log.messages import Residual
 from ipsys_log.report.accuracy import Accuracy, accuracy_json
 from ipsys_log.report.figures import png
 from ipsys_log.report.files import cross_validation_csv, paper_csv
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.learning_figure import learning_figure, published_figure
-from ipsys_log.report.paper_figures import models_figure, residuals_figure, write_plots
+from ipsys_log.report.paper_figures import models_figure, residuals_figure, shown_models, write_plots
 from ipsys_log.report.points_figure import places_figure
 from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys
@@ -102,6 +103,15 @@ def test_only_available_data_are_drawn(tmp_path: Path) -> None:
     rows = read((tmp_path / "plots/table_1.csv").read_bytes())
     assert {row["mean_cm_red"] for row in rows} == {""}
     assert all(read((tmp_path / "plots/table_2.csv").read_bytes())[0].values())
+
+
+def test_models_of_a_log_with_ground_truth_are_chosen(paper: Findings) -> None:
+    """The errors of their tracks are arrays."""
+    errors = TrajectoryErrors("ada", np.zeros((4, 3)), ())
+    findings = with_accuracies(
+        paper, [replace(accuracy, trajectories=(errors,)) for accuracy in paper.accuracies]
+    )
+    assert [accuracy.model for accuracy in shown_models(findings)] == [a.model for a in shown_models(paper)]
 
 
 def texts_of(figure: Figure) -> dict[Text, tuple[float, float, float, float]]:

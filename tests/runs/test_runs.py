@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ipsys_log
 from ipsys_log import pipeline
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
@@ -24,7 +25,7 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, RIG, RUN_EVENTS
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, RUN_EVENTS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log, write_messages
@@ -377,3 +378,50 @@ def test_a_wrong_dictionary_leaves_no_empty_run(ipsys: Ipsys, lab: Path, tmp_pat
     assert done.code == 1
     assert "no marker was found in" in done.err
     assert lab.read_bytes() == before
+
+
+def test_stage_without_model_continues_the_newest_run(ipsys: Ipsys, replayed: Path, tmp_path: Path) -> None:
+    """The log already has a run of the default model."""
+    settings = ("--model", "rigid", "--seed", 3, "--run", "monday")
+    rig = robots(tmp_path, replayed, "bus")
+    assert runs_of(ipsys, "replay", replayed, *settings, "--rig", rig)["fuse"] == ("monday", True)
+    for stage in ("locate", "fuse"):
+        assert runs_of(ipsys, stage, replayed)[stage] == ("monday", False)
+    smoothed = runs_of(ipsys, "smooth", replayed)
+    assert smoothed["smooth"] == ("monday", True)
+    assert [stage for stage, (_, is_new) in smoothed.items() if is_new] == ["smooth"]
+    with Session([replayed]) as session:
+        first = session.payloads(["/runs/monday/smoothed_tracks"])[0]
+    with ipsys_log.open(replayed) as log:
+        track = log.track_at(first.tracks[0].robot, [first.timestamp])
+        assert track.robot.startswith("bus")
+        assert (track.run, track.channel) == ("monday", "smoothed_tracks")
+    # An evaluation of all models selects none.
+    assert ipsys("evaluate", replayed, "--model", "kriging").code == 0
+    assert runs_of(ipsys, "smooth", replayed)["smooth"] == ("monday", False)
+    # A setting of the user counts.
+    assert runs_of(ipsys, "smooth", replayed, "--model", "poly")["smooth"] == ("poly", True)
+
+
+def test_stage_without_model_continues_a_run_of_a_copied_model(
+    ipsys: Ipsys, replayed: Path, tmp_path: Path
+) -> None:
+    """The log has measurements, but the user selected a model of another log."""
+    other = tmp_path / "other.mcap"
+    shutil.copy(PAPER, other)
+    assert ipsys("fit", other, "--model", "rigid").code == 0
+    assert runs_of(ipsys, "replay", replayed, "--model-from", other)["fuse"] == ("rigid", True)
+    smoothed = runs_of(ipsys, "smooth", replayed)
+    assert [run for run, is_new in smoothed.values() if is_new] == ["rigid"]
+
+
+def test_newest_run_that_is_out_of_date_is_repeated_as_it_was(
+    ipsys: Ipsys, replayed: Path, tmp_path: Path
+) -> None:
+    assert runs_of(ipsys, "replay", replayed, "--model", "rigid", "--seed", 3)["fuse"] == ("rigid", True)
+    with Session([replayed]) as session:
+        *_, last = session.messages(session.topics(MEASUREMENTS))
+    withdrawal = replace(last.payload, id="w", withdraws=last.payload.id, splits=())
+    append_messages(replayed, [replace(last, payload=withdrawal)])
+    smoothed = runs_of(ipsys, "smooth", replayed)
+    assert smoothed["smooth"] == ("rigid_2", True)

@@ -7,16 +7,19 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from math import isnan, pi
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from pymavlink import mavutil
+from pymavlink.dialects.v20 import common
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
+from tests.sinks.autopilots import ardupilot, px4
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
 
 _LIMIT_S = 240.0
@@ -110,16 +113,61 @@ def test_turn_to_the_left_is_a_negative_yaw_rate(autopilot: Autopilot) -> None:
     assert last.yawspeed == pytest.approx(-1.0, abs=1e-5)
 
 
-def test_covariance_is_turned_and_unknown_values_are_nan(autopilot: Autopilot) -> None:
-    known = replace(track("ada", 1.0), covariance_m2=np.diag([1e-4, 4e-4, 9e-4]))
+def test_covariance_is_turned_and_unknown_begins_with_nan(autopilot: Autopilot) -> None:
+    known = replace(track("ada", 1.0), covariance_m2=np.diag([1e-4, 4e-4, 9e-4]), heading_sigma_rad=0.02)
     unknown = replace(track("ada", 1.0), covariance_m2=None)
     with streaming(autopilot) as (stream, _):
         stream.consume(iter([tracks(0, known), tracks(1, unknown)]))
         first, second = [autopilot.next("ODOMETRY").pose_covariance for _ in range(2)]
     # The upper triangle by rows: x, y and z are at 0, 6 and 11; x is north, the y of the lab.
     assert [first[n] for n in (0, 6, 11)] == pytest.approx([4e-4, 1e-4, 9e-4])
-    assert all(isnan(first[n]) for n in (3, 15, 18, 20))
-    assert all(map(isnan, second))
+    assert [first[n] for n in (15, 18, 20)] == pytest.approx([0.02**2] * 3)
+    assert np.isfinite(first).all()
+    assert isnan(second[0])
+    assert [second[n] for n in (15, 18, 20)] == pytest.approx([0.1**2] * 3)
+
+
+TRACKS = {
+    "all_known": moving_track("ada", 0.4),
+    "no_velocity": replace(track("ada", 1.0, 0.4), heading_sigma_rad=0.02),
+    "no_heading_sigma": track("ada", 1.0, 0.4),
+    "no_covariance": replace(moving_track("ada", 0.4), covariance_m2=None, velocity_covariance_m2_s2=None),
+    "broken_covariance": replace(moving_track("ada", 0.4), covariance_m2=np.full((3, 3), np.nan)),
+    "facing_back": moving_track("ada", -np.pi),
+}
+
+
+@pytest.mark.parametrize("message", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
+@pytest.mark.parametrize("name", TRACKS)
+def test_both_autopilots_use_position_and_yaw(autopilot: Autopilot, message: str, name: str) -> None:
+    sent = TRACKS[name]
+    assert sent.heading_rad is not None
+    with streaming(autopilot, "" if message == "ODOMETRY" else "/vision") as (stream, _):
+        stream.consume(iter([tracks(0, sent)]))
+        received = autopilot.next(message)
+    for reading in (px4(received), ardupilot(received)):
+        assert reading.internal_errors == 0
+        assert reading.position_m == pytest.approx((sent.y_m, sent.x_m, -sent.z_m))
+        assert reading.yaw_rad is not None
+        assert np.cos(reading.yaw_rad - (pi / 2 - sent.heading_rad)) == pytest.approx(1.0)
+        has_velocity = message == "ODOMETRY" and sent.velocity_m_s is not None
+        assert (reading.velocity_m_s is not None) == has_velocity
+    is_known = name not in ("no_covariance", "broken_covariance")
+    assert (px4(received).sigma_m is not None) == is_known
+    assert px4(received).yaw_sigma_rad == pytest.approx(0.1 if name == "no_heading_sigma" else 0.02)
+    # ArduPilot: 0 is "take the noise floors".
+    assert (ardupilot(received).sigma_m != (0.0,)) == is_known
+    assert received.reset_counter == 300 % 256
+    assert getattr(received, "quality", 0) == 0  # unknown: both use it, unless they require a quality
+
+
+@pytest.mark.parametrize("name", ["ODOMETRY", "VISION_POSITION_ESTIMATE"])
+def test_each_field_of_a_message_is_in_the_documents(name: str) -> None:
+    text = (Path(__file__).parents[2] / "docs/streams.md").read_text()
+    table = text.partition(f"| field of `{name}` |")[2].partition("\n\n")[0]
+    (kind,) = [kind for kind in common.mavlink_map.values() if kind.msgname == name]
+    for field in kind.fieldnames:
+        assert f"`{field}`" in table, field
 
 
 def test_covariance_of_the_velocity_is_along_the_robot(autopilot: Autopilot) -> None:
@@ -132,7 +180,7 @@ def test_covariance_of_the_velocity_is_along_the_robot(autopilot: Autopilot) -> 
     diagonal = [last.velocity_covariance[n] for n in (0, 6, 11, 20)]
     assert diagonal == pytest.approx([4e-4, 1e-4, 9e-4, 0.03**2])
     assert last.pose_covariance[20] == pytest.approx(0.02**2)
-    assert all(isnan(last.velocity_covariance[n]) for n in (3, 15, 18))
+    assert np.isfinite(last.velocity_covariance).all()
 
 
 def test_new_session_raises_the_reset_counter(autopilot: Autopilot) -> None:

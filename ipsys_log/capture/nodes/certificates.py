@@ -135,6 +135,8 @@ def check_centre(host: str, port: int, files: Certificates) -> str | None:
         ) from error
     except TimeoutError:
         return "timed out"
+    except UnicodeError:
+        return "is no name of a host"
     except OSError as error:
         return (error.strerror or str(error)).lower()
     return None

@@ -1,7 +1,7 @@
 """Poses as MAVLink messages: axes north, east, down instead of those of the lab, and covariances.
 
 The autopilots PX4 and ArduPilot expect x forward (here: north), y right (east) and z down, and angles
-clockwise from north, seen from above.
+clockwise from north, seen from above. docs/streams.md lists what each autopilot does with each field.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ __all__ = ["NORTH_RAD", "encode_odometry", "encode_vision"]
 NORTH_RAD = pi / 2
 _NS_PER_US = 1000
 _RESETS = 256
+# A heading without a stated sigma. The autopilots need a number: this one is the default of PX4.
+_UNKNOWN_YAW_SIGMA_RAD = 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _LocalPose:
     """A pose in the axes north, east, down, in m and rad; velocities along the axes of the robot.
 
@@ -40,7 +42,10 @@ class _LocalPose:
 
 
 def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> Any:
-    """Return the message ODOMETRY, from LOCAL_FRD to BODY_FRD; unknown values are NaN.
+    """Return the message ODOMETRY, from LOCAL_FRD to BODY_FRD.
+
+    The estimator is VISION: PX4 gives the poses of MOCAP to a topic that its filter does not read. An unknown
+    velocity is NaN, and an unknown covariance begins with NaN.
 
     Parameters
     ----------
@@ -62,7 +67,7 @@ def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> A
         local.covariance,
         local.velocity_covariance,
         pose.session % _RESETS,
-        common.MAV_ESTIMATOR_TYPE_MOCAP,
+        common.MAV_ESTIMATOR_TYPE_VISION,
     )
 
 
@@ -86,7 +91,7 @@ def _localize(pose: StreamPose, heading_rad: float, north_rad: float) -> _LocalP
         [[cos(north_rad), sin(north_rad), 0], [sin(north_rad), -cos(north_rad), 0], [0, 0, -1]]
     )
     yaw_rad = (north_rad - heading_rad + pi) % (2 * pi) - pi
-    velocity_m_s, yaw_rad_s, velocity_covariance = np.full(3, nan), nan, _upper(None, None)
+    velocity_m_s, yaw_rad_s, velocity_covariance = np.full(3, nan), nan, _upper(None, nan)
     if velocity is not None:
         body_from_local = np.array(
             [[cos(yaw_rad), sin(yaw_rad), 0], [-sin(yaw_rad), cos(yaw_rad), 0], [0, 0, 1]]
@@ -97,25 +102,24 @@ def _localize(pose: StreamPose, heading_rad: float, north_rad: float) -> _LocalP
         known = velocity.covariance_m2_s2
         velocity_covariance = _upper(
             None if known is None else body_from_world @ known @ body_from_world.T,
-            None if velocity.yaw_rad_s is None else velocity.yaw_sigma_rad_s,
+            nan if velocity.yaw_sigma_rad_s is None else velocity.yaw_sigma_rad_s,
         )
-    known = pose.covariance_m2
+    known, sigma_rad = pose.covariance_m2, pose.heading_sigma_rad
     covariance = _upper(
-        None if known is None else local_from_world @ known @ local_from_world.T, pose.heading_sigma_rad
+        None if known is None else local_from_world @ known @ local_from_world.T,
+        _UNKNOWN_YAW_SIGMA_RAD if sigma_rad is None else sigma_rad,
     )
     position_m = local_from_world @ np.array([track.x_m, track.y_m, track.z_m])
     return _LocalPose(position_m, yaw_rad, velocity_m_s, yaw_rad_s, covariance, velocity_covariance)
 
 
-def _upper(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> list[float]:
-    """Return the upper triangle of a covariance of 6 x 6; unknown values are NaN.
+def _upper(known: NDArray[np.float64] | None, yaw_sigma: float) -> list[float]:
+    """Return the upper triangle of a covariance of 6 x 6; it begins with NaN if ``known`` is None.
 
-    ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z.
+    ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z. A level
+    vehicle has the same about x and y: ArduPilot adds the three variances, and PX4 uses none if one is NaN.
     """
-    covariance = np.full((6, 6), nan)
-    if known is not None:
-        covariance[:3, :3] = known
-    if yaw_sigma is not None:
-        covariance[5, 5] = yaw_sigma**2
+    covariance = np.diag(np.full(6, yaw_sigma**2))
+    covariance[:3, :3] = nan if known is None else known
     upper: list[float] = covariance[np.triu_indices(6)].tolist()
     return upper

@@ -39,7 +39,7 @@ def first_session(now_ns: int) -> int:
     return now_ns // _NS_PER_MS
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Velocity:
     """The velocity of a robot in m/s, and the rate of its heading in rad/s (None: headings are missing).
 

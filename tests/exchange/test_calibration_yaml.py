@@ -65,7 +65,7 @@ def test_kalibr(model: str, name: str) -> None:
     assert camera["resolution"] == [1920, 1080]
 
 
-# The focal lengths and the principal point as shares of the image, and coefficients of curves that do not fold.
+# Focal lengths and principal point as shares of the image, and coefficients of curves that do not turn back.
 @given(
     st.lists(st.floats(0.5, 1), min_size=2, max_size=2),
     st.lists(st.floats(0.45, 0.55), min_size=2, max_size=2),

@@ -179,12 +179,12 @@ FAULTS: Sequence[Fault] = (
         "pixels",
     ),
     _fault(
-        "lens curve turns back in the image",
+        "lens curve turns back",
         lambda lens: _text(lens.K, [-1.152516, 2.913204, -2.482336, 0.178503], "fisheye"),
         "turns back",
     ),
     _fault(
-        "four pinhole coefficients, no model",
+        "four coefficients, no model",
         lambda lens: _text(lens.K, lens.D[:4], ""),
         "does not state its lens model",
         "plumb_bob",

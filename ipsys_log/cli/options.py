@@ -161,8 +161,8 @@ Calibrations = Annotated[
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
-        help="Use these camera intrinsics: a YAML file of OpenCV, ROS or Kalibr, or a log "
-        "with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
+        help="Use these camera intrinsics: a calibration file of OpenCV, ROS, Kalibr or others, or a "
+        "log with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
 Corners = Annotated[Optional[str], build_option(CORNERS)]  # noqa: UP045

@@ -468,7 +468,10 @@ def live(
         from ipsys_log.stages.fit import model_run
 
         lab, wanted = load_cameras(Path(rig), cameras)
-        lenses = load_lenses(Path(rig), wanted, calibrations or {})
+        assumed: dict[str, str] = {}
+        lenses = load_lenses(Path(rig), wanted, calibrations or {}, report=assumed.__setitem__)
+        for camera, text in assumed.items():
+            say(f"camera {camera}: {text}")
         check_devices(wanted)
         check_sources(wanted)
         names = [camera.name for camera in wanted]
@@ -493,7 +496,7 @@ def live(
         ):
             sizes_px = {name: state.size_px for name, state in attached.states.items()}
             settings = first_messages(
-                lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns, attached.imported_run
+                lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns, attached.imported_run, assumed
             )
             tracker.begin(attached.stop)
             sinks: list[Sink] = [tracker, *streams]

@@ -22,7 +22,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from ipsys_log.analysis.pairs import gather_sightings
 from ipsys_log.calibration.images import _decode
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.exchange.calibration_files import read_opencv_calibration
+from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.exchange.image_folders import find_times, parse_time
 from ipsys_log.exchange.imsel import read_mat
 from ipsys_log.geometry.lenses import check_calibration
@@ -116,7 +116,7 @@ def test_lens_file_with_a_wrong_width_is_one_line(tmp_path: Path, width: str) ->
     path = tmp_path / "lens.yaml"
     path.write_text(LENS.format(width=width, rows=3))
     with pytest.raises(IpsysError) as caught:
-        read_opencv_calibration(path, "red")
+        read_intrinsics(path, "red")
     assert str(path) in one_line(caught)
 
 
@@ -126,7 +126,7 @@ def test_lens_file_with_a_wrong_matrix_is_one_line(tmp_path: Path, rows: str) ->
     text = LENS.format(width=960, rows=rows)
     path.write_text(re.sub(r"data: \[ 500.*\]", "data: 5.", text))
     with pytest.raises(IpsysError) as caught:
-        read_opencv_calibration(path, "red")
+        read_intrinsics(path, "red")
     one_line(caught)
 
 
@@ -148,7 +148,7 @@ def test_lens_file_of_many_levels_is_one_line(tmp_path: Path, name: str, text: s
     path.write_text(text, errors="surrogateescape")
     code = (
         "import sys, pathlib\nfrom ipsys_log.errors import IpsysError\n"
-        "from ipsys_log.exchange.calibration_files import read_opencv_calibration as read\n"
+        "from ipsys_log.exchange.calibration_files import read_intrinsics as read\n"
         "try: read(pathlib.Path(sys.argv[1]), 'red')\nexcept IpsysError as error: print(error)\n"
     )
     done = subprocess.run(

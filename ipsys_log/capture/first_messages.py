@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.messages import (
+    ASSUMED_MODEL,
+    EVENTS_TOPIC,
     IMPORTED,
     RIG_TOPIC,
     CameraCalibration,
+    Event,
     Message,
     Rig,
     Run,
@@ -47,12 +51,14 @@ def first_messages(
     lenses: Mapping[str, CameraCalibration],
     now_ns: Callable[[], int],
     imported_run: str | None = None,
+    assumed: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Message]:
-    """Return the first messages of a log: the rig, the intrinsics by camera, and the record of a run.
+    """Return the first messages of a log: the rig, intrinsics by camera, and the record of a run.
 
     Parameters
     ----------
     imported_run : the run of markers that other hosts have detected.
+    assumed : texts by camera for calibration files that do not state their lens model.
     """
     time_ns = now_ns()
     messages = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
@@ -60,6 +66,9 @@ def first_messages(
         time_ns = now_ns()
         stamped = replace(lens, timestamp=time_ns)
         messages.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
+    for camera, text in sorted(assumed.items()):
+        time_ns = now_ns()
+        messages.append(Message(EVENTS_TOPIC, time_ns, time_ns, Event(time_ns, ASSUMED_MODEL, text, camera)))
     if imported_run is not None:
         time_ns = now_ns()
         record = Run(time_ns, imported_run, IMPORTED, {"format": NODE_FORMAT})

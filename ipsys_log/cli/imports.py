@@ -14,7 +14,10 @@ from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appende
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from ipsys_log.exchange.import_truth import TruthOptions
+    from ipsys_log.messages import CameraCalibration, Rig
 
 __all__ = ["add_commands"]
 
@@ -70,16 +73,15 @@ def images(
     ] = None,
 ) -> None:
     """Import a folder of images. Without --times, images with the same number have the same time."""
-    from ipsys_log.cli.options import load_calibrations, load_matching_rig
+    from ipsys_log.exchange.calibration_files import announce_assumed
     from ipsys_log.exchange.image_folders import find_images, find_times, read_images
     from ipsys_log.runs.output import write_log
 
     _refuse_log(folder)
     pictures = find_images(folder)
-    lenses = load_calibrations(calibration, lambda: pictures)
     taken_ns = find_times(pictures, times) if times else None
-    lab = load_matching_rig(rig, lambda: pictures)
-    write_log(output, read_images(pictures, lab, lenses, rate, taken_ns))
+    lab, lenses, assumed = _settings(rig, calibration, pictures)
+    write_log(output, announce_assumed(read_images(pictures, lab, lenses, rate, taken_ns), assumed))
     if not times and len({len(paths) for paths in pictures.values()}) > 1:
         remarks.print(
             "the cameras have different numbers of images: images with the same number get the same time"
@@ -101,16 +103,16 @@ def videos(
 ) -> None:
     """Import videos that start at the same time. The log gets MJPEG, H.264 and H.265 unchanged."""
     from ipsys_log.capture.video_files import read_videos
-    from ipsys_log.cli.options import load_calibrations, load_matching_rig
+    from ipsys_log.exchange.calibration_files import announce_assumed
     from ipsys_log.exchange.image_folders import parse_start
     from ipsys_log.runs.output import write_log
 
     for option in files:
         _refuse_log(Path(option.rpartition("=")[2]))
     paths = _by_camera(files)
-    lenses = load_calibrations(calibration, lambda: paths)
-    lab = load_matching_rig(rig, lambda: paths)
-    counts = write_log(output, read_videos(paths, lab, lenses, parse_start(start), remarks.print))
+    lab, lenses, assumed = _settings(rig, calibration, paths)
+    messages = read_videos(paths, lab, lenses, parse_start(start), remarks.print)
+    counts = write_log(output, announce_assumed(messages, assumed))
     text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
     console.print(f"{output} written: frames: {text}")
 
@@ -136,19 +138,19 @@ def ros(
 
     Images are CompressedImage, or Image with mono8, bgr8, rgb8 or an alpha channel; their bytes stay as they
     are. The other commands read MCAP bags of ROS 2 without an import."""
-    from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.extras import check_installed
     from ipsys_log.runs.output import write_log
 
     check_installed("import ros needs", "rosbags")
+    from ipsys_log.exchange.calibration_files import announce_assumed
     from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
 
     _refuse_log(bag)
     cameras = find_bag_cameras(bag, _topic_of(camera or []))
-    lenses = load_calibrations(calibration, lambda: cameras.images)
-    lab = load_matching_rig(rig, lambda: cameras.images)
+    lab, lenses, assumed = _settings(rig, calibration, cameras.images)
     with progress_bar(("bag",)) as progress:
-        counts = write_log(output, read_bag(bag, cameras, lab, lenses, progress))
+        messages = read_bag(bag, cameras, lab, lenses, progress)
+        counts = write_log(output, announce_assumed(messages, assumed))
     text = ", ".join(f"{counts.get(f'/cameras/{name}/image', 0)} of {name}" for name in cameras.images)
     console.print(f"{output} written: images: {text}")
 
@@ -234,15 +236,19 @@ def detections(
     The columns are time, camera, marker_id, and x0_px, y0_px to x3_px, y3_px of the corners, clockwise from
     the top left of the marker. ipsys export --table markers writes such a table.
     """
-    from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.cli.options import load_calibrations, say_remark, say_unusual
     from ipsys_log.exchange.detection_tables import DetectionOptions, import_detections
     from ipsys_log.rig.file import load_rig
 
     _refuse_log(file)
     lab = load_rig(rig) if rig else None
     cameras = [camera.name for camera in lab.cameras] if lab else []
-    lenses = load_calibrations(calibration, lambda: cameras)
-    imported = import_detections(file, into, output, DetectionOptions(lab, lenses, run))
+    assumed: dict[str, str] = {}
+    lenses = load_calibrations(calibration, lambda: cameras, assumed.__setitem__)
+    imported = import_detections(file, into, output, DetectionOptions(lab, lenses, run, rig, assumed))
+    for name in sorted(imported.assumed.keys() - assumed.keys()):
+        say_remark(name, imported.assumed[name])
+    say_unusual(imported.lenses)
     text = ", ".join(f"{count} of {camera}" for camera, count in imported.markers.items())
     console.print(f"run {imported.run}: markers: {text}")
     remarks.print(f"results are in {imported.path}", markup=False)
@@ -297,6 +303,35 @@ def _truth_options(
         run,
         load_rig(rig) if rig else None,
     )
+
+
+def _settings(
+    rig: Path | None, calibration: list[str] | None, cameras: Collection[str]
+) -> tuple[Rig | None, dict[str, CameraCalibration], dict[str, str]]:
+    """Return the rig of an import, the intrinsics of its cameras, and texts on their assumed lens models.
+
+    The intrinsics are the given ones, else those of the files that the rig names, as far as they exist.
+    """
+    from ipsys_log.cli.options import load_calibrations, load_matching_rig, say_remark, say_unusual
+    from ipsys_log.exchange.lab_files import load_lenses
+
+    assumed: dict[str, str] = {}
+    lenses = load_calibrations(calibration, lambda: cameras, assumed.__setitem__)
+    lab = load_matching_rig(rig, lambda: cameras)
+    if rig is None or lab is None:
+        return lab, lenses, assumed
+    named = [camera for camera in lab.cameras if camera.name in cameras and camera.name not in lenses]
+    for camera in named:
+        if camera.calibration is not None and (rig.parent / camera.calibration).exists():
+            from_rig = load_lenses(rig, [camera], {}, report=assumed.__setitem__)
+            say_unusual(from_rig)
+            lenses |= from_rig
+        elif camera.calibration is not None:
+            text = f"{camera.calibration} of the rig does not exist; 'ipsys calibrate' writes it"
+            say_remark(camera.name, text)
+        if camera.name in assumed:
+            say_remark(camera.name, assumed[camera.name])
+    return lab, lenses, assumed
 
 
 def _refuse_log(path: Path) -> None:

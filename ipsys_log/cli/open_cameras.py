@@ -45,13 +45,17 @@ _PLACE_S = 1.5
 
 
 class Lab(NamedTuple):
-    """The cameras to open: the rig, its cameras, their intrinsics by name, the input files and the folder."""
+    """The cameras to open: the rig, its cameras, their intrinsics by name, the input files and the folder.
+
+    ``assumed`` has a text for each camera whose calibration file does not state the lens model.
+    """
 
     rig: Rig
     cameras: list[RigCamera]
     lenses: dict[str, CameraCalibration]
     files: list[tuple[str, LogLocation]]
     folder: Path
+    assumed: dict[str, str]
 
     @property
     def names(self) -> list[str]:
@@ -75,8 +79,8 @@ def prepare_lab(
     """
     from ipsys_log.capture.devices import check_devices, check_sources, usb_advice
 
-    described, cameras, lenses = load_lab(rig, calibration, only or (), with_lenses)
-    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration), rig.parent)
+    described, cameras, lenses, assumed = load_lab(rig, calibration, only or (), with_lenses)
+    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration), rig.parent, assumed)
     check_devices(lab.cameras)
     check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
@@ -188,7 +192,8 @@ def open_cameras(
         say(doing or "the cameras are open; Ctrl-C to end")
         if panel:
             stack.enter_context(_on_screen(status))
-        yield attached, first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run), status
+        settings = first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run, lab.assumed)
+        yield attached, settings, status
     for line in () if doing else status.summary():
         console.print(line, markup=False)
 

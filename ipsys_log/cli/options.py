@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -161,8 +161,8 @@ Calibrations = Annotated[
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
-        help="Use these camera intrinsics: a YAML file of OpenCV, ROS or Kalibr, or a log "
-        "with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
+        help="Use these camera intrinsics: a calibration file of OpenCV, ROS, Kalibr or others, or a "
+        "log with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
 Corners = Annotated[Optional[str], build_option(CORNERS)]  # noqa: UP045
@@ -202,9 +202,14 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def load_calibrations(
-    options: list[str] | None, cameras: Callable[[], Collection[str]]
+    options: list[str] | None,
+    cameras: Callable[[], Collection[str]],
+    assume: Callable[[str, str], None] = lambda camera, text: None,
 ) -> dict[str, CameraCalibration]:
     """Read intrinsics by camera from ``camera=file``, or from ``other.mcap`` for the given ``cameras``.
+
+    ``assume`` is called with a camera and a text if its file does not state the lens model. The text and
+    remarks on unusual values are printed.
 
     Raises
     ------
@@ -217,15 +222,19 @@ def load_calibrations(
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
 
+    def report(camera: str, text: str) -> None:
+        say_remark(camera, text)
+        assume(camera, text)
+
     lenses: dict[str, CameraCalibration] = {}
     for option in options:
         camera, place = split_calibration(option)
         if camera is not None:
-            calibrations = {camera: read_intrinsics(place, camera)}
+            calibrations = {camera: read_intrinsics(place, camera, report)}
         elif place.suffix == ".mcap":
             with Session([place]) as log:
-                recorded = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
-            calibrations = {c: lens for c, lens in recorded.items() if c in cameras()}
+                known = [camera for camera in log.calibrations if camera in cameras()]
+            calibrations = {camera: read_intrinsics(place, camera, report) for camera in known}
             if not calibrations:
                 raise IpsysError(
                     f"--calibration {place}: has no calibration of these cameras; give another log"
@@ -238,7 +247,22 @@ def load_calibrations(
             if name in lenses:
                 raise IpsysError(f"--calibration: camera {name!r} has two calibrations; give one")
         lenses.update(calibrations)
+    say_unusual(lenses)
     return lenses
+
+
+def say_remark(camera: str, text: str) -> None:
+    """Print a remark on the calibration of a camera."""
+    remarks.print(f"camera {camera}: {text}", style="yellow", markup=False)
+
+
+def say_unusual(lenses: Mapping[str, CameraCalibration]) -> None:
+    """Print remarks on unusual values of calibrations."""
+    from ipsys_log.geometry.plausible_lenses import calibration_remarks
+
+    for camera, lens in sorted(lenses.items()):
+        for text in calibration_remarks(lens):
+            say_remark(camera, text)
 
 
 def split_calibration(option: str) -> tuple[str | None, LogLocation]:
@@ -276,11 +300,12 @@ def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]])
 
 def load_lab(
     rig: Path, calibration: list[str] | None, only: Collection[str], with_lenses: bool = True
-) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration]]:
+) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration], dict[str, str]]:
     """Return the rig of a file, its cameras that have a source (or ``only`` some), and their intrinsics.
 
-    The intrinsics come from ``calibration``, else from the file that the rig names, relative to the folder of
-    the rig file. The files of the rig are read only ``with_lenses``.
+    The intrinsics come from ``calibration``, else from the file that the rig names, relative to the rig file.
+    The files of the rig are read only ``with_lenses``. The last value has a text for each camera whose file
+    does not state the lens model.
 
     Raises
     ------
@@ -291,8 +316,14 @@ def load_lab(
 
     lab, cameras = load_cameras(rig, only)
     names = [camera.name for camera in cameras]
-    lenses = load_calibrations(calibration, lambda: names)
-    return lab, cameras, load_lenses(rig, cameras, lenses, with_lenses)
+    assumed: dict[str, str] = {}
+    given = load_calibrations(calibration, lambda: names, assumed.__setitem__)
+    from_files: dict[str, str] = {}
+    lenses = load_lenses(rig, cameras, given, with_lenses, from_files.__setitem__)
+    for camera, text in from_files.items():
+        say_remark(camera, text)
+    say_unusual({camera: lens for camera, lens in lenses.items() if camera not in given})
+    return lab, cameras, lenses, assumed | from_files
 
 
 def cameras_of(logs: Sequence[LogLocation]) -> set[str]:

@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.calibration_files import announce_assumed
 from ipsys_log.exchange.csv_rows import NamedRow, read_rows
 from ipsys_log.exchange.image_folders import parse_time
+from ipsys_log.exchange.lab_files import load_lenses
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     IMPORTED,
@@ -43,19 +45,30 @@ _LARGEST_ID = (1 << 31) - 1
 
 @dataclass(frozen=True, slots=True)
 class DetectionOptions:
-    """The options of an import: intrinsics by camera and a rig for a new log, and the name of the run."""
+    """The options of an import: a rig for a new log, intrinsics by camera, and the name of the run.
+
+    ``rig_file`` is the path of the rig: the intrinsics of other cameras come from the files that it names.
+    ``assumed`` has a text for each camera whose file does not state the lens model.
+    """
 
     rig: Rig | None = None
     lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
     run: str | None = None
+    rig_file: Path | None = None
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
 
 class ImportedDetections(NamedTuple):
-    """The result of an import: the log, its new run, and the number of markers by camera."""
+    """The result of an import: the log, its new run, and the number of markers by camera.
+
+    ``lenses`` are the intrinsics from the files of the rig. ``assumed`` is that of the options, with these.
+    """
 
     path: Path
     run: str
     markers: dict[str, int]
+    lenses: dict[str, CameraCalibration]
+    assumed: dict[str, str]
 
 
 def import_detections(
@@ -90,12 +103,14 @@ def import_detections(
             )
         if options.rig is None and (session is None or not session.topics(RIG)):
             raise IpsysError(f"{session or file}: has no rig; add --rig FILE")
-        lenses = _lenses(session, options.lenses)
-        frames = _read_frames(file, lenses)
+        known = _lenses(session, options.lenses)
+        frames = _read_frames(file)
+        from_rig, assumed = _lenses_of_rig(options, {frame.camera: frame.where for frame in frames}, known)
+        lenses, assumed = {**known, **from_rig}, {**options.assumed, **assumed}
         run = _run_name(session, options.run)
         messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
         if session is None:
-            messages = [*_settings(options, frames), *messages]
+            messages = [*announce_assumed(_settings(options.rig, lenses, frames), assumed), *messages]
         last_ns = frames[-1].log_time_ns
         earlier = session.runs() if session is not None else []
         number = max((other.number for other in earlier), default=0) + 1
@@ -106,7 +121,7 @@ def import_detections(
     counts = Counter(dict.fromkeys(sorted({frame.camera for frame in frames}), 0))
     for frame in frames:
         counts[frame.camera] += len(frame.markers)
-    return ImportedDetections(output or target, run, dict(counts))
+    return ImportedDetections(output or target, run, dict(counts), from_rig, assumed)
 
 
 class _Frame(NamedTuple):
@@ -114,17 +129,16 @@ class _Frame(NamedTuple):
     time_ns: int
     camera: str
     markers: tuple[Marker, ...]
+    where: str
 
 
-def _read_frames(file: Path, lenses: Mapping[str, CameraCalibration]) -> list[_Frame]:
+def _read_frames(file: Path) -> list[_Frame]:
     """Return the frames of a table in log order, with their markers sorted by id."""
     by_frame: dict[tuple[int, int, str], dict[int, Marker]] = {}
+    first_rows: dict[str, str] = {}
     for row in read_rows(file, _NEEDED):
         camera = check_name(row.text("camera"), f"{row.where}: camera name")
-        if camera not in lenses:
-            raise IpsysError(
-                f"{row.where}: camera {camera!r} has no intrinsics; add --calibration {camera}=FILE"
-            )
+        first_rows.setdefault(camera, row.where)
         time_ns = _time_ns(row)
         log_ns = row.optional("log_time_ns", row.integer)
         log_ns = time_ns if log_ns is None else log_ns
@@ -137,7 +151,7 @@ def _read_frames(file: Path, lenses: Mapping[str, CameraCalibration]) -> list[_F
     if not by_frame:
         raise IpsysError(f"{file}: has no rows; export the markers again")
     return [
-        _Frame(*key, tuple(markers[one] for one in sorted(markers)))
+        _Frame(*key, tuple(markers[one] for one in sorted(markers)), first_rows[key[2]])
         for key, markers in sorted(by_frame.items())
     ]
 
@@ -171,6 +185,28 @@ def _lenses(session: Session | None, given: Mapping[str, CameraCalibration]) -> 
     return {**own, **given}
 
 
+def _lenses_of_rig(
+    options: DetectionOptions, rows: Mapping[str, str], known: Mapping[str, CameraCalibration]
+) -> tuple[dict[str, CameraCalibration], dict[str, str]]:
+    """Return the intrinsics that the rig names for cameras without others, and their assumed models.
+
+    ``rows`` are the places of the first rows by camera.
+    """
+    cameras = {camera.name: camera for camera in options.rig.cameras} if options.rig else {}
+    lenses: dict[str, CameraCalibration] = {}
+    assumed: dict[str, str] = {}
+    for name in sorted(set(rows) - set(known)):
+        if name in cameras and options.rig_file is not None:
+            camera = cameras[name]
+            lenses |= load_lenses(options.rig_file, [camera], {}, report=assumed.__setitem__)
+        if name not in lenses:
+            raise IpsysError(
+                f"{rows[name]}: camera {name!r} has no intrinsics; add --calibration {name}=FILE, or "
+                "calibration = FILE to this camera of the rig file"
+            )
+    return lenses, assumed
+
+
 def _run_name(session: Session | None, wanted: str | None) -> str:
     if wanted is not None:
         check_name(wanted, "--run")
@@ -181,14 +217,16 @@ def _run_name(session: Session | None, wanted: str | None) -> str:
     return free_name(session, Run(0, _RUN, IMPORTED), _RUN, (MARKERS,))
 
 
-def _settings(options: DetectionOptions, frames: Sequence[_Frame]) -> Iterator[Message]:
+def _settings(
+    rig: Rig | None, lenses: Mapping[str, CameraCalibration], frames: Sequence[_Frame]
+) -> Iterator[Message]:
     """Yield the rig, and the intrinsics of the cameras with frames, just before the first frame."""
     cameras = sorted({frame.camera for frame in frames})
     log_ns = frames[0].log_time_ns - len(cameras) - 1
-    yield Message(RIG_TOPIC, log_ns, log_ns, options.rig)
+    yield Message(RIG_TOPIC, log_ns, log_ns, rig)
     for number, camera in enumerate(cameras, 1):
         time_ns = log_ns + number
-        lens = replace(options.lenses[camera], timestamp=time_ns, frame_id=camera)
+        lens = replace(lenses[camera], timestamp=time_ns, frame_id=camera)
         yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
 
 

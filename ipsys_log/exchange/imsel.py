@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.calibration_files import read_opencv_calibration
+from ipsys_log.exchange.calibration_formats import read_calibration
 from ipsys_log.messages import (
     IMPORTED,
     MEASUREMENTS_TOPIC,
@@ -156,7 +156,8 @@ def read_imsel(folder: Path) -> Iterator[Message]:
     yield Message(RIG_TOPIC, START_NS, START_NS, _RIG)
     for number, (camera, path) in enumerate(lenses.items(), 1):
         time_ns = START_NS + number
-        lens = read_opencv_calibration(path, camera, time_ns)
+        # The files do not state the fisheye model; the paper does.
+        lens = read_calibration(path, camera, time_ns).lens
         yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
     time_ns = START_NS
     names: dict[bytes, str] = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from ipsys_log.capture.simulated import intrinsics_of
@@ -54,7 +54,11 @@ def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigC
 
 
 def load_lenses(
-    path: Path, cameras: Sequence[RigCamera], given: Mapping[str, CameraCalibration], read: bool = True
+    path: Path,
+    cameras: Sequence[RigCamera],
+    given: Mapping[str, CameraCalibration],
+    read: bool = True,
+    report: Callable[[str, str], None] = lambda camera, text: None,
 ) -> dict[str, CameraCalibration]:
     """Return the intrinsics of cameras: the given ones, else those from the files that the rig names.
 
@@ -62,6 +66,7 @@ def load_lenses(
     ----------
     path : path of the rig file; names of files are relative to its folder.
     read : read the files; without it, only the given intrinsics are returned.
+    report : called with a camera and a remark if its file does not state the lens model.
 
     Raises
     ------
@@ -72,7 +77,7 @@ def load_lenses(
     lenses = dict(given)
     for camera in cameras if read else ():
         if camera.name not in lenses and camera.calibration is not None:
-            lenses[camera.name] = read_intrinsics(path.parent / camera.calibration, camera.name)
+            lenses[camera.name] = read_intrinsics(path.parent / camera.calibration, camera.name, report)
         elif camera.name not in lenses and str(camera.source).startswith("sim:"):
             lenses[camera.name] = intrinsics_of(camera)
     unknown = sorted(set(lenses) - set(names))

@@ -10,6 +10,7 @@ from ipsys_log.capture.devices import check_sources
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.first_day.lab_folder import FitFacts, LabFolder, LogFacts
+from ipsys_log.geometry.plausible_lenses import calibration_remarks
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.models.table import min_pairs
 from ipsys_log.plain_text import join_names, shell_words
@@ -122,11 +123,13 @@ def _read_rig(path: Path) -> tuple[Rig | None, str]:
 
 def _intrinsics_of(camera: RigCamera, folder: Path) -> CameraIntrinsics:
     if camera.calibration is not None:
+        assumed: dict[str, str] = {}
         try:
-            read_intrinsics(folder / camera.calibration, camera.name)
+            lens = read_intrinsics(folder / camera.calibration, camera.name, assumed.__setitem__)
         except IpsysError as error:
             return CameraIntrinsics(camera.name, False, str(error))
-        return CameraIntrinsics(camera.name, True, f"from {camera.calibration}")
+        texts = [f"from {camera.calibration}", *assumed.values(), *calibration_remarks(lens)]
+        return CameraIntrinsics(camera.name, True, "; ".join(texts))
     if str(camera.source).startswith("sim:"):
         return CameraIntrinsics(camera.name, True, "from the simulated lab")
     file = f"{camera.name}.yaml"

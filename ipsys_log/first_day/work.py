@@ -242,7 +242,8 @@ def _new_log(folder: LabFolder, name: str) -> Iterator[Path]:
 def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
     """Open the cameras of the rig; a stop of the job ends them in order."""
     rig, cameras = load_cameras(folder.rig_file)
-    lenses = load_lenses(folder.rig_file, cameras, {})
+    assumed: dict[str, str] = {}
+    lenses = load_lenses(folder.rig_file, cameras, {}, report=assumed.__setitem__)
     check_devices(cameras)
     check_sources(cameras)
     job.say(f"opening {', '.join(camera.name for camera in cameras)}")
@@ -261,7 +262,7 @@ def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
             rig,
             fitting,
             attached,
-            first_messages(rig, fitting, attached.now_ns, attached.imported_run),
+            first_messages(rig, fitting, attached.now_ns, attached.imported_run, assumed),
             monitor,
         )
 

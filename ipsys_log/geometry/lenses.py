@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError, SizeError
+from ipsys_log.geometry.plausible_lenses import check_plausible
 from ipsys_log.messages import CameraCalibration
 
 __all__ = [
@@ -80,8 +81,8 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
     Raises
     ------
     IpsysError
-        The distortion model is unknown, the number of coefficients is wrong, or a focal length is not
-        positive. The text names ``where``.
+        The distortion model is unknown, the number of coefficients is wrong, or the values are not those of a
+        camera with images of this size. The text names ``where``.
     """
     wanted = DISTORTION_MODELS.get(lens.distortion_model)
     if wanted is None:
@@ -101,8 +102,7 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
         raise IpsysError(
             f"{where}: {lens.width} x {lens.height} px is not an image size; correct the size in pixels"
         )
-    if not lens.K[0, 0] > 0 < lens.K[1, 1]:
-        raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
+    check_plausible(lens, where)
     return lens
 
 

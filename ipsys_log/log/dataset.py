@@ -32,10 +32,11 @@ from ipsys_log.log.contents import (
 )
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import Cut, Measurement, Merge, MergedLog, Message, Run
+from ipsys_log.messages import ASSUMED_MODEL, Cut, Measurement, Merge, MergedLog, Message, Run
 from ipsys_log.messages.channels import (
     CALIBRATIONS,
     CUTS,
+    EVENTS,
     IMAGES,
     MEASUREMENTS_TOPIC,
     MERGES,
@@ -103,6 +104,15 @@ class Session:
     @property
     def end_ns(self) -> int:
         return max((r.end_ns for r in self.readers if r.end_ns is not None), default=0)
+
+    def assumed_models(self) -> dict[str, str]:
+        """Return the cameras whose calibration file did not state the lens model, each with a text on it."""
+        events = (event for _, event in self.attempts(self.topics(EVENTS)) if isinstance(event, Message))
+        return {
+            str(event.payload.camera): event.payload.text
+            for event in events
+            if event.payload.kind == ASSUMED_MODEL
+        }
 
     def topics(self, channel: Channel, run: str | None = None) -> list[str]:
         """Return the topics of a channel that have messages: of one run, or with None outside of all runs."""

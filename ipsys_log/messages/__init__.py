@@ -28,7 +28,14 @@ from ipsys_log.messages.commands import (
     WheelCommand,
 )
 from ipsys_log.messages.cuts import ChannelCut, Cut
-from ipsys_log.messages.events import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
+from ipsys_log.messages.events import (
+    ASSUMED_MODEL,
+    CAMERA_MOVED,
+    FRAME_SKIPPED,
+    STAMP_UNRELIABLE,
+    Event,
+    Latency,
+)
 from ipsys_log.messages.images import (
     Color,
     CompressedImage,
@@ -92,6 +99,7 @@ from ipsys_log.messages.tracks import (
 )
 
 __all__ = [
+    "ASSUMED_MODEL",
     "CAMERA_MOVED",
     "COMMANDS_TOPIC",
     "DRIVING",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from statistics import fmean, median
 from typing import Any
 
@@ -14,9 +14,12 @@ from rich.text import Text
 from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
 from ipsys_log.analysis.frame_gaps import FrameGaps, find_gaps
 from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.geometry.plausible_lenses import calibration_remarks
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Run
+from ipsys_log.messages import CameraCalibration, Run
 from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.runs.frame_times import channel_times
@@ -113,10 +116,24 @@ def contents_json(session: Session) -> dict[str, Any]:
             }
             for camera, topic in session.images.items()
         },
+        "calibration_remarks": _calibration_remarks(session),
         "channels": {topic: _channel(session, topic) for topic in topics},
         "overlap": overlap_json(session),
         "runs": runs_json(session),
     }
+
+
+def _calibration_remarks(session: Session) -> list[dict[str, str]]:
+    """Return remarks on the calibrations of a log: an assumed lens model, and values that no camera has."""
+    remarks = [*session.assumed_models().items()]
+    for camera, topic in session.calibrations.items():
+        lens = replace(_newest(session, topic), frame_id=camera)
+        try:
+            check_calibration(lens, "its calibration")
+            remarks += [(camera, text) for text in calibration_remarks(lens)]
+        except IpsysError as error:
+            remarks.append((camera, str(error)))
+    return [{"camera": camera, "text": text} for camera, text in remarks]
 
 
 def overlap_json(session: Session) -> list[dict[str, Any]]:
@@ -138,10 +155,14 @@ def overlap_json(session: Session) -> list[dict[str, Any]]:
 def _lens(session: Session, camera: str) -> dict[str, Any] | None:
     if camera not in session.calibrations:
         return None
-    topic = session.calibrations[camera]
-    *_, message = session.messages([topic], session.last([topic])[0])
-    lens = message.payload
+    lens = _newest(session, session.calibrations[camera])
     return {"width": lens.width, "height": lens.height, "model": lens.distortion_model}
+
+
+def _newest(session: Session, topic: str) -> CameraCalibration:
+    *_, message = session.messages([topic], session.last([topic])[0])
+    lens: CameraCalibration = message.payload
+    return lens
 
 
 def _channel(session: Session, topic: str) -> dict[str, Any]:
@@ -209,6 +230,7 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s" if found["start"] else "no messages"
     files.caption_justify = "left"
     tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
+    tables += [_remarks_table(found)] if found["calibration_remarks"] else []
     tables += [_overlap_table(found["overlap"])] if found["overlap"] else []
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 
@@ -221,6 +243,13 @@ def _cameras_table(found: dict[str, Any]) -> Table:
         if lens is not None:
             text = Text(plain_text(f"{lens['width']} x {lens['height']} px, {lens['model']}"))
         table.add_row(camera, str(channel["messages"]), _rate(channel), text)
+    return table
+
+
+def _remarks_table(found: dict[str, Any]) -> Table:
+    table = _table("Remarks on calibrations", "camera", "remark")
+    for row in found["calibration_remarks"]:
+        table.add_row(row["camera"], Text(plain_text(row["text"]), style="yellow"))
     return table
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.geometry.plausible_lenses import calibration_remarks
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Rig
@@ -73,8 +74,11 @@ def check_intrinsics(session: Session) -> Iterator[LogFinding]:
         place = stored, message.log_time_ns
         try:
             check_calibration(replace(lens, frame_id=camera), "the intrinsics")
+            unusual = calibration_remarks(lens)
         except IpsysError as error:
-            yield LogFinding("reference", REMARK, str(error), advice, *place)
+            unusual = [str(error)]
+        for text in unusual:
+            yield LogFinding("reference", REMARK, f"camera {camera}: {text}", advice, *place)
         if camera in sizes_px and sizes_px[camera] != (lens.width, lens.height):
             width, height = sizes_px[camera]
             text = (

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.exchange.calibration_files import read_opencv_calibration
+from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
 from ipsys_log.runs.output import write_log
@@ -84,7 +84,7 @@ def test_a_folder_of_pictures(ipsys: Ipsys, red: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("COLUMNS", "80")
     done = calibrate(ipsys, "red", "--board", "6x4", "--plot", "red.png")
     assert done.code == 0, done.err
-    lens = read_opencv_calibration(red.parent / "red.yaml", "red")
+    lens = read_intrinsics(red.parent / "red.yaml", "red")
     assert (lens.width, lens.height, lens.distortion_model) == (*SIZE_PX, "kannala_brandt")
     storage = cv2.FileStorage(str(red.parent / "red.yaml"), cv2.FILE_STORAGE_READ)
     sigmas = [storage.getNode("standard_deviations").getNode(name).real() for name in NAMES]
@@ -115,7 +115,7 @@ def test_all_of_it_as_json_and_in_all_formats(ipsys: Ipsys, red: Path, tmp_path:
     assert set(found["standard_deviations"]) == set(NAMES)
     assert found["coverage"]["widest_rad"] > 1.0
     for name in ("red.yaml", "red_ros.yaml"):
-        lens = read_opencv_calibration(out / name, "red")
+        lens = read_intrinsics(out / name, "red")
         assert lens.K[0, 0] == found["parameters"]["fx"]
 
 
@@ -127,7 +127,7 @@ def test_existing_files_are_overwritten_only_on_request(ipsys: Ipsys, red: Path,
     assert "--force" in line
     assert file.read_text() == "precious"
     assert calibrate(ipsys, red, "--board", "6x4", "-o", file, "--force").code == 0
-    assert read_opencv_calibration(file, "red").width == SIZE_PX[0]
+    assert read_intrinsics(file, "red").width == SIZE_PX[0]
 
 
 @pytest.fixture
@@ -387,7 +387,7 @@ def test_a_recorded_video_gives_the_lens_of_its_pictures(
         assert done.code == 0
         (one,) = json.loads(done.out)
         assert one["pictures"]["seen"] == 12
-        lens = read_opencv_calibration(tmp_path / "x.yaml", "red")
+        lens = read_intrinsics(tmp_path / "x.yaml", "red")
         lenses.append(lens.K)
     # The only loss between the two is the rounding of grey levels.
     assert np.abs(np.subtract(*lenses)).max() < 0.05

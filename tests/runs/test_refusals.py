@@ -14,6 +14,7 @@ import pytest
 
 from ipsys_log import errors
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.joint.solver import ConvergenceError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -89,6 +90,10 @@ def rig(**fields: Any) -> Change:
     return edit(Rig, lambda one: replace(one, **fields))
 
 
+def lens_of(**fields: Any) -> Change:
+    return edit(CameraCalibration, lambda lens: replace(lens, **fields))
+
+
 def places(point_m: Callable[[int], tuple[float, float, float]]) -> Change:
     """Give each measurement a world point, by its number."""
 
@@ -121,7 +126,9 @@ NO_COVARIANCE = edit(
         one, markers=tuple(replace(marker, covariance_px2=np.zeros((8, 8))) for marker in one.markers)
     ),
 )
-WIDER = edit(CameraCalibration, lambda lens: replace(lens, width=1920, height=1080))
+SKEWED = np.array([[500.0, 2.84, 480.0], [0.0, 500.0, 270.0], [0.0, 0.0, 1.0]])
+FOLDING = np.array([-1.15, 2.91, -2.48, 0.178])
+WIDER = edit(CameraCalibration, lambda lens: scale_intrinsics(lens, 1920, 1080, "red"))
 FAR = edit(
     CameraPoints, lambda one: replace(one, points=tuple(replace(point, x_m=1e9) for point in one.points))
 )
@@ -153,6 +160,9 @@ CASES: dict[str, Case] = {
         said="takes 4 coefficients, found 3",
         change=edit(CameraCalibration, lambda lens: replace(lens, D=lens.D[:3])),
     ),
+    "centre": Case(said="the principal point", change=lens_of(width=1920, height=1080), log="lab"),
+    "skew": Case(said="has a skew of 2.84 px", change=lens_of(K=SKEWED), log="lab"),
+    "folding": Case(said="turns back inside the image", change=lens_of(D=FOLDING), log="lab"),
     "size": Case(said="its calibration is for 1920 x 1080", change=WIDER, log="lab"),
     "size_stock": Case(
         said="its calibration is for 1920 x 1080", change=WIDER, log="lab",
@@ -271,6 +281,9 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "geometry.lenses.check_size": ("size", "size_stock", "size_video"),
     "geometry.lenses.scale_intrinsics": "only a recorder calls it",
     "geometry.markers.check_covariance": ("covariance",),
+    "geometry.plausible_lenses._check_centre": ("centre",),
+    "geometry.plausible_lenses._check_matrix": ("skew",),
+    "geometry.plausible_lenses.check_plausible": ("folding",),
     "geometry.trilateration._check_numbers": ("no_distance",),
     "geometry.trilateration.multilaterate": ("no_side", "wrong_side"),
     "geometry.trilateration.trilaterate": ("no_triangle",),

@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import ipsys_log as ipsys
+from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import journal_path
 from ipsys_log.log.reader import LogReader
@@ -311,7 +312,7 @@ def _without_lens(message: Message) -> Message | None:
 
 def _other_size(message: Message) -> Message:
     if isinstance(message.payload, CameraCalibration) and message.camera == "red":
-        return replace(message, payload=replace(message.payload, width=1920, height=1080))
+        return replace(message, payload=scale_intrinsics(message.payload, 1920, 1080, "red"))
     return message
 
 

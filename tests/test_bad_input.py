@@ -273,6 +273,29 @@ def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> N
     assert [(event.kind, event.camera) for event in events] == [("corrupt_frame", "white")]
 
 
+@pytest.mark.parametrize("has_crc", [True, False])
+def test_flipped_bit_in_an_image_is_named_by_its_crc(ipsys: Ipsys, lab: Path, has_crc: bool) -> None:
+    with Session([lab]) as session:
+        image = next(session.messages(["/cameras/white/image"])).payload.data
+        topics = ["/cameras/white/image"]
+        assert list(session.readers[0].changed_chunks(topics)) == []
+    data = bytearray(lab.read_bytes())
+    at = data.find(image) + len(image) - 200
+    data[at] ^= 4
+    lab.write_bytes(data)
+    with Session([lab]) as session:
+        ((offset, start_ns, names),) = session.readers[0].changed_chunks(topics)
+    assert names == topics
+    if not has_crc:
+        data[offset + 33 : offset + 37] = bytes(4)  # after opcode, length, two times and a size
+        lab.write_bytes(data)
+    done = ipsys("detect", lab)
+    assert done.code == 0, done.err
+    remark = f"{lab}: the CRC of the chunk at byte {offset} is wrong: images of "
+    assert done.err.count(remark) == has_crc
+    assert (f"white from {format_time(start_ns)} on have changed" in done.err) == has_crc
+
+
 def test_impossible_names_and_options_are_refused(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     assert "model 'spline' is not known; use one of" in refused(
         ipsys, lab, "replay", lab, "--model", "spline"

@@ -19,7 +19,8 @@ from ipsys_log.units import NS_PER_S
 __all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "recorded_latencies", "step_times_s"]
 
 STEPS = ("captured", "received", "detected", "located", "fused", "published")
-_REMEMBERED = 20_000
+# Frames whose times are kept: more than those that wait for the stages, of 24 cameras too.
+_REMEMBERED = 2_000
 # The step that is done when a message of a channel is made.
 _STEP_OF = {MARKERS: "detected", POSITIONS: "located", TRACKS: "fused"}
 

@@ -179,7 +179,9 @@ def _decode(data: bytes) -> Grey | None:
         check_encoded(data)
         # Keep the orientation of the sensor: the lens does not turn with the orientation tag of an image.
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        # OpenCV refuses a JPEG without the end marker, which some cameras leave out.
+        ended = data + b"\xff\xd9" if data.startswith(b"\xff\xd8") else data
+        grey = cv2.imdecode(np.frombuffer(ended, np.uint8), flags)
     except (FrameError, cv2.error):  # OpenCV asserts on empty data
         return None
     return None if grey is None else np.asarray(grey, dtype=np.uint8)

@@ -25,7 +25,8 @@ __all__ = ["LiveCameras"]
 # Most bytes of frames that wait to be written: some seconds of three cameras.
 _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
-_REMEMBERED = 20_000
+# Frames whose times are kept: more than those that wait for the stages, of 24 cameras too.
+_REMEMBERED = 2_000
 # Longest time that the user waits for the disk when a point is saved.
 _SAVED_S = 10.0
 # After an interrupt, a hanging camera delays the end by at most this time.

@@ -118,6 +118,19 @@ _OPTIONS = {
     "analyzeduration": "1000000",
 }
 
+# The protocols of FFmpeg that a stream may use, by the scheme of its address. A playlist names further
+# addresses: without this limit, a camera can name files of this machine (file://), and the setup page shows
+# them.
+_WEB = "http,https,httpproxy,crypto,tcp,tls"
+_PROTOCOLS = {
+    "http": _WEB,
+    "https": _WEB,
+    "rtsp": "rtp,tcp,udp",
+    "rtsps": "rtp,srtp,tcp,tls,udp",
+    "tcp": "tcp",
+    "udp": "udp",
+}
+
 # The queue holds frames, then the error, or None at the end of the stream.
 _Queue = Queue[Frame | SourceError | None]
 
@@ -238,7 +251,8 @@ def _open(address: str, label: str) -> InputContainer:
             f"{label}: the name {host!r} cannot be resolved ({error.strerror}); check the network, "
             "or use the IP address"
         ) from error
-    return av.open(address, options=dict(_OPTIONS), timeout=_SILENT_S)
+    options = {**_OPTIONS, "protocol_whitelist": _PROTOCOLS[address.partition(":")[0].lower()]}
+    return av.open(address, options=options, timeout=_SILENT_S)
 
 
 def _explain(error: Exception) -> str:

@@ -46,6 +46,9 @@ __all__ = [
 
 # After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0
+# After this number of ticks without a message, the last ones go into the file. At each tick, every image of a
+# camera of 10 Hz would be a chunk, with its index in memory.
+_QUIET_TICKS = 5
 _DELETED = "another program has deleted the log"
 
 
@@ -234,7 +237,7 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
     deleted the log, the source is stopped.
     Messages other than frames are still written, to the reserved space.
     """
-    warned = False
+    warned, ticks = False, 0
     with closing(iter(source)) as messages:
         for message in messages:
             if log.fault is not None and not warned:
@@ -242,8 +245,10 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
                 source.add_event(
                     "disk_fault", f"{describe_disk_fault(log.fault)}; the last written messages may be lost"
                 )
+            ticks = 0 if message is not None else ticks + 1
             if message is None:
-                log.flush()
+                if ticks % _QUIET_TICKS == 0:
+                    log.flush()
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
                 log.put(message)
                 if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:

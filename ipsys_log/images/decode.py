@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
 from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
+from ipsys_log.images.jpeg_flaws import decode_flawed, remove_stray_bytes
 from ipsys_log.messages import CompressedImage, RawImage
 
 __all__ = [
@@ -182,10 +183,14 @@ def decode_rows(
     starts, stops = [part.start for part in shown], [part.stop for part in shown]
     for low, high in zip([0, *stops], [*starts, layout.height], strict=True):
         grey[low:high] = 0
-    pieces = cut_rows(frame.data, layout, shown, memory.reserve(len(frame.data)))
-    for piece, part in zip(pieces, shown, strict=True):
-        # Without restart markers, the data after the last requested row looks like damage.
-        _decode_jpeg(piece, grey[part], strict=layout.interval > 0)
+    try:
+        pieces = cut_rows(frame.data, layout, shown, memory.reserve(len(frame.data)))
+        for piece, part in zip(pieces, shown, strict=True):
+            # Without restart markers, the data after the last requested row looks like damage.
+            _decode_jpeg(piece, grey[part], strict=layout.interval > 0)
+    except FrameError:  # the whole image shows whether the camera always sends surplus bytes
+        _decode_jpeg(frame.data, grey)
+        return grey, [slice(0, layout.height)]
     return grey, shown
 
 
@@ -239,7 +244,15 @@ def _decode_jpeg(
     try:
         grey: Grey = simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=pixels, strict=strict)[..., 0]
     except ValueError as error:
-        raise FrameError(str(error)) from error
+        clean = remove_stray_bytes(bytes(data))
+        check_encoded(clean)
+        flawed = decode_flawed(clean)
+        if flawed is None:
+            raise FrameError(str(error)) from error
+        if pixels is None:
+            return flawed
+        pixels[:] = flawed
+        return pixels
     return grey
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
 
-__all__ = ["JpegHeader", "cut_rows", "read_layout", "whole_rows"]
+__all__ = ["JpegHeader", "check_restarts", "cut_rows", "read_header", "read_layout", "whole_rows"]
 
 _END = b"\xff\xd9"
 _BASELINE = (0xC0, 0xC1)
@@ -31,15 +31,16 @@ _AT_ONCE = 65_536
 class JpegHeader(NamedTuple):
     """The header of a baseline JPEG.
 
-    ``width`` and ``height`` are its size in px. ``block_px`` is the height of a row of blocks in px, and
-    ``blocks`` the number of blocks in a row. ``height_at`` and ``data_at`` are the offsets in the file of the
-    height and of the pixel data. ``interval`` is the number of blocks between two restart markers (0: there
-    are no restart markers).
+    ``width`` and ``height`` are its size in px. ``block_px`` is the height of a row of blocks in px,
+    ``block_width_px`` their width, and ``blocks`` the number of blocks in a row. ``height_at`` and
+    ``data_at`` are the offsets in the file of the height and of the pixel data. ``interval`` is the number of
+    blocks between two restart markers (0: there are no restart markers).
     """
 
     width: int
     height: int
     block_px: int
+    block_width_px: int
     blocks: int
     height_at: int
     data_at: int
@@ -56,6 +57,11 @@ def read_layout(data: bytes) -> JpegHeader | None:
     # Some cameras append zeros.
     if data[:2] != b"\xff\xd8" or not (data.endswith(_END) or data.rstrip(b"\0").endswith(_END)):
         return None
+    return read_header(data)
+
+
+def read_header(data: bytes) -> JpegHeader | None:
+    """Return the header of a baseline JPEG in one scan, also of a truncated one; None for all other data."""
     offset, frame, interval = 2, None, 0
     while offset + 4 <= len(data) and data[offset] == 0xFF:
         kind, size = data[offset + 1], int.from_bytes(data[offset + 2 : offset + 4], "big")
@@ -83,7 +89,7 @@ def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -
         return None
     across, down = max(f >> 4 for f in factors), max(f & 15 for f in factors)
     blocks = -(-width // (8 * across))
-    return JpegHeader(width, height, 8 * down, blocks, frame + 5, scan + 2 + scan_size, interval)
+    return JpegHeader(width, height, 8 * down, 8 * across, blocks, frame + 5, scan + 2 + scan_size, interval)
 
 
 def whole_rows(layout: JpegHeader, rows: Iterable[slice]) -> list[slice]:
@@ -137,17 +143,23 @@ def cut_rows(
 
 def _find_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> NDArray[np.intp]:
     """Return the offsets of restart markers; search in pieces that fit into the processor's cache."""
-    offsets = []
+    offsets = [np.empty(0, dtype=np.intp)]
     for start in range(layout.data_at, len(codes) - 1, _AT_ONCE):
         ends = np.flatnonzero(codes[start : min(start + _AT_ONCE, len(codes) - 1)] == 0xFF) + start
         offsets.append(ends[(codes[ends + 1] & 0xF8) == _RESTART])
     return np.concatenate(offsets)
 
 
-def _check_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> None:
-    """Check that all restart markers are present and in order, because their count identifies rows."""
+def check_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> None:
+    """Check that all restart markers are present and in order, because their count identifies rows.
+
+    Raises
+    ------
+    FrameError
+        Restart markers are missing or out of order.
+    """
     blocks = layout.blocks * -(-layout.height // layout.block_px)
-    wanted = _RESTART + np.arange(-(-blocks // layout.interval) - 1) % _CYCLE
+    wanted = _RESTART + np.arange(-(-blocks // (layout.interval or blocks)) - 1) % _CYCLE
     if not np.array_equal(codes, wanted):
         raise FrameError("restart markers are missing or out of order")
 
@@ -156,20 +168,22 @@ def _between(data: bytes, layout: JpegHeader, rows: Sequence[slice]) -> list[byt
     """Return JPEGs of the header and the data of some rows, from one restart marker to another."""
     if not rows:
         return []
-    codes = np.frombuffer(data, dtype=np.uint8)
+    # Some cameras append other data, such as a smaller image.
+    end = data.find(_END, layout.data_at) + len(_END)
+    codes = np.frombuffer(data, dtype=np.uint8, count=end)
     restarts = _find_restarts(codes, layout)
-    _check_restarts(codes[restarts + 1], layout)
-    starts = [layout.data_at, *(restarts + 2).tolist(), len(data)]
+    check_restarts(codes[restarts + 1], layout)
+    starts = [layout.data_at, *(restarts + 2).tolist(), end]
     pieces = []
     for part in rows:
-        begin, end = (
+        first, last = (
             row // layout.block_px * layout.blocks // layout.interval for row in (part.start, part.stop)
         )
         if part.stop == layout.height:
-            end = len(restarts) + 1
-        start, stop = starts[begin], starts[end]
+            last = len(restarts) + 1
+        start, stop = starts[first], starts[last]
         piece = bytearray(data[: layout.data_at]) + data[start:stop]
-        for number, offset in enumerate(restarts[begin : end - 1].tolist()):
+        for number, offset in enumerate(restarts[first : last - 1].tolist()):
             piece[layout.data_at + offset - start + 1] = _RESTART + number % _CYCLE
         piece[-2:] = _END
         pieces.append(piece)

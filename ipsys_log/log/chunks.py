@@ -17,9 +17,9 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, chunk_excess
+from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, BoundError, chunk_excess
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse
+from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse, parse_chunk_head
 
 __all__ = [
     "ChunkContents",
@@ -28,6 +28,7 @@ __all__ = [
     "check_compression",
     "check_definition",
     "find_blocks",
+    "has_wrong_crc",
     "inner_records",
     "parse_chunk_contents",
     "unpack",
@@ -166,6 +167,8 @@ class _PerThread(threading.local):
 
 _DECOMPRESSORS = _PerThread()
 _PIECE = 4 << 20  # bytes: decompressed at once if the size of the result is not known
+_LARGEST_UNPACKED = 64 << 20  # bytes
+_CHECKED_AT_ONCE = 256 << 10  # bytes, which stay in the cache of the processor
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _FAULTS = (zstandard.ZstdError, RuntimeError, EOFError, ValueError)
 
@@ -210,6 +213,25 @@ def unpack(view: LogBytes, offset: int, head: ChunkHead, is_crc_checked: bool = 
     if is_crc_checked and head.crc and zlib.crc32(data) != head.crc:
         raise view.fault(offset, "the CRC of the chunk is wrong")
     return data
+
+
+def has_wrong_crc(view: LogBytes, offset: int) -> bool:
+    """Return whether the records of the chunk at `offset` contradict its CRC.
+
+    False if the chunk has no CRC. A large compressed chunk is not checked: it would need much memory.
+    """
+    head = parse_chunk_head(view, offset)[1]
+    if not head.crc or (head.compression and head.uncompressed_size > _LARGEST_UNPACKED):
+        return False
+    if head.compression:
+        try:
+            return zlib.crc32(unpack(view, offset, head, is_crc_checked=False)) != head.crc
+        except BoundError:
+            return False
+    crc, end = 0, head.data_offset + head.data_size
+    for start in range(head.data_offset, end, _CHECKED_AT_ONCE):
+        crc = zlib.crc32(view.read(start, min(_CHECKED_AT_ONCE, end - start)), crc)
+    return crc != head.crc
 
 
 def _decompress(view: LogBytes, offset: int, head: ChunkHead, data: bytes, excess: str) -> bytes:

@@ -29,6 +29,7 @@ from ipsys_log.log.chunk_messages import (
     planned_range,
     to_rows,
 )
+from ipsys_log.log.chunks import has_wrong_crc
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
 from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.file_check import FileCheck, check_file
@@ -317,6 +318,20 @@ class LogReader:
     def check_file(self, watch: Watch) -> FileCheck:
         """Read every byte of the log, and compare records, CRCs, indexes, summary and stored hashes."""
         return check_file(self._view, self._contents, stored_hashes(self._view, self._contents), watch)
+
+    def changed_chunks(self, topics: Collection[str]) -> Iterator[tuple[int, int, list[str]]]:
+        """Yield the chunks with these topics that contradict their CRC; of files, not of remote objects.
+
+        Yields
+        ------
+        The offset of the chunk, its first log time in ns, and those of the topics that it has.
+        """
+        wanted = self._topics_by_id(topics)
+        chunks = self._contents.chunks if wanted and isinstance(self._view, FileBytes) else []
+        for chunk in chunks:
+            names = [topic for key, topic in wanted.items() if key in chunk.index_offsets]
+            if names and has_wrong_crc(self._view, chunk.offset):
+                yield chunk.offset, chunk.start_ns, names
 
     def sizes(
         self, progress: Callable[[int], None] = lambda done: None, topics: Collection[str] | None = None

@@ -6,7 +6,7 @@ The layouts follow the MCAP specification, https://mcap.dev/spec. The record cla
 import struct
 from collections.abc import Callable, Iterator
 from io import BytesIO
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 from mcap import records as mcap
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -51,6 +51,8 @@ MESSAGE_HEAD_SIZE = MESSAGE.size  # bytes from a message's opcode to its payload
 CHUNK_HEAD_SIZE = 49  # bytes from a chunk's opcode to its data, without the name of the compression
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # start, end, offset, length, bytes of the map that follows
+_PACKED = struct.Struct("<QQQQQQQI")  # the numbers of a ChunkRef, bytes of the map that follows
+_CHANNEL_OFFSET = struct.Struct("<HQ")
 _WALK_BLOCK = 4096
 _LONGEST_NAME = 64
 
@@ -82,6 +84,22 @@ class ChunkRef(NamedTuple):
     def end(self) -> int:
         """The offset of the first byte after the message indexes of the chunk."""
         return self.offset + self.length + self.index_length
+
+    def pack(self) -> bytes:
+        """Return these contents in a tenth of the memory; :meth:`unpack` reads them."""
+        name, offsets = self.compression.encode(), self.index_offsets
+        place = self.start_ns, self.end_ns, self.offset, self.length
+        sizes = self.compressed_size, self.uncompressed_size, self.index_length
+        pairs = b"".join(_CHANNEL_OFFSET.pack(*pair) for pair in offsets.items())
+        return _PACKED.pack(*place, *sizes, len(pairs)) + pairs + name
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Self:
+        start, end, offset, length, compressed, uncompressed, index_length, size = _PACKED.unpack_from(data)
+        pairs, name = data[_PACKED.size : _PACKED.size + size], data[_PACKED.size + size :]
+        offsets = dict(_CHANNEL_OFFSET.iter_unpack(pairs))
+        sizes = compressed, uncompressed, index_length
+        return cls(offset, length, start, end, name.decode(), *sizes, offsets)
 
     def as_record(self) -> mcap.ChunkIndex:
         return mcap.ChunkIndex(

@@ -71,6 +71,8 @@ class LogWriter:
         self._channels: dict[str, tuple[int, ChunkBuilder]] = {}
         # The last declaration of each topic: a search of all channels for each message takes too long.
         self._declared: dict[str, tuple[Schema | None, str]] = {}
+        # A live run grows for days. Until its end, only its summary needs these.
+        self._packed_chunks: list[bytes] = []
         self._hashes: dict[str, ChannelHash] = {}
         self._stored: dict[str, ChannelHash] = {}
         self._open = True
@@ -293,7 +295,8 @@ class LogWriter:
         shift = self._output.offset - chunk.offset
         self._output.emit(data, crc)
         offsets = {key: offset + shift for key, offset in chunk.index_offsets.items()}
-        self._contents.chunks.append(chunk._replace(offset=chunk.offset + shift, index_offsets=offsets))
+        copy = chunk._replace(offset=chunk.offset + shift, index_offsets=offsets)
+        self._packed_chunks.append(copy.pack())
         self._contents.cover(chunk.start_ns, chunk.end_ns)
         for key, number in counts.items():
             self._contents.count(key, number)
@@ -386,6 +389,7 @@ class LogWriter:
 
     def _finish(self) -> None:
         contents, output = self._contents, self._output
+        contents.chunks += map(ChunkRef.unpack, self._packed_chunks)
         hashes = metadata_of_hashes(self._hashes, output.offset)
         if hashes:
             contents.metadata.append(mcap.MetadataIndex(output.offset, len(hashes), METADATA_NAME))
@@ -446,7 +450,7 @@ class LogWriter:
             return
         ref, data, crc = chunk
         self._output.emit(data, crc)
-        self._contents.chunks.append(ref)
+        self._packed_chunks.append(ref.pack())
         self._contents.cover(ref.start_ns, ref.end_ns)
         for channel, number in builder.counts.items():
             self._contents.count(channel, number)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -41,8 +41,9 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, imported_inputs, newest_run
 from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.stages.detect import usual_corners
+from ipsys_log.units import format_time
 
-__all__ = ["check_earlier_runs", "check_inputs", "image_sizes"]
+__all__ = ["check_earlier_runs", "check_inputs", "describe_changed_images", "image_sizes"]
 
 # Most messages of a channel that the checks read. Some recorders write a calibration with each frame, so that
 # all of them are spread over the whole log.
@@ -273,3 +274,20 @@ def _first_size_px(session: Session, topic: str) -> tuple[int, int] | None:
             if frame is not None:
                 return frame_size(frame)
     return None
+
+
+def describe_changed_images(session: Session) -> Iterator[str]:
+    """Yield for each log a remark if the CRC of a chunk shows that its images have changed."""
+    for reader in session.readers:
+        topics = [topic for topic in session.images.values() if topic in reader.channels]
+        chunks = list(reader.changed_chunks(topics))
+        if not chunks:
+            continue
+        offset, start_ns, names = chunks[0]
+        cameras = ", ".join(sorted(camera for camera, topic in session.images.items() if topic in names))
+        more = f", and of {len(chunks) - 1} more" if len(chunks) > 1 else ""
+        yield (
+            f"{reader.path}: the CRC of the chunk at byte {offset}{more} is wrong: images of {cameras} from "
+            f"{format_time(start_ns)} on have changed since the recording, and are used as they are; copy "
+            f"the log again from its origin. To find all damage: ipsys check {reader.path}"
+        )

@@ -11,11 +11,11 @@ from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
-from ipsys_log.messages.channels import MODEL, RUN_EVENTS, Channel
+from ipsys_log.messages.channels import IMAGES, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
-from ipsys_log.runs.checks import check_earlier_runs
+from ipsys_log.runs.checks import check_earlier_runs, describe_changed_images
 from ipsys_log.runs.execute import compute_messages, run_stage
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.model_checks import check_fits
@@ -121,10 +121,13 @@ class Replay:
         return outcome.run
 
     def _prepare(self, task: Task, session: Session) -> None:
-        """Divide a long run; the workers start while this process loads libraries and opens the log."""
+        """Divide a long run, and check its images while the workers load libraries and open the log."""
         self.divided = divide_run(task, session, self.workers)
         if self.divided is not None:
             self.divided.workers.prepare(self.divided.plan)
+        if IMAGES in task.stage.reads:
+            for remark in describe_changed_images(session):
+                self.say(remark)
 
     def _messages(
         self, task: Task, session: Session, name: str, following: Sequence[Stage], model: str

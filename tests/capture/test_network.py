@@ -5,10 +5,11 @@ from __future__ import annotations
 import http.server
 import re
 import socket
+import socketserver
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import count, islice, pairwise
 from pathlib import Path
@@ -16,8 +17,9 @@ from pathlib import Path
 import av
 import pytest
 
+from ipsys_log.capture.devices import OPENERS
 from ipsys_log.capture.frames import Clock, Frame, SourceError
-from ipsys_log.capture.network import open_network
+from ipsys_log.capture.network import _PROTOCOLS, open_network
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs, serve, serve_rtsp
@@ -169,6 +171,59 @@ def test_invalid_stream_is_reported(web: str, path: str, said: str) -> None:
         take(web + path, 1)
     assert f"camera red: {web}{path}: " in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def playlist(url: str) -> bytes:
+    return f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{url}\n#EXT-X-ENDLIST\n".encode()
+
+
+@contextmanager
+def answering(data: bytes) -> Iterator[str]:
+    """Answer each connection with the same bytes, without HTTP."""
+
+    class Answer(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            self.request.sendall(data)
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Answer) as server:
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        yield f"tcp://127.0.0.1:{server.server_address[1]}/live.m3u8"
+        server.shutdown()
+
+
+@pytest.fixture
+def segment(tmp_path: Path) -> Path:
+    """A video on this machine, in the folder of ``web``."""
+    make_jpegs(tmp_path, 90)
+    return encode(tmp_path, "private.ts", *X264)
+
+
+def test_playlist_by_tcp_reads_no_file(segment: Path) -> None:
+    with answering(playlist(segment.as_uri())) as address, pytest.raises(SourceError, match="is not video"):
+        take(address, 1)
+    with (
+        answering(playlist(segment.as_uri())) as inner,
+        answering(f"#EXTM3U\n#EXT-X-STREAM-INF:BANDWIDTH=1\n{inner}\n".encode()) as outer,
+        pytest.raises(SourceError, match="is not video"),
+    ):
+        take(outer, 1)
+
+
+def test_playlist_by_http_reads_only_http(web: str, segment: Path, tmp_path: Path) -> None:
+    (tmp_path / "live.m3u8").write_bytes(playlist(segment.name))
+    assert len(take(f"{web}/live.m3u8", 3)) == 3
+    with answering(playlist(segment.as_uri())) as address:
+        for number, url in enumerate([segment.as_uri(), address]):
+            (tmp_path / f"{number}.m3u8").write_bytes(playlist(url))
+            with pytest.raises(SourceError, match="is not video"):
+                take(f"{web}/{number}.m3u8", 1)
+
+
+def test_every_network_source_limits_the_protocols() -> None:
+    schemes = {scheme for scheme, opener in OPENERS.items() if opener is open_network}
+    assert schemes == set(_PROTOCOLS)
+    protocols = {protocol for names in _PROTOCOLS.values() for protocol in names.split(",")}
+    assert not protocols & {"file", "pipe", "subfile", "concat", "data", "fd", "unix", "cache", "async"}
 
 
 def test_missing_server_is_reported() -> None:

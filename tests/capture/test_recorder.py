@@ -5,13 +5,13 @@ from __future__ import annotations
 import errno
 import threading
 from collections.abc import Generator, Iterator
-from itertools import pairwise
+from itertools import pairwise, repeat
 from pathlib import Path
 
 import pytest
 
 from ipsys_log.capture.backlog import TICK, Backlog
-from ipsys_log.capture.recorder import Recording, open_recording, write_each
+from ipsys_log.capture.recorder import _QUIET_TICKS, Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import Disk
@@ -182,13 +182,15 @@ def test_killed_recorder_has_lost_at_most_a_second(tmp_path: Path) -> None:
             for camera in ("red", "white"):
                 image = CompressedImage(number, camera, bytes(5_000), "jpeg")
                 yield Message(image_topic(camera), number * NS_PER_S // 10, number, image, camera)
-        yield None
+        yield from repeat(None, _QUIET_TICKS)
 
     with open_recording(path) as log:
         for number, message in enumerate(write_each(Sent(source()), log)):
             if message is not None:
-                newest_ns, allowed_ns = message.log_time_ns, NS_PER_S
-            else:  # no message comes: everything is written
+                newest_ns, allowed_ns, quiet = message.log_time_ns, NS_PER_S, 0
+            else:
+                quiet += 1
+            if quiet == _QUIET_TICKS:  # no message comes: everything is written
                 allowed_ns = 0
             if message is None or number % 9 == 8:
                 killed.write_bytes(path.read_bytes())

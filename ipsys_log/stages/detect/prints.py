@@ -57,7 +57,8 @@ class Prints:
     nudge: float
 
 
-@lru_cache(maxsize=1024)
+# The prints of 40 markers have 250 kB, and each marker that comes or goes makes a new set.
+@lru_cache(maxsize=32)
 def build_prints(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     """Return the prints of markers; ``dictionary`` is OpenCV's name, such as DICT_4X4_100."""
     edges = [_edges(dictionary, marker_id) for marker_id in marker_ids]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import pixel_slopes
 from ipsys_log.geometry.rotations import rotate
-from ipsys_log.geometry.square_pose import fit_squares
+from ipsys_log.geometry.square_pose import fit_squares, tilt_cost
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 
@@ -18,8 +18,6 @@ __all__ = ["Poses", "locate_poses"]
 
 Array = NDArray[np.float64]
 
-# Markers face up, to about this angle. It selects one of the two poses if the corners do not.
-_TILT_RAD = np.radians(3.0)
 _STEPS = 2
 
 
@@ -101,8 +99,7 @@ def _start(model: JointModel, corners_px: Array, variances: Array, sizes_m: Arra
     by_uv = np.einsum("nrci,ncij->nrcj", whitening, slopes).reshape(-1, 8, 8)
     poses = fit_squares(own, by_uv, sizes_m[valid])
     world = model.camera_from_world.T @ poses.rotations
-    tilts2_rad2 = 2 * (1 - world[..., 2, 2])
-    best = (poses.chi2 + tilts2_rad2 / _TILT_RAD**2).argmin(axis=1)
+    best = (poses.chi2 + tilt_cost(world[..., 2, 2])).argmin(axis=1)
     rows = np.arange(len(best))
     points_m[valid] = poses.centres_m[rows, best] @ model.camera_from_world + model.origin_m
     turns[valid] = world[rows, best]

@@ -19,7 +19,7 @@ from ipsys_log.geometry.markers import (
     pixel_slopes,
     whiten,
 )
-from ipsys_log.geometry.square_pose import fit_squares, is_convex, reprojection_px
+from ipsys_log.geometry.square_pose import calibration_covariances, fit_squares, is_convex, reprojection_px
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -154,8 +154,13 @@ def _perimeter_covariances(
 
 def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
     lengths_m = np.array([sighting.length_m for sighting in seen])
-    whitening = _whitening(seen, _lens_slopes(seen, lens))
+    lens_slopes = _lens_slopes(seen, lens)
+    whitening = _whitening(seen, lens_slopes)
     squares = fit_squares(np.stack([sighting.uv for sighting in seen]), whitening, lengths_m)
+    covariances_m2 = squares.covariances_m2
+    covariances_m2 = covariances_m2 + calibration_covariances(
+        squares.centres_m[:, 0], lens_slopes.mean(axis=1)
+    )
     misses_px = reprojection_px(squares, lengths_m, np.stack([s.marker.corners_px for s in seen]), lens)
     points = []
     for n, (marker, _, _) in enumerate(seen):
@@ -165,7 +170,7 @@ def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint
         # The side from corner 3 to corner 0 is the marker's y axis.
         right, down, _ = squares.rotations[n, 0, :, 1]
         heading_rad = float(np.arctan2(-down, right))
-        covariance_m2 = None if marker.covariance_px2 is None else squares.covariances_m2[n]
+        covariance_m2 = None if marker.covariance_px2 is None else covariances_m2[n]
         offset_ns = marker.time_offset_ns
         points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2, poses))
     return points
@@ -238,7 +243,7 @@ def _rig_part(rig: Rig, _method: str) -> object:
 
 STAGE = Stage(
     name="camera-frame",
-    versions={"camera-frame": 1, PERIMETER: 1, "pose": 1},
+    versions={"camera-frame": 1, PERIMETER: 2, "pose": 2},
     reads=(RIG, CALIBRATIONS, MARKERS),
     writes=(CAMERA_POINTS, RUN_EVENTS),
     plan=_plan,

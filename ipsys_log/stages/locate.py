@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.square_pose import DEPTH_SHARE
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -81,8 +82,7 @@ def _positions(
     sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
     inside = applied.inside(points_m, world, sigmas_m)
     if inside is not None:
-        depth_sigmas_m = np.sqrt([0.0 if p.covariance_m2 is None else p.covariance_m2[2, 2] for p in points])
-        inside &= applied.at_height(points_m, world, height_sigmas_m, depth_sigmas_m)
+        inside &= applied.at_height(points_m, world, height_sigmas_m, _depth_noise_m(points))
     return tuple(
         Position(
             point.id,
@@ -97,6 +97,19 @@ def _positions(
         for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))
         if np.isfinite(world[n]).all()
     )
+
+
+def _depth_noise_m(points: tuple[CameraPoint, ...]) -> Array:
+    """Return the standard deviations (n,) of the depths by the noise of an image, 0 if unknown.
+
+    The covariance of a pose also has the error of its camera, which the calibration points have corrected.
+    """
+    variances_m2 = np.zeros(len(points))
+    for n, point in enumerate(points):
+        if point.covariance_m2 is not None:
+            shared_m = DEPTH_SHARE * point.z_m if point.poses else 0.0
+            variances_m2[n] = max(point.covariance_m2[2, 2] - shared_m**2, 0.0)
+    return np.sqrt(variances_m2)
 
 
 def _world_poses(

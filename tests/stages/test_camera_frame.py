@@ -31,6 +31,8 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
 from tests.conftest import ROOT, Ipsys
 from tests.geometry.squares import CENTRE, EDGE, FISHEYE, LENSES, MIDWAY, Array, corners_px, turned
+from tests.stages.real_board import RIG as BOARD_RIG
+from tests.stages.real_board import read_lens, read_markers
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3), RigMarker(4, length_m=0.1), RigMarker(5)))
 SIGMA_PX = 0.03
@@ -113,13 +115,32 @@ def test_the_covariance_is_that_of_the_scatter(method: str, place_m: tuple[float
     root = rng.normal(0, SIGMA_PX / 3, (8, 8))
     exact = marker(3, place_m, turned(0.4, 3.0, 1.0))
     noise_px = (rng.normal(size=(500, 8)) @ root.T).reshape(-1, 4, 2)
+    if method == "pose":  # this covariance has the errors of the lens
+        noise_px += rng.normal(0, 0.12, (500, 1, 2))
     noisy = [Marker(3, exact.corners_px + off, root @ root.T) for off in noise_px]
     found, _ = points(method, *noisy)
-    scatter = np.linalg.inv(np.linalg.cholesky(np.cov(np.transpose([where(point) for point in found]))))
+    places_m = np.array([where(point) for point in found])
+    if method == "pose":  # and of the print
+        places_m *= rng.normal(1, 0.002, (500, 1))
+    scatter = np.linalg.inv(np.linalg.cholesky(np.cov(places_m.T)))
     said = [point.covariance_m2 for point in found if point.covariance_m2 is not None]
     assert len(said) == len(found)
     ratios = np.linalg.eigvalsh(scatter @ np.mean(said, axis=0) @ scatter.T)
     assert 0.8 < ratios.min() < ratios.max() < 1.25
+
+
+def test_pose_covariance_holds_on_a_real_board(data: Path) -> None:
+    """Compare each marker of a hand-held board with its place on the board, whose pose has other corners."""
+    folder, scores = data / "charuco_videos", []
+    lens = read_lens(folder, "1")
+    for markers, centres_m in read_markers(folder, "1", every=6):
+        found, _ = points("pose", *markers, lens=lens, rig=BOARD_RIG)
+        for point in found:
+            off_m = np.subtract(where(point), centres_m[point.id])
+            assert point.covariance_m2 is not None
+            scores.append(off_m @ np.linalg.solve(point.covariance_m2, off_m) / 3)
+    assert len(scores) > 30
+    assert 0.5 < np.mean(scores) < 3
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -197,7 +218,7 @@ def test_another_method_is_another_run(ipsys: Ipsys, tmp_path: Path) -> None:
     assert run("--method", "perimeter") == ("edges", False)
     with Session([log]) as session:
         parameters = {r.run: r.parameters for r in session.runs() if r.stage == "camera-frame"}
-        assert parameters == {"edges": {}, "edges_pose": {"method": "pose"}}
+        assert parameters == {"edges": {"perimeter": "2"}, "edges_pose": {"method": "pose", "pose": "2"}}
         by_pose = session.payloads(session.topics(CAMERA_POINTS, "edges_pose"))
         assert all(len(point.poses) == 2 for frame in by_pose for point in frame.points)
 

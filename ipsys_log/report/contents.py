@@ -17,7 +17,8 @@ from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.messages.channels import POSITIONS
+from ipsys_log.messages.channels import POSITIONS, RUN_EVENTS
+from ipsys_log.messages.events import UNFITTING_MARKERS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.runs.frame_times import channel_times
 from ipsys_log.runs.provenance import newest_run
@@ -114,9 +115,20 @@ def contents_json(session: Session) -> dict[str, Any]:
             for camera, topic in session.images.items()
         },
         "channels": {topic: _channel(session, topic) for topic in topics},
+        "marker_remarks": _marker_remarks(session),
         "overlap": overlap_json(session),
         "runs": runs_json(session),
     }
+
+
+def _marker_remarks(session: Session) -> list[dict[str, str]]:
+    """Return the events of runs about markers that contradict the rig or the method, each text once."""
+    runs = {topic: run for run in session.run_names() for topic in session.topics(RUN_EVENTS, run)}
+    texts: dict[str, str] = {}
+    for message in session.messages(list(runs)):
+        if message.payload.kind in UNFITTING_MARKERS:
+            texts.setdefault(message.payload.text, runs[message.topic])
+    return [{"run": run, "text": text} for text, run in texts.items()]
 
 
 def overlap_json(session: Session) -> list[dict[str, Any]]:
@@ -209,6 +221,7 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s" if found["start"] else "no messages"
     files.caption_justify = "left"
     tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
+    tables += [_marker_remarks_table(found["marker_remarks"])] if found["marker_remarks"] else []
     tables += [_overlap_table(found["overlap"])] if found["overlap"] else []
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 
@@ -221,6 +234,13 @@ def _cameras_table(found: dict[str, Any]) -> Table:
         if lens is not None:
             text = Text(plain_text(f"{lens['width']} x {lens['height']} px, {lens['model']}"))
         table.add_row(camera, str(channel["messages"]), _rate(channel), text)
+    return table
+
+
+def _marker_remarks_table(rows: list[dict[str, str]]) -> Table:
+    table = _table("Remarks on markers", "run", "remark")
+    for row in rows:
+        table.add_row(row["run"], Text(plain_text(row["text"]), style="yellow"))
     return table
 
 

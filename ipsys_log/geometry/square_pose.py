@@ -125,13 +125,15 @@ class SquarePoses(NamedTuple):
 
     ``rotations`` (n, 2, 3, 3) and ``centres_m`` (n, 2, 3) are the marker's axes and centre in camera
     coordinates. ``chi2`` (n, 2) is the sum of the squared residuals of the eight whitened coordinates.
-    ``covariances_m2`` (n, 3, 3) are those of the centre of the first pose.
+    ``covariances_m2`` (n, 3, 3) are those of the centre of the first pose, ``tilt_sigmas_rad`` (n,) the
+    standard deviations of the direction of its normal.
     """
 
     rotations: Array
     centres_m: Array
     chi2: Array
     covariances_m2: Array
+    tilt_sigmas_rad: Array
 
 
 def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
@@ -172,8 +174,9 @@ def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
     rotations, centres_m, chi2 = (
         values[row[:, None], order] for values in (fit.rotations, fit.centres_m, fit.chi2)
     )
-    covariances_m2 = _centre_covariances(fit.slopes[row, order[:, 0]], centres_m[:, 0, 2])
-    return SquarePoses(rotations, centres_m, chi2, covariances_m2)
+    covariances = _pose_covariances(fit.slopes[row, order[:, 0]])
+    covariances_m2 = covariances[:, 3:, 3:] * centres_m[:, 0, 2, None, None] ** 2
+    return SquarePoses(rotations, centres_m, chi2, covariances_m2, _tilt_sigmas(covariances, rotations[:, 0]))
 
 
 def tilt_cost(cosines: Array) -> Array:
@@ -323,7 +326,14 @@ def _small_turns(vectors_rad: Array) -> Array:
     return turns
 
 
-def _centre_covariances(slopes: Array, z_m: Array) -> Array:
-    """Return covariances of centres, (n, 3, 3) in m^2, to first order in the noise of the corners."""
-    covariances = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes)
-    return np.asarray(covariances[:, 3:, 3:] * z_m[:, None, None] ** 2, dtype=np.float64)
+def _pose_covariances(slopes: Array) -> Array:
+    """Return covariances of the parameters of :func:`_look`, (n, 6, 6), to first order in the noise."""
+    return np.asarray(np.linalg.inv(slopes.swapaxes(1, 2) @ slopes), dtype=np.float64)
+
+
+def _tilt_sigmas(covariances: Array, rotations: Array) -> Array:
+    """Return the standard deviations (n,) of normals; a turn about its normal does not move a normal."""
+    normals = rotations[:, :, 2:]
+    about = (normals.swapaxes(1, 2) @ covariances[:, :3, :3] @ normals)[:, 0, 0]
+    variances: Array = np.trace(covariances[:, :3, :3], axis1=1, axis2=2) - about
+    return np.sqrt(np.maximum(variances, 0.0))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.marker_tilts import MarkerTilts, SeenMarkers
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
 from ipsys_log.geometry.markers import (
@@ -32,6 +33,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
+from ipsys_log.messages.events import TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView
 
 __all__ = ["METHODS", "PERIMETER", "STAGE", "CameraFrame", "check_method", "points_run"]
@@ -50,13 +52,16 @@ class CameraFrame:
     Parameters
     ----------
     method : ``perimeter``, eq. (3) to (5), exact for a marker that is parallel to the image plane; or
-        ``pose``, exact for a marker with any tilt.
+        ``pose``, exact for a marker with any tilt. With ``perimeter``, an event names a tilted marker, one
+        for each camera.
     """
 
     def __init__(self, method: str = PERIMETER) -> None:
         self._method = METHODS[check_method(method)]
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
+        self._knows_tilts = method != PERIMETER
+        self._tilts: dict[str | None, MarkerTilts] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
@@ -82,7 +87,29 @@ class CameraFrame:
                 else:
                     yield Event(message.publish_time_ns, *fault, camera, sighting.marker.id)
             points = self._method.place(seen, lens) if seen else []
+            # With nominal intrinsics, which have no distortion, level markers seem to lie on a bowl.
+            if seen and not self._knows_tilts and lens.D.any():
+                yield from self._tilt(seen, lens, frame.height, message)
         yield CameraPoints(message.publish_time_ns, tuple(points))
+
+    def _tilt(
+        self, seen: Sequence[_Seen], lens: CameraCalibration, rows: int, message: Message
+    ) -> Iterator[Event]:
+        """Yield the event of a tilted marker, if its tilt has become certain."""
+        tilts = self._tilts.setdefault(message.camera, MarkerTilts())
+        own = [sighting for sighting in seen if is_convex(sighting.uv)]
+        tilted = (
+            tilts.add(_seen_markers(own, lens, rows, message.publish_time_ns))
+            if tilts.is_next() and own
+            else None
+        )
+        if tilted is not None:
+            text = (
+                f"camera {message.camera}: marker {tilted.marker_id} is tilted by "
+                f"{np.degrees(tilted.tilt_rad):.0f} degrees, but eq. (3) takes it for parallel to the image; "
+                "use --method pose"
+            )
+            yield Event(message.publish_time_ns, TILTED_MARKER, text, message.camera, tilted.marker_id)
 
     def _settings(self, camera: str | None) -> tuple[Rig, CameraCalibration]:
         if self._rig is None:
@@ -185,6 +212,24 @@ def _whitening(seen: Sequence[_Seen], lens_slopes: Array) -> Array:
     return by_marker
 
 
+def _seen_markers(seen: Sequence[_Seen], lens: CameraCalibration, rows: int, time_ns: int) -> SeenMarkers:
+    covariances_px2 = [sighting.marker.covariance_px2 for sighting in seen]
+    traces_px2 = [np.trace(_USUAL_PX2 if c is None else c) for c in covariances_px2]
+    # Only edges, whose corners have a covariance, are corrected with the row time of the rig.
+    corrected = [s.marker.time_offset_ns is not None and s.marker.covariance_px2 is not None for s in seen]
+    return SeenMarkers(
+        time_ns,
+        [sighting.marker.id for sighting in seen],
+        np.stack([sighting.marker.corners_px for sighting in seen]),
+        np.stack([sighting.uv for sighting in seen]),
+        _whitening(seen, _lens_slopes(seen, lens)),
+        np.array([sighting.length_m for sighting in seen]),
+        np.sqrt(np.array(traces_px2) / 8),
+        ~np.array(corrected),
+        rows,
+    )
+
+
 def _vector(rotation: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64).ravel()
 
@@ -249,5 +294,8 @@ STAGE = Stage(
     plan=_plan,
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("method", PERIMETER),
-    stateless=lambda parameters, view: (CAMERA_POINTS, RUN_EVENTS),
+    # An event names a tilted marker once.
+    stateless=lambda parameters, view: (
+        (CAMERA_POINTS, RUN_EVENTS) if parameters.get("method", PERIMETER) != PERIMETER else (CAMERA_POINTS,)
+    ),
 )

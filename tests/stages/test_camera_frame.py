@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,61 @@ def test_pose_covariance_holds_on_a_real_board(data: Path) -> None:
             scores.append(off_m @ np.linalg.solve(point.covariance_m2, off_m) / 3)
     assert len(scores) > 30
     assert 0.5 < np.mean(scores) < 3
+
+
+def tilt_events(method: str, tilts_deg: list[float], seed: int = 0) -> list[Event]:
+    """Return the events of a level marker 3, and of a turning marker 4 with these tilts."""
+    rng, stage, events = np.random.default_rng(seed), CameraFrame(method), []
+    for payload, camera in ((RIG, None), (FISHEYE, "red")):
+        assert list(stage(Message("t", 0, 0, payload, camera))) == []
+    for number, tilt_deg in enumerate(tilts_deg):
+        time_ns = number * 100_000_000
+        axes = {3: turned(0.4), 4: turned(0.1 * number, tilt_deg, 1.0 + 0.1 * number)}
+        centres_m = {3: (-0.5, 0.3, 2.1), 4: (0.8, 0.1 + 0.0002 * number, 2.1)}
+        seen = [
+            Marker(
+                n,
+                corners_px(FISHEYE, axes[n], np.array(centres_m[n]), RIG.length_of(n))
+                + rng.normal(0, SIGMA_PX, (4, 2)),
+                SIGMA_PX**2 * np.eye(8),
+            )
+            for n in axes
+        ]
+        payloads = stage(Message("t", time_ns, time_ns, Markers(time_ns, tuple(seen), 1920, 1080), "red"))
+        events += [payload for payload in payloads if isinstance(payload, Event)]
+    return events
+
+
+@pytest.mark.parametrize("tilt_deg", [12.0, 30.0])
+def test_tilted_marker_is_named_once_with_the_other_method(tilt_deg: float) -> None:
+    (event,) = tilt_events("perimeter", [tilt_deg] * 60)
+    assert (event.kind, event.camera, event.marker_id) == ("tilted_marker", "red", 4)
+    assert re.search(r"camera red: marker 4 is tilted by \d+ degrees", event.text)
+    assert "--method pose" in event.text
+    assert tilt_events("pose", [tilt_deg] * 60) == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_tops_of_2_degrees_are_not_named(seed: int) -> None:
+    assert tilt_events("perimeter", [2.0] * 200, seed) == []
+
+
+def test_tilt_that_begins_later_is_named_then() -> None:
+    (event,) = tilt_events("perimeter", [0.0] * 60 + [20.0] * 80)
+    assert event.timestamp >= 60 * 100_000_000
+
+
+def test_tilted_real_board_is_named(data: Path) -> None:
+    folder, stage, events = data / "charuco_videos", CameraFrame(), []
+    lens = read_lens(folder, "1")
+    for payload, camera in ((BOARD_RIG, None), (lens, "red")):
+        assert list(stage(Message("t", 0, 0, payload, camera))) == []
+    for number, (markers, _) in enumerate(read_markers(folder, "1", every=6)):
+        time_ns = number * 300_000_000
+        payloads = stage(Message("t", time_ns, time_ns, Markers(time_ns, markers, 1280, 720), "red"))
+        events += [payload.text for payload in payloads if isinstance(payload, Event)]
+    assert len(events) == 1
+    assert "use --method pose" in events[0]
 
 
 @pytest.mark.parametrize("method", METHODS)

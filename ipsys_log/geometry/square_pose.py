@@ -200,10 +200,10 @@ def is_convex(uv: Array) -> bool:
 
 # Errors that all images of a marker at one place share. The print and the focal length: relative standard
 # deviation of the depth. The rest of the lens model, the compression of the images and the bending of a
-# print: that of a direction in px. For the real board of tests/stages/real_board.py, chi2 / 3 is then 0.7 to
-# 2.3 in four cameras; with the noise of the corners alone, it is 6 to 51.
+# print: that of a direction in px. For the real board of tests/stages/real_board.py, chi2 / 3 is then 0.6 to
+# 1.5 in four cameras; with the noise of the corners alone, it is 6 to 51.
 DEPTH_SHARE = 0.002
-_DIRECTION_PX = 0.12
+_DIRECTION_PX = 0.18
 
 
 def calibration_covariances(centres_m: Array, lens_slopes: Array) -> Array:

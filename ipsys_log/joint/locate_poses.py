@@ -1,8 +1,8 @@
-"""Full poses of markers from their corners, by a joint model, if the heights are unknown."""
+"""Full poses of markers from their corners, by a joint model, if heights are unknown or tops are tilted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import pixel_slopes
 from ipsys_log.geometry.rotations import rotate
-from ipsys_log.geometry.square_pose import fit_squares
+from ipsys_log.geometry.square_pose import fit_squares, tilt_cost
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 
-__all__ = ["Poses", "locate_poses"]
+__all__ = ["Poses", "hold_heights", "locate_poses"]
 
 Array = NDArray[np.float64]
 
-# Markers face up, to about this angle. It selects one of the two poses if the corners do not.
-_TILT_RAD = np.radians(3.0)
 _STEPS = 2
+# Relative error of the printed side of one marker beside the mean of all, which the model has.
+_PRINT_SIGMA = 0.001
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class Poses:
     Attributes
     ----------
     points_m, turns : (n, 3) and (n, 3, 3), centres and axes; NaN for corners that the lens cannot reach.
-    covariances_m2 : (n, 3, 3), of the points: noise and calibration.
+    covariances_m2 : (n, 3, 3), of the points: noise, calibration and print.
     chi2 : (n,), squared residuals in units of the noise, with two degrees of freedom.
     modes_m : (n, 3, m), errors of the points by the modes of the calibration.
     noise_m2 : (n, 3, 3), the part of the covariances by the noise of the corners.
@@ -76,15 +76,55 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
     modes_m = -(gains[:, :3] @ now.by_camera) @ model.modes
     noise_m2 = np.asarray(spread[:, :3, :3], dtype=np.float64)
     heading_noise_rad: Array = np.sqrt(spread[:, 5, 5])
+    # Another size of the marker scales its point about the camera.
+    by_print_m = _PRINT_SIGMA * (points_m - model.origin_m)[:, :, None]
     return Poses(
         points_m,
         turns,
-        noise_m2 + modes_m @ modes_m.swapaxes(1, 2),
+        noise_m2 + modes_m @ modes_m.swapaxes(1, 2) + by_print_m @ by_print_m.swapaxes(1, 2),
         (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0],
         modes_m,
         noise_m2,
         heading_noise_rad,
     )
+
+
+def hold_heights(
+    model: JointModel, poses: Poses, heights_m: Array, sigmas_m: Array
+) -> tuple[Poses, Array, Array]:
+    """Return poses whose points also use known heights above the floor, and the heights without them.
+
+    The second result (n,) are the heights above the floor by the corners alone, the third (n,) the standard
+    deviations of their differences to the known heights.
+
+    Parameters
+    ----------
+    poses : poses by :func:`locate_poses`.
+    heights_m, sigmas_m : (n,), the known heights, and their standard deviations.
+    """
+    floor_m, slopes, floor_modes = model.floor.evaluate(np.nan_to_num(poses.points_m), model.amplitudes)
+    rise = np.concatenate([-slopes, np.ones((len(slopes), 1))], axis=1)[:, None]
+    # The error of the floor, and that of the height above it.
+    by_floor_m = np.zeros((len(slopes), 1, model.modes.shape[1]))
+    by_floor_m[:, 0, : model.floor_modes.shape[1]] = floor_modes @ model.floor_modes
+    misses_m2 = (by_floor_m**2).sum(axis=2)[:, 0] + sigmas_m**2
+    above_m = poses.points_m[:, 2] - floor_m
+    variances_m2 = (rise @ poses.covariances_m2 @ rise.swapaxes(1, 2))[:, 0, 0] + misses_m2
+    gains = poses.covariances_m2 @ rise.swapaxes(1, 2) / variances_m2[:, None, None]
+    kept = np.eye(3) - gains @ rise
+
+    def reduced(covariances_m2: Array, height_m2: Array) -> Array:
+        known = gains @ gains.swapaxes(1, 2) * height_m2[:, None, None]
+        return np.asarray(kept @ covariances_m2 @ kept.swapaxes(1, 2) + known)
+
+    held = replace(
+        poses,
+        points_m=poses.points_m + gains[:, :, 0] * (heights_m - above_m)[:, None],
+        covariances_m2=reduced(poses.covariances_m2, misses_m2),
+        modes_m=kept @ poses.modes_m + gains @ by_floor_m,
+        noise_m2=reduced(poses.noise_m2, np.zeros(len(slopes))),
+    )
+    return held, above_m, np.sqrt(variances_m2)
 
 
 def _start(model: JointModel, corners_px: Array, variances: Array, sizes_m: Array) -> tuple[Array, Array]:
@@ -101,8 +141,7 @@ def _start(model: JointModel, corners_px: Array, variances: Array, sizes_m: Arra
     by_uv = np.einsum("nrci,ncij->nrcj", whitening, slopes).reshape(-1, 8, 8)
     poses = fit_squares(own, by_uv, sizes_m[valid])
     world = model.camera_from_world.T @ poses.rotations
-    tilts2_rad2 = 2 * (1 - world[..., 2, 2])
-    best = (poses.chi2 + tilts2_rad2 / _TILT_RAD**2).argmin(axis=1)
+    best = (poses.chi2 + tilt_cost(world[..., 2, 2])).argmin(axis=1)
     rows = np.arange(len(best))
     points_m[valid] = poses.centres_m[rows, best] @ model.camera_from_world + model.origin_m
     turns[valid] = world[rows, best]

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.locate import Positions as LocatedMarkers
 from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.locate_poses import Poses, locate_poses
+from ipsys_log.joint.locate_poses import Poses, hold_heights, locate_poses
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
+from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["MOST_CHI2", "MOST_CHI2_OF_POSE", "LocateCorners", "corner_covariances"]
@@ -29,13 +30,15 @@ _HEIGHT_SIGMA_M = JointSettings().robot_height_sigma_m
 # chance: with five degrees of freedom at a known height, and with two for a full pose.
 MOST_CHI2 = 37.0
 MOST_CHI2_OF_POSE = 27.6
+# A height by the corners that differs by more than this multiple of its uncertainty contradicts the rig.
+_MOST_SIGMAS = 4.0
 
 
 class _Located(NamedTuple):
     """A located marker.
 
     ``fits`` is True if its residuals are usual. ``noise_m2`` (3, 3) and ``heading_noise_rad`` are the part of
-    the uncertainty that changes from frame to frame.
+    the uncertainty that changes from frame to frame. ``height`` is a height that contradicts the rig.
     """
 
     point_m: Array
@@ -44,6 +47,7 @@ class _Located(NamedTuple):
     fits: bool
     noise_m2: Array
     heading_noise_rad: float
+    height: HeightSighting | None = None
 
 
 def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
@@ -55,14 +59,17 @@ def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
 class LocateCorners:
     """The step from markers to positions. A camera that is not in the model has no positions.
 
-    A marker whose height is in the rig is level, at this height. Other markers get their full pose. Reference
-    markers are no robots: they have no positions.
+    A marker whose height is in the rig is level, at this height. If its corners contradict this, it gets its
+    full pose: at this height if only its tilt is unusual, otherwise at the height by its corners, which an
+    event names. Markers without a height get their full pose. Reference markers are no robots: they have no
+    positions.
     """
 
     def __init__(self, model: Model) -> None:
         self._name = model.name
         self._cameras = restore_joint(model)
         self._rig: Rig | None = None
+        self._heights = ContradictedHeights(model)
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
@@ -74,9 +81,14 @@ class LocateCorners:
         if camera is not None:
             rig = self._rig
             markers = [m for m in message.payload.markers if rig is None or not rig.is_reference(m.id)]
-            yield Positions(message.publish_time_ns, self._positions(camera, markers))
+            located = self._locate(camera, markers)
+            heights = [row.height for row in located if row.height is not None]
+            yield from self._heights(message.publish_time_ns, message.camera, heights)
+            rows = zip(markers, located, strict=True)
+            positions = tuple(_position(camera, *row) for row in rows if np.isfinite(row[1].point_m).all())
+            yield Positions(message.publish_time_ns, positions)
 
-    def _positions(self, camera: JointModel, markers: Sequence[Marker]) -> tuple[Position, ...]:
+    def _locate(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
         if markers and self._rig is None:
             raise IpsysError(f"{self._name} needs the size of the markers; give a rig with --rig lab.toml")
         located: dict[int, _Located] = {}
@@ -86,11 +98,7 @@ class LocateCorners:
             if own:
                 locate = self._locate_at_height if by_height else self._locate_poses
                 located.update(zip(rows, locate(camera, own), strict=True))
-        return tuple(
-            _position(camera, marker, located[n])
-            for n, marker in enumerate(markers)
-            if np.isfinite(located[n].point_m).all()
-        )
+        return [located[n] for n in range(len(markers))]
 
     def _has_height(self, marker: Marker) -> bool:
         return self._rig is not None and self._rig.height_of(marker.id) is not None
@@ -98,14 +106,20 @@ class LocateCorners:
     def _locate_at_height(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
         assert self._rig is not None
         sigmas_m = [self._rig.height_sigma_of(marker.id) for marker in markers]
-        found = locate_markers(
-            camera,
-            *_corners(markers),
-            np.array([self._rig.height_of(marker.id) for marker in markers], dtype=np.float64),
-            np.array([self._rig.length_of(marker.id) for marker in markers]),
-            np.array([_HEIGHT_SIGMA_M if sigma_m is None else sigma_m for sigma_m in sigmas_m]),
-        )
-        return _rows(found, MOST_CHI2)
+        heights_m = np.array([self._rig.height_of(marker.id) for marker in markers], dtype=np.float64)
+        known_m = np.array([_HEIGHT_SIGMA_M if sigma_m is None else sigma_m for sigma_m in sigmas_m])
+        lengths_m = np.array([self._rig.length_of(marker.id) for marker in markers])
+        found = locate_markers(camera, *_corners(markers), heights_m, lengths_m, known_m)
+        rows = _rows(found, MOST_CHI2)
+        odd = [n for n, row in enumerate(rows) if not row.fits]
+        if odd:
+            poses = locate_poses(camera, *_corners([markers[n] for n in odd]), lengths_m[odd])
+            own = [markers[n] for n in odd]
+            for n, row in zip(
+                odd, _contradictions(camera, own, poses, heights_m[odd], known_m[odd]), strict=True
+            ):
+                rows[n] = rows[n] if row is None else row
+        return rows
 
     def _locate_poses(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
         assert self._rig is not None
@@ -124,6 +138,24 @@ def _rows(located: LocatedMarkers | Poses, most_chi2: float) -> list[_Located]:
         located.heading_noise_rad.tolist(),
     )
     return [_Located(*row) for row in zip(*columns, strict=True)]
+
+
+def _contradictions(
+    camera: JointModel, markers: Sequence[Marker], poses: Poses, heights_m: Array, sigmas_m: Array
+) -> list[_Located | None]:
+    """Return the rows of markers that are not level at their heights; None for corners of no pose."""
+    held, above_m, apart_m = hold_heights(camera, poses, heights_m, sigmas_m)
+    free, tilted = _rows(poses, MOST_CHI2_OF_POSE), _rows(held, MOST_CHI2_OF_POSE)
+    rows: list[_Located | None] = []
+    for n, marker in enumerate(markers):
+        if not free[n].fits:
+            rows.append(None)
+        elif abs(above_m[n] - heights_m[n]) <= _MOST_SIGMAS * apart_m[n]:
+            rows.append(tilted[n])
+        else:
+            numbers = heights_m[n], free[n].point_m, above_m[n], apart_m[n]
+            rows.append(free[n]._replace(height=HeightSighting(marker.id, *numbers)))
+    return rows
 
 
 def _position(camera: JointModel, marker: Marker, located: _Located) -> Position:

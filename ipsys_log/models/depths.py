@@ -115,6 +115,14 @@ class HeightCheck:
         height_sigmas_m : (n,), standard deviations of these heights.
         depth_sigmas_m : (n,), standard deviations of the depths from the noise of the image, 0 if unknown.
         """
+        rises_m, sigmas_m = self.rises(points_m, world_m, depth_sigmas_m)
+        # A position that is not finite, because its ray misses the height, agrees with nothing.
+        most_m = _SAME_HEIGHT_M + 2 * np.sqrt(sigmas_m**2 + height_sigmas_m**2)
+        agrees: NDArray[np.bool_] = np.abs(rises_m) <= most_m
+        return agrees
+
+    def rises(self, points_m: Array, world_m: Array, depth_sigmas_m: Array) -> tuple[Array, Array]:
+        """Return the heights by the depths minus those of the positions, and their sigmas, both (n,)."""
         terms, growth = depth_terms(points_m)
         taken_m = (world_m - self._rays.origin_m) @ self._rays.rotation[:, 2]
         depths_m = points_m[:, 2] * (1 + terms @ self._coefficients)
@@ -126,7 +134,4 @@ class HeightCheck:
             + tilts**2
             + (depth_sigmas_m / points_m[:, 2]) ** 2
         )
-        sigmas_m = np.sqrt(variances * (depths_m * falls) ** 2 + height_sigmas_m**2)
-        # A position that is not finite, because its ray misses the height, agrees with nothing.
-        agrees: NDArray[np.bool_] = np.abs((depths_m - taken_m) * falls) <= _SAME_HEIGHT_M + 2 * sigmas_m
-        return agrees
+        return (depths_m - taken_m) * falls, np.sqrt(variances) * np.abs(depths_m * falls)

@@ -360,3 +360,11 @@ class AppliedModel:
         if self._height_check is None:
             return np.ones(len(points_m), dtype=bool)
         return self._height_check.agrees(points_m, world_m, height_sigmas_m, depth_sigmas_m)
+
+    def rises(self, points_m: Array, world_m: Array, depth_sigmas_m: Array) -> tuple[Array, Array]:
+        """Return the heights by the depths minus the heights that the model read, and their sigmas, (n,).
+
+        The model must read heights. See :meth:`ipsys_log.models.depths.HeightCheck.rises`.
+        """
+        assert self._height_check is not None
+        return self._height_check.rises(points_m, world_m, depth_sigmas_m)

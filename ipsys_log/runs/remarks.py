@@ -11,6 +11,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
 from ipsys_log.messages.channels import MARKERS, POSITIONS
+from ipsys_log.messages.events import UNFITTING_MARKERS
 from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.units import format_time
@@ -28,6 +29,7 @@ class Remarks:
         self._events: Counter[str] = Counter()
         self._first: dict[str, Message] = {}
         self._unknown: set[str] = set()
+        self._unfitting: list[Message] = []
         self._frames = self._markers = 0
         self._located: set[str | None] = set()
         # An array takes eight bytes for each offset: a long log has millions of offsets.
@@ -50,7 +52,9 @@ class Remarks:
 
     def _note(self, message: Message) -> None:
         payload = message.payload
-        if isinstance(payload, Event):
+        if isinstance(payload, Event) and payload.kind in UNFITTING_MARKERS:
+            self._unfitting.append(message)
+        elif isinstance(payload, Event):
             self._events[payload.kind] += 1
             self._first.setdefault(payload.kind, message)
             if payload.kind == "unknown_marker":
@@ -99,6 +103,7 @@ class Remarks:
             f"{count} x {kind.replace('_', ' ')}, first: {_said(self._first[kind])}"
             for kind, count in sorted(self._events.items())
         ]
+        lines += [_said(message) for message in self._unfitting]
         if MARKERS in self._task.stage.writes:
             lines.insert(0, f"{self._markers} markers in {self._frames} frames")
             lines += self._about_offsets()

@@ -19,11 +19,13 @@ from ipsys_log.messages.channels import CHANNELS, EVENTS, IMAGES, RUN_EVENTS, ch
 from ipsys_log.messages.events import (
     ASSUMED_MODEL,
     CAMERA_MOVED,
+    CONTRADICTED_HEIGHT,
     FRAME_SKIPPED,
     NODE_ANSWERS,
     NODE_AWAITED,
     OPERATOR_KINDS,
     STAMP_UNRELIABLE,
+    TILTED_MARKER,
 )
 from ipsys_log.soundness.finding import NOTE, REMARK, LogFinding
 from ipsys_log.units import NS_PER_S
@@ -42,6 +44,8 @@ _ADVICE = {
     FRAME_SKIPPED: "the frames are in the log: ipsys replay processes them",
     STAMP_UNRELIABLE: "these frames have their time of arrival",
     ASSUMED_MODEL: "if the model is wrong, import or record again with the corrected file",
+    CONTRADICTED_HEIGHT: "correct lab.toml, and give it with --rig",
+    TILTED_MARKER: "run ipsys replay --method pose",
     CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
     "frames_dropped": "record on a faster disk",
     "frames_missed": "reduce the rate or the size of the images, or use another USB bus",

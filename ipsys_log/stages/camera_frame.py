@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.marker_tilts import MarkerTilts, SeenMarkers
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
 from ipsys_log.geometry.markers import (
@@ -19,7 +20,7 @@ from ipsys_log.geometry.markers import (
     pixel_slopes,
     whiten,
 )
-from ipsys_log.geometry.square_pose import fit_squares, is_convex, reprojection_px
+from ipsys_log.geometry.square_pose import calibration_covariances, fit_squares, is_convex, reprojection_px
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -32,6 +33,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
+from ipsys_log.messages.events import TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView
 
 __all__ = ["METHODS", "PERIMETER", "STAGE", "CameraFrame", "check_method", "points_run"]
@@ -50,13 +52,16 @@ class CameraFrame:
     Parameters
     ----------
     method : ``perimeter``, eq. (3) to (5), exact for a marker that is parallel to the image plane; or
-        ``pose``, exact for a marker with any tilt.
+        ``pose``, exact for a marker with any tilt. With ``perimeter``, an event names a tilted marker, one
+        for each camera.
     """
 
     def __init__(self, method: str = PERIMETER) -> None:
         self._method = METHODS[check_method(method)]
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
+        self._knows_tilts = method != PERIMETER
+        self._tilts: dict[str | None, MarkerTilts] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
@@ -82,7 +87,29 @@ class CameraFrame:
                 else:
                     yield Event(message.publish_time_ns, *fault, camera, sighting.marker.id)
             points = self._method.place(seen, lens) if seen else []
+            # With nominal intrinsics, which have no distortion, level markers seem to lie on a bowl.
+            if seen and not self._knows_tilts and lens.D.any():
+                yield from self._tilt(seen, lens, frame.height, message)
         yield CameraPoints(message.publish_time_ns, tuple(points))
+
+    def _tilt(
+        self, seen: Sequence[_Seen], lens: CameraCalibration, rows: int, message: Message
+    ) -> Iterator[Event]:
+        """Yield the event of a tilted marker, if its tilt has become certain."""
+        tilts = self._tilts.setdefault(message.camera, MarkerTilts())
+        own = [sighting for sighting in seen if is_convex(sighting.uv)]
+        tilted = (
+            tilts.add(_seen_markers(own, lens, rows, message.publish_time_ns))
+            if tilts.is_next() and own
+            else None
+        )
+        if tilted is not None:
+            text = (
+                f"camera {message.camera}: marker {tilted.marker_id} is tilted by "
+                f"{np.degrees(tilted.tilt_rad):.0f} degrees, but eq. (3) takes it for parallel to the image; "
+                "use --method pose"
+            )
+            yield Event(message.publish_time_ns, TILTED_MARKER, text, message.camera, tilted.marker_id)
 
     def _settings(self, camera: str | None) -> tuple[Rig, CameraCalibration]:
         if self._rig is None:
@@ -154,8 +181,13 @@ def _perimeter_covariances(
 
 def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
     lengths_m = np.array([sighting.length_m for sighting in seen])
-    whitening = _whitening(seen, _lens_slopes(seen, lens))
+    lens_slopes = _lens_slopes(seen, lens)
+    whitening = _whitening(seen, lens_slopes)
     squares = fit_squares(np.stack([sighting.uv for sighting in seen]), whitening, lengths_m)
+    covariances_m2 = squares.covariances_m2
+    covariances_m2 = covariances_m2 + calibration_covariances(
+        squares.centres_m[:, 0], lens_slopes.mean(axis=1)
+    )
     misses_px = reprojection_px(squares, lengths_m, np.stack([s.marker.corners_px for s in seen]), lens)
     points = []
     for n, (marker, _, _) in enumerate(seen):
@@ -165,7 +197,7 @@ def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint
         # The side from corner 3 to corner 0 is the marker's y axis.
         right, down, _ = squares.rotations[n, 0, :, 1]
         heading_rad = float(np.arctan2(-down, right))
-        covariance_m2 = None if marker.covariance_px2 is None else squares.covariances_m2[n]
+        covariance_m2 = None if marker.covariance_px2 is None else covariances_m2[n]
         offset_ns = marker.time_offset_ns
         points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2, poses))
     return points
@@ -178,6 +210,24 @@ def _whitening(seen: Sequence[_Seen], lens_slopes: Array) -> Array:
     by_corner = whitening.reshape(-1, 8, 4, 2).swapaxes(1, 2)
     by_marker: Array = (by_corner @ lens_slopes).swapaxes(1, 2).reshape(-1, 8, 8)
     return by_marker
+
+
+def _seen_markers(seen: Sequence[_Seen], lens: CameraCalibration, rows: int, time_ns: int) -> SeenMarkers:
+    covariances_px2 = [sighting.marker.covariance_px2 for sighting in seen]
+    traces_px2 = [np.trace(_USUAL_PX2 if c is None else c) for c in covariances_px2]
+    # Only edges, whose corners have a covariance, are corrected with the row time of the rig.
+    corrected = [s.marker.time_offset_ns is not None and s.marker.covariance_px2 is not None for s in seen]
+    return SeenMarkers(
+        time_ns,
+        [sighting.marker.id for sighting in seen],
+        np.stack([sighting.marker.corners_px for sighting in seen]),
+        np.stack([sighting.uv for sighting in seen]),
+        _whitening(seen, _lens_slopes(seen, lens)),
+        np.array([sighting.length_m for sighting in seen]),
+        np.sqrt(np.array(traces_px2) / 8),
+        ~np.array(corrected),
+        rows,
+    )
 
 
 def _vector(rotation: Array) -> Array:
@@ -238,11 +288,14 @@ def _rig_part(rig: Rig, _method: str) -> object:
 
 STAGE = Stage(
     name="camera-frame",
-    versions={"camera-frame": 1, PERIMETER: 1, "pose": 1},
+    versions={"camera-frame": 1, PERIMETER: 2, "pose": 2},
     reads=(RIG, CALIBRATIONS, MARKERS),
     writes=(CAMERA_POINTS, RUN_EVENTS),
     plan=_plan,
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("method", PERIMETER),
-    stateless=lambda parameters, view: (CAMERA_POINTS, RUN_EVENTS),
+    # An event names a tilted marker once.
+    stateless=lambda parameters, view: (
+        (CAMERA_POINTS, RUN_EVENTS) if parameters.get("method", PERIMETER) != PERIMETER else (CAMERA_POINTS,)
+    ),
 )

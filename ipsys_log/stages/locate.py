@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.square_pose import DEPTH_SHARE
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -18,8 +19,9 @@ from ipsys_log.messages import (
     Positions,
     Rig,
 )
-from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, POSITIONS, RIG
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, POSITIONS, RIG, RUN_EVENTS
 from ipsys_log.messages.stage import Plan, Stage, StageView, Step, model_read
+from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
 from ipsys_log.models.table import AppliedModel, reads_corners, reads_height
 from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
 
@@ -36,13 +38,16 @@ _LEAST_FALL = 0.1
 class Locate:
     """The stage *locate*. A camera that is not in the model has no positions.
 
-    Models that need the height of a marker get it from the rig.
+    Models that need the height of a marker get it from the rig. If the pose of a marker contradicts its
+    height, they get the height of the pose, and an event names it. By eq. (3), a tilt looks like another
+    height, so that such a position is only marked as not inside.
     """
 
     def __init__(self, model: Model) -> None:
         self._name = model.name
         self._cameras = {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
         self._rig: Rig | None = None
+        self._heights = ContradictedHeights(model)
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
@@ -55,7 +60,8 @@ class Locate:
             points = message.payload.points
             heights_m = np.array([self._height(point.id) for point in points])
             sigmas_m = np.array([self._height_sigma(point.id) for point in points])
-            positions = _positions(applied, points, heights_m, sigmas_m) if points else ()
+            positions, contradicted = _positions(applied, points, heights_m, sigmas_m) if points else ((), [])
+            yield from self._heights(message.publish_time_ns, message.camera, contradicted)
             yield Positions(message.publish_time_ns, positions)
 
     def _height(self, marker_id: int) -> float:
@@ -68,22 +74,35 @@ class Locate:
 
 def _positions(
     applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array, height_sigmas_m: Array
-) -> tuple[Position, ...]:
-    """Return the positions of the markers; a marker whose ray does not meet its height has none.
+) -> tuple[tuple[Position, ...], list[HeightSighting]]:
+    """Return the positions of the markers, and the heights that contradict those of the rig.
 
-    A marker whose depth contradicts its height is not inside: its position is valid at that height only.
+    A marker whose ray does not meet its height has no position. A marker whose depth by eq. (3) contradicts
+    its height is not inside: its position is valid at that height only.
     """
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
     angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
     world, headings_rad = _world_poses(applied, points_m, angles, heights_m)
+    noise_m = _depth_noise_m(points)
+    agrees = applied.at_height(points_m, world, height_sigmas_m, noise_m)
+    by_pose = ~agrees & np.array([bool(point.poses) for point in points]) & np.isfinite(world).all(axis=1)
+    contradicted: list[HeightSighting] = []
+    if by_pose.any():
+        rises_m, sigmas_m = applied.rises(points_m, world, noise_m)
+        stated_m, heights_m = heights_m, np.where(by_pose, heights_m + rises_m, heights_m)
+        height_sigmas_m = np.where(by_pose, sigmas_m, height_sigmas_m)
+        world, headings_rad = _world_poses(applied, points_m, angles, heights_m)
+        contradicted = [
+            HeightSighting(points[n].id, stated_m[n], world[n], heights_m[n], sigmas_m[n])
+            for n in np.flatnonzero(by_pose)
+        ]
     headings = headings_rad.tolist()
     covariances = applied.covariances(points_m, heights_m, height_sigmas_m)
     sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
     inside = applied.inside(points_m, world, sigmas_m)
     if inside is not None:
-        depth_sigmas_m = np.sqrt([0.0 if p.covariance_m2 is None else p.covariance_m2[2, 2] for p in points])
-        inside &= applied.at_height(points_m, world, height_sigmas_m, depth_sigmas_m)
-    return tuple(
+        inside &= agrees | by_pose
+    positions = tuple(
         Position(
             point.id,
             x_m,
@@ -97,6 +116,20 @@ def _positions(
         for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))
         if np.isfinite(world[n]).all()
     )
+    return positions, contradicted
+
+
+def _depth_noise_m(points: tuple[CameraPoint, ...]) -> Array:
+    """Return the standard deviations (n,) of the depths by the noise of an image, 0 if unknown.
+
+    The covariance of a pose also has the error of its camera, which the calibration points have corrected.
+    """
+    variances_m2 = np.zeros(len(points))
+    for n, point in enumerate(points):
+        if point.covariance_m2 is not None:
+            shared_m = DEPTH_SHARE * point.z_m if point.poses else 0.0
+            variances_m2[n] = max(point.covariance_m2[2, 2] - shared_m**2, 0.0)
+    return np.sqrt(variances_m2)
 
 
 def _world_poses(
@@ -171,11 +204,13 @@ def _rig_part(rig: Rig, model: str) -> object:
 
 STAGE = Stage(
     name="locate",
-    versions={"locate": 3},
+    versions={"locate": 4},
     reads=(RIG, MARKERS, CAMERA_POINTS, MODEL),
-    writes=(POSITIONS,),
+    writes=(POSITIONS, RUN_EVENTS),
     plan=_plan,
     rig_part=_rig_part,
     method=model_read,
+    # An event names a marker once, of whichever cameras.
+    per_camera=False,
     stateless=lambda parameters, view: (POSITIONS,),
 )

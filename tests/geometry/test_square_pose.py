@@ -195,6 +195,20 @@ def test_rate_of_wrong_pose_choices_is_bounded(length_m: float, sigma_px: float,
     assert (tilts[:, 0] > tilts[:, 1] + 0.5).mean() <= most
 
 
+def test_mirrored_poses_of_tilted_markers_are_rare() -> None:
+    """If all markers are expected to be level, 6 % of these get their mirrored pose, otherwise 1.2 %."""
+    rng = np.random.default_rng(8)
+    axes: list[Array] = []
+    seen_px: list[Array] = []
+    while len(axes) < 2000:
+        centre_m = np.array([*rng.uniform(-1, 1, 2) * (1.5, 0.8), rng.uniform(1.9, 2.1)])
+        axes.append(turned(rng.uniform(-3, 3), rng.uniform(15, 30), rng.uniform(0, 2 * np.pi)))
+        seen_px.append(corners_px(FISHEYE, axes[-1], centre_m, 0.1))
+    noisy_px = np.array(seen_px) + rng.normal(0, 0.1, (2000, 4, 2))
+    tilts = tilts_deg(fit(noisy_px, FISHEYE, 0.01 * np.eye(8), 0.1), np.array(axes))
+    assert (tilts[:, 0] > tilts[:, 1] + 0.5).mean() < 0.02
+
+
 def test_corners_outweigh_the_tilt_where_they_are_sure() -> None:
     """A tilted marker: its mirrored solution faces the camera much better."""
     axes, centre_m = turned(0.4, 35.0, np.pi / 2), np.array([0.6, 0.1, 2.0])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -16,7 +19,19 @@ from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.payload import joint_payload
-from ipsys_log.messages import Marker, Markers, Message, ReferenceMarker, Rig, RigMarker
+from ipsys_log.messages import (
+    Event,
+    Marker,
+    Markers,
+    Message,
+    Model,
+    Pair,
+    Position,
+    Positions,
+    ReferenceMarker,
+    Rig,
+    RigMarker,
+)
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 
 POSES = [(1.6, 1.2, 0.1, 0.3), (2.4, 2.2, 0.0, -2.0), (3.1, 1.9, 0.2, 1.5)]
@@ -176,3 +191,83 @@ def test_reference_marker_has_no_position(fit: JointFit, model: JointModel) -> N
     markers = [Marker(number, corners) for number, corners in enumerate(see(model, level_poses(model)))]
     (found,) = step(Message("/markers", 1, 1, Markers(1, tuple(markers), 1920, 1080), "c0"))
     assert [position.id for position in found.positions] == [0, 1]
+
+
+def drive(model: Model, sighted: list[Array], height_m: float | None) -> tuple[list[Event], list[Position]]:
+    """Return the events and positions of a marker that drives past a camera, by the step of its model."""
+    step = LocateCorners(model)
+    rig = Rig("lab", "DICT_4X4_100", LENGTH_M, (RigMarker(0, height_m=height_m, height_sigma_m=0.001),))
+    assert not list(step(Message("/rig", 0, 0, rig)))
+    events: list[Event] = []
+    positions: list[Position] = []
+    for number, corners_px in enumerate(sighted):
+        time_ns = number * 100_000_000
+        frame = Markers(time_ns, (Marker(0, corners_px, noise()[0]),), 1920, 1080)
+        for payload in step(Message("/markers", time_ns, time_ns, frame, "c0")):
+            events += [payload] if isinstance(payload, Event) else []
+            positions += payload.positions if isinstance(payload, Positions) else []
+    return events, positions
+
+
+def path(model: JointModel, height_m: float, tilt_rad: float = 0.0) -> tuple[Array, list[Array]]:
+    """Return places (n, 3) of a driving robot on the estimated floor, and its corners with noise."""
+    rng = np.random.default_rng(5)
+    flat_m = np.column_stack([np.linspace(1.2, 3.4, 30), np.linspace(1.0, 2.4, 30)])
+    floor_m, _ = model.floor.heights(flat_m, model.amplitudes)
+    places_m = np.column_stack([flat_m, floor_m + height_m])
+    tilt = make_pose(rotation(np.array([tilt_rad, 0.0, 0.0])), np.zeros(3))
+    poses = [pose_facing_up(x, y, z, 0.5) @ tilt for x, y, z in places_m.tolist()]
+    return places_m, [see(model, [pose])[0] + rng.normal(0, 0.02, (4, 2)) for pose in poses]
+
+
+@pytest.mark.parametrize("wrong_m", [0.03, -0.012])
+def test_contradicted_height_gives_full_pose_and_one_event(
+    fit: JointFit, model: JointModel, wrong_m: float
+) -> None:
+    places_m, sighted = path(model, 0.1 + wrong_m)
+    events, positions = drive(joint_payload(fit, {}, 0), sighted, 0.1)
+    (event,) = events
+    assert (event.kind, event.marker_id) == ("contradicted_height", 0)
+    assert re.match(r"marker 0 is at 0\.\d{3} m, not at 0\.100 m", event.text)
+    assert abs(float(event.text.split()[4]) - 0.1 - wrong_m) < 0.002
+    away_m = np.array([(p.x_m, p.y_m, p.z_m) for p in positions]) - places_m
+    assert np.median(np.linalg.norm(away_m[:, :2], axis=1)) < 0.001
+    covariances_m2 = np.array([position.covariance_m2 for position in positions])
+    chi2 = (away_m * np.linalg.solve(covariances_m2, away_m[:, :, None])[:, :, 0]).sum(axis=1)
+    assert (chi2 < 7.81).mean() > 0.9
+    assert all(position.inside for position in positions)
+
+
+def test_height_that_changes_is_named_when_it_changes(fit: JointFit, model: JointModel) -> None:
+    _, before = path(model, 0.1)
+    _, after = path(model, 0.16)
+    (event,), _ = drive(joint_payload(fit, {}, 0), before[:15] + after[15:], 0.1)
+    assert event.timestamp > 15 * 100_000_000
+    assert event.text.startswith("marker 0 is at 0.1")
+
+
+@pytest.mark.parametrize("tilt_deg", [2.0, 8.0])
+def test_tilted_top_at_its_height_keeps_its_flag(fit: JointFit, model: JointModel, tilt_deg: float) -> None:
+    places_m, sighted = path(model, 0.1, np.radians(tilt_deg))
+    events, positions = drive(joint_payload(fit, {}, 0), sighted, 0.1)
+    assert events == []
+    away_m = np.array([(p.x_m, p.y_m) for p in positions]) - places_m[:, :2]
+    assert np.linalg.norm(away_m, axis=1).max() < 0.001
+    assert all(position.inside for position in positions)
+
+
+def test_print_within_its_error_is_no_wrong_height(fit: JointFit, model: JointModel) -> None:
+    """A side that is 0.2 % too long looks like a marker that is 4 mm higher."""
+    _, sighted = path(replace(model, scale=1.002 * model.scale), 0.1)
+    events, positions = drive(joint_payload(fit, {}, 0), sighted, 0.1)
+    assert events == []
+    assert all(position.inside for position in positions)
+
+
+def test_calibration_points_are_no_wrong_heights(fit: JointFit, model: JointModel) -> None:
+    """A marker on the floor, at calibration points and at one further point, is on no robot."""
+    places_m, sighted = path(model, 0.0)
+    pairs = [Pair(str(n), 0, np.zeros(3), place_m, 10) for n, place_m in enumerate(places_m[:20:10])]
+    still = [sighted[n] for n in (0, 10, 25) for _ in range(20)]
+    events, _ = drive(joint_payload(fit, {"c0": pairs}, 0), still, 0.1)
+    assert events == []

@@ -139,7 +139,7 @@ def test_state_does_not_depend_on_the_order_of_logs(
     assert ipsys("camera-frame", lab, "-o", first).code == 0
     assert ipsys("replay", lab, first, "-o", last).code == 0
     assert ipsys("verify", last, first, lab).code == 0
-    monkeypatch.setitem(VERSIONS, "perimeter", 2)
+    monkeypatch.setitem(VERSIONS, "perimeter", VERSIONS["perimeter"] + 1)
     found = [
         {(row["run"], row["stage"]): row["state"] for row in json.loads(ipsys("runs", *logs, "--json").out)}
         for logs in ((lab, first, last), (last, first, lab))

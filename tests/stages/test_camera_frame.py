@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from ipsys_log.runs.output import write_log
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
 from tests.conftest import ROOT, Ipsys
 from tests.geometry.squares import CENTRE, EDGE, FISHEYE, LENSES, MIDWAY, Array, corners_px, turned
+from tests.stages.real_board import RIG as BOARD_RIG
+from tests.stages.real_board import read_lens, read_markers
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3), RigMarker(4, length_m=0.1), RigMarker(5)))
 SIGMA_PX = 0.03
@@ -113,13 +116,87 @@ def test_the_covariance_is_that_of_the_scatter(method: str, place_m: tuple[float
     root = rng.normal(0, SIGMA_PX / 3, (8, 8))
     exact = marker(3, place_m, turned(0.4, 3.0, 1.0))
     noise_px = (rng.normal(size=(500, 8)) @ root.T).reshape(-1, 4, 2)
+    if method == "pose":  # this covariance has the errors of the lens
+        noise_px += rng.normal(0, 0.18, (500, 1, 2))
     noisy = [Marker(3, exact.corners_px + off, root @ root.T) for off in noise_px]
     found, _ = points(method, *noisy)
-    scatter = np.linalg.inv(np.linalg.cholesky(np.cov(np.transpose([where(point) for point in found]))))
+    places_m = np.array([where(point) for point in found])
+    if method == "pose":  # and of the print
+        places_m *= rng.normal(1, 0.002, (500, 1))
+    scatter = np.linalg.inv(np.linalg.cholesky(np.cov(places_m.T)))
     said = [point.covariance_m2 for point in found if point.covariance_m2 is not None]
     assert len(said) == len(found)
     ratios = np.linalg.eigvalsh(scatter @ np.mean(said, axis=0) @ scatter.T)
     assert 0.8 < ratios.min() < ratios.max() < 1.25
+
+
+def test_pose_covariance_holds_on_a_real_board(data: Path) -> None:
+    """Compare each marker of a hand-held board with its place on the board, whose pose has other corners."""
+    folder, scores = data / "charuco_videos", []
+    lens = read_lens(folder, "1")
+    for markers, centres_m in read_markers(folder, "1", every=6):
+        found, _ = points("pose", *markers, lens=lens, rig=BOARD_RIG)
+        for point in found:
+            off_m = np.subtract(where(point), centres_m[point.id])
+            assert point.covariance_m2 is not None
+            scores.append(off_m @ np.linalg.solve(point.covariance_m2, off_m) / 3)
+    assert len(scores) > 30
+    assert 0.5 < np.mean(scores) < 3
+
+
+def tilt_events(method: str, tilts_deg: list[float], seed: int = 0) -> list[Event]:
+    """Return the events of a level marker 3, and of a turning marker 4 with these tilts."""
+    rng, stage, events = np.random.default_rng(seed), CameraFrame(method), []
+    for payload, camera in ((RIG, None), (FISHEYE, "red")):
+        assert list(stage(Message("t", 0, 0, payload, camera))) == []
+    for number, tilt_deg in enumerate(tilts_deg):
+        time_ns = number * 100_000_000
+        axes = {3: turned(0.4), 4: turned(0.1 * number, tilt_deg, 1.0 + 0.1 * number)}
+        centres_m = {3: (-0.5, 0.3, 2.1), 4: (0.8, 0.1 + 0.0002 * number, 2.1)}
+        seen = [
+            Marker(
+                n,
+                corners_px(FISHEYE, axes[n], np.array(centres_m[n]), RIG.length_of(n))
+                + rng.normal(0, SIGMA_PX, (4, 2)),
+                SIGMA_PX**2 * np.eye(8),
+            )
+            for n in axes
+        ]
+        payloads = stage(Message("t", time_ns, time_ns, Markers(time_ns, tuple(seen), 1920, 1080), "red"))
+        events += [payload for payload in payloads if isinstance(payload, Event)]
+    return events
+
+
+@pytest.mark.parametrize("tilt_deg", [12.0, 30.0])
+def test_tilted_marker_is_named_once_with_the_other_method(tilt_deg: float) -> None:
+    (event,) = tilt_events("perimeter", [tilt_deg] * 60)
+    assert (event.kind, event.camera, event.marker_id) == ("tilted_marker", "red", 4)
+    assert re.search(r"camera red: marker 4 is tilted by \d+ degrees", event.text)
+    assert "--method pose" in event.text
+    assert tilt_events("pose", [tilt_deg] * 60) == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_tops_of_2_degrees_are_not_named(seed: int) -> None:
+    assert tilt_events("perimeter", [2.0] * 200, seed) == []
+
+
+def test_tilt_that_begins_later_is_named_then() -> None:
+    (event,) = tilt_events("perimeter", [0.0] * 60 + [20.0] * 80)
+    assert event.timestamp >= 60 * 100_000_000
+
+
+def test_tilted_real_board_is_named(data: Path) -> None:
+    folder, stage, events = data / "charuco_videos", CameraFrame(), []
+    lens = read_lens(folder, "1")
+    for payload, camera in ((BOARD_RIG, None), (lens, "red")):
+        assert list(stage(Message("t", 0, 0, payload, camera))) == []
+    for number, (markers, _) in enumerate(read_markers(folder, "1", every=6)):
+        time_ns = number * 300_000_000
+        payloads = stage(Message("t", time_ns, time_ns, Markers(time_ns, markers, 1280, 720), "red"))
+        events += [payload.text for payload in payloads if isinstance(payload, Event)]
+    assert len(events) == 1
+    assert "use --method pose" in events[0]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -197,7 +274,7 @@ def test_another_method_is_another_run(ipsys: Ipsys, tmp_path: Path) -> None:
     assert run("--method", "perimeter") == ("edges", False)
     with Session([log]) as session:
         parameters = {r.run: r.parameters for r in session.runs() if r.stage == "camera-frame"}
-        assert parameters == {"edges": {}, "edges_pose": {"method": "pose"}}
+        assert parameters == {"edges": {"perimeter": "2"}, "edges_pose": {"method": "pose", "pose": "2"}}
         by_pose = session.payloads(session.topics(CAMERA_POINTS, "edges_pose"))
         assert all(len(point.poses) == 2 for frame in by_pose for point in frame.points)
 

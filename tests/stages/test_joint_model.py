@@ -173,7 +173,8 @@ def test_loaded_joint_model_gives_the_positions_of_locate(ipsys: Ipsys, fitted: 
         seen, positions = next(
             (m, positions)
             for m in session.messages(session.topics(MARKERS, "geometric"))
-            if (positions := located[m.camera, m.log_time_ns]) and all(p.inside for p in positions)
+            if (positions := located[m.camera, m.log_time_ns])
+            and all(p.inside and abs(p.z_m - rig.height_of(p.id)) < 0.005 for p in positions)
         )
     markers = seen.payload.markers
     corners_px = np.array([marker.corners_px for marker in markers])

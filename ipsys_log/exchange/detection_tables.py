@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.csv_rows import NamedRow, read_rows
 from ipsys_log.exchange.image_folders import parse_time
@@ -19,6 +20,7 @@ from ipsys_log.messages import (
     IMPORTED,
     RIG_TOPIC,
     CameraCalibration,
+    Event,
     Marker,
     Markers,
     Message,
@@ -26,7 +28,8 @@ from ipsys_log.messages import (
     Run,
     calibration_topic,
 )
-from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.messages.channels import MARKERS, RIG, RUN_EVENTS
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
 from ipsys_log.rig.file import check_name
 from ipsys_log.runs.output import append_run, open_target
 from ipsys_log.runs.provenance import check_run_name, fingerprint, free_name
@@ -50,11 +53,12 @@ class DetectionOptions:
 
 
 class ImportedDetections(NamedTuple):
-    """The result of an import: the log, its new run, and the number of markers by camera."""
+    """The result of an import: the log, its new run, the number of markers by camera, and remarks."""
 
     path: Path
     run: str
     markers: dict[str, int]
+    remarks: list[str]
 
 
 def import_detections(
@@ -92,6 +96,9 @@ def import_detections(
         frames = _read_frames(file, lenses)
         run = _run_name(session, options.run)
         messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
+        rig = options.rig or (session.payloads(session.topics(RIG))[-1] if session is not None else None)
+        contradictions = [*_contradictions(messages, lenses, rig, run)] if rig is not None else []
+        messages += contradictions
         if session is None:
             messages = [*_settings(options, frames), *messages]
         last_ns = frames[-1].log_time_ns
@@ -104,7 +111,8 @@ def import_detections(
     counts = Counter(dict.fromkeys(sorted({frame.camera for frame in frames}), 0))
     for frame in frames:
         counts[frame.camera] += len(frame.markers)
-    return ImportedDetections(output or target, run, dict(counts))
+    texts = [message.payload.text for message in contradictions]
+    return ImportedDetections(output or target, run, dict(counts), texts)
 
 
 class _Frame(NamedTuple):
@@ -167,6 +175,19 @@ def _lenses(session: Session | None, given: Mapping[str, CameraCalibration]) -> 
     recorded = session.calibrations if session is not None else {}
     own = {camera: session.payloads([topic])[-1] for camera, topic in recorded.items() if session}
     return {**own, **given}
+
+
+def _contradictions(
+    messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], rig: Rig, run: str
+) -> Iterator[Message]:
+    """Yield an event, after the last frame, for each contradiction of markers and intrinsics."""
+    tests = {camera: IntrinsicsTest(camera, lens, rig) for camera, lens in lenses.items()}
+    topic, last_ns = RUN_EVENTS.topic_of(run), messages[-1].log_time_ns
+    for message in messages:
+        camera, kind = str(message.camera), CALIBRATION_CONTRADICTED
+        for text, marker_id in tests[camera].add(message.publish_time_ns, message.payload.markers):
+            event = Event(message.publish_time_ns, kind, text, camera, marker_id)
+            yield Message(topic, last_ns, event.timestamp, event, camera)
 
 
 def _run_name(session: Session | None, wanted: str | None) -> str:

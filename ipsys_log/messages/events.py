@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from ipsys_log.messages.message import TimeNs
 
 __all__ = [
+    "CALIBRATION_CONTRADICTED",
     "CAMERA_MOVED",
     "FRAME_SKIPPED",
     "MARK",
@@ -25,6 +26,8 @@ __all__ = [
 FRAME_SKIPPED = "frame_skipped"
 # The kind of an event for late frames of a camera; these frames have their time of arrival.
 STAMP_UNRELIABLE = "stamp_unreliable"
+# The kind of an event for a camera whose markers contradict its intrinsics, or a marker its length.
+CALIBRATION_CONTRADICTED = "calibration_contradicted"
 # The kind of an event for a camera that was knocked during a live recording.
 CAMERA_MOVED = "camera_moved"
 # The kinds of events for the first answers of the node of a camera, and for a long wait for them.

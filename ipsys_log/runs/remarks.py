@@ -11,6 +11,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
 from ipsys_log.messages.channels import MARKERS, POSITIONS
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
 from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.units import format_time
@@ -28,6 +29,7 @@ class Remarks:
         self._events: Counter[str] = Counter()
         self._first: dict[str, Message] = {}
         self._unknown: set[str] = set()
+        self._contradictions: list[str] = []
         self._frames = self._markers = 0
         self._located: set[str | None] = set()
         # An array takes eight bytes for each offset: a long log has millions of offsets.
@@ -50,7 +52,9 @@ class Remarks:
 
     def _note(self, message: Message) -> None:
         payload = message.payload
-        if isinstance(payload, Event):
+        if isinstance(payload, Event) and payload.kind == CALIBRATION_CONTRADICTED:
+            self._contradictions.append(payload.text)
+        elif isinstance(payload, Event):
             self._events[payload.kind] += 1
             self._first.setdefault(payload.kind, message)
             if payload.kind == "unknown_marker":
@@ -79,6 +83,8 @@ class Remarks:
                 f"{', '.join(sorted(self._unknown))}: add them as [[markers]] to lab.toml, and give the "
                 "file with --rig"
             )
+        if self._contradictions and not self._markers:
+            raise IpsysError(f"no marker could be measured: {self._contradictions[0]}")
         rejected = self._events["rejected_marker"]
         if rejected and not self._markers:
             raise IpsysError(
@@ -100,7 +106,7 @@ class Remarks:
             for kind, count in sorted(self._events.items())
         ]
         if MARKERS in self._task.stage.writes:
-            lines.insert(0, f"{self._markers} markers in {self._frames} frames")
+            lines = [f"{self._markers} markers in {self._frames} frames", *self._contradictions, *lines]
             lines += self._about_offsets()
         if POSITIONS in self._task.stage.writes:
             cameras = {camera_of_topic(topic) for topic in self._task.topics} - {None}

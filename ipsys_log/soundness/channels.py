@@ -17,6 +17,7 @@ from ipsys_log.log.stored_schemas import compare_schema
 from ipsys_log.messages import Event
 from ipsys_log.messages.channels import CHANNELS, EVENTS, IMAGES, RUN_EVENTS, channel_of
 from ipsys_log.messages.events import (
+    CALIBRATION_CONTRADICTED,
     CAMERA_MOVED,
     FRAME_SKIPPED,
     NODE_ANSWERS,
@@ -40,6 +41,7 @@ _USUAL_EVENTS = frozenset(
 _ADVICE = {
     FRAME_SKIPPED: "the frames are in the log: ipsys replay processes them",
     STAMP_UNRELIABLE: "these frames have their time of arrival",
+    CALIBRATION_CONTRADICTED: "correct lab.toml, or give the file with --calibration CAMERA=calibration.yaml",
     CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
     "frames_dropped": "record on a faster disk",
     "frames_missed": "reduce the rate or the size of the images, or use another USB bus",

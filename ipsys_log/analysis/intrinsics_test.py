@@ -5,14 +5,13 @@ the marker lies, the Jacobian is a rotation times a scale. For a marker of anoth
 intrinsics, its shape deviates by ``beta / alpha`` (the Beltrami coefficient: axes differ by twice its
 size). These deviations are linear in the errors of corners everywhere in the image, unlike tilts. Least
 squares explain them by the tilt of the floor, by one tilt of the top of each robot, and by a correction of
-the image: scale, aspect, skew, centre and a radial term. The intrinsics are contradicted if the correction
+the image: scale, aspect, skew, centre and two radial terms. The intrinsics are contradicted if the correction
 is much larger than the errors of a calibration, beside its own uncertainty. Markers in a hand explain
 nothing: their scatter makes the correction uncertain.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -33,12 +32,13 @@ Complex = NDArray[np.complex128]
 _EVERY_NS = NS_PER_S // 5
 # Numbers of sightings at which the test is made. Then a new window begins, because a lens can be changed
 # later; it is tested at its end.
-_TESTED_AT = (4, 12, 24, 48, 96, 192)
-_LEAST_LEVEL = 12
-# The correction: scale, centre x and y, radial term at half the width of the image, aspect, skew. Sigmas of
+_TESTED_AT = (4, 32, 64, 128, 256)
+# With fewer, chance and the unknowns explain too much.
+_LEAST_LEVEL = 24
+# The correction: scale, centre x and y, radial terms at half the width of the image, aspect, skew. Sigmas of
 # any camera, and of the error of a good calibration: 0.4 % of the focal length, 4 px of 1920 for the centre.
-_ANY = np.array([0.3, 0.3, 0.3, 0.3, 0.1, 0.1])
-_CALIBRATED = np.array([0.004, 0.004, 0.004, 0.003, 0.002, 0.002])
+_ANY = np.array([0.3, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1])
+_CALIBRATED = np.array([0.004, 0.004, 0.004, 0.003, 0.003, 0.002, 0.002])
 _NONE = 1e-6 * _ANY
 _PARAMETERS = len(_ANY)
 # Sigma of the tilt of the top of a robot, in rad; of the floor to the image, any tilt.
@@ -46,11 +46,10 @@ _TOP_TILT, _ANY_TILT = 0.035, 3.0
 # Error of the shape of a print: stretched by the printer by 0.3 %, bent, on a floor that is not flat.
 _SHAPE_SIGMA = 0.002
 _HUBER = 2.5
-# Neighbouring sightings have similar errors. Factor for variances.
-_ALIKE = 2.0
-# Chi-square of six parameters: chance exceeds it once in 25,000 tests. Least effect on shapes, and least
-# ratio of the deviations before and after the correction.
-_CHI2, _LEAST_EFFECT, _LEAST_RATIO = 30.0, 0.004, 1.5
+# Chi-square of seven parameters: chance exceeds it once in 10,000 tests. Least deviation of shapes that the
+# correction explains: a good calibration has 0.4 % at the border of the image. Least ratio of the deviations
+# before and after the correction.
+_CHI2, _LEAST_EFFECT, _LEAST_RATIO = 30.0, 0.005, 1.5
 _ITERATIONS, _SETTLED, _STEP = 12, 0.05, 1e-5
 # Square fit of raw corners: usual error, and error in shares of the side (a print that is not square).
 _FIT_PX, _FIT_SHARE, _FIT_FACTOR = 0.35, 0.005, 3.0
@@ -58,6 +57,7 @@ _FIT_PX, _FIT_SHARE, _FIT_FACTOR = 0.35, 0.005, 3.0
 _FITTED_PX = 1e-4
 # Size of a marker: least contradiction, and in units of the scatter of distances.
 _SIZE_SHARE, _SIZE_SCATTER = 0.03, 4.0
+# Level markers have a smaller scatter of shapes; least number of sightings of a marker.
 _LEVEL_SCATTER, _LEAST_OF_MARKER = 0.02, 5
 
 
@@ -168,7 +168,8 @@ class IntrinsicsTest:
             return
         if (
             corrected.chi2 > _CHI2
-            and corrected.effect > _LEAST_EFFECT
+            and corrected.rms < _LEVEL_SCATTER
+            and given.rms**2 - corrected.rms**2 > _LEAST_EFFECT**2
             and given.rms > _LEAST_RATIO * corrected.rms
         ):
             sides_px = np.linalg.norm(seen.corners_px - np.roll(seen.corners_px, 1, axis=1), axis=2)
@@ -180,29 +181,42 @@ class IntrinsicsTest:
         elif given.rms < _LEVEL_SCATTER:
             yield from self._test_sizes(seen, given)
 
+    def _floor_distances(self, seen: _Seen, fit: _Explanation) -> dict[int, Array]:
+        """Return distances of the floor from the camera in m, by the marker of known height."""
+        floors_m: dict[int, Array] = {}
+        for marker_id in seen.known_ids:
+            height_m = self.rig.height_of(marker_id)
+            distances_m = fit.distances[seen.ids == marker_id] * self.rig.length_of(marker_id)
+            if height_m is not None and len(distances_m) >= _LEAST_OF_MARKER:
+                floors_m[marker_id] = distances_m + height_m
+        return floors_m
+
     def _test_sizes(self, seen: _Seen, fit: _Explanation) -> Iterator[Contradiction]:
         """Find markers that are at another height than the rig says, as those of a wrong length are."""
-        heights_m = [self.rig.height_of(n) for n in seen.known_ids]
-        known = [n for n, height_m in zip(seen.known_ids, heights_m, strict=True) if height_m is not None]
-        logs: dict[int, Array] = {}
-        for marker_id in known:
-            distances_m = fit.distances[seen.ids == marker_id] * self.rig.length_of(marker_id)
-            if len(distances_m) >= _LEAST_OF_MARKER:
-                logs[marker_id] = distances_m + float(self.rig.height_of(marker_id) or 0.0)
-        if len(logs) < 3:
+        floors_m = self._floor_distances(seen, fit)
+        if len(floors_m) < 2:
             return
-        centres_m = {marker_id: float(np.median(values_m)) for marker_id, values_m in logs.items()}
+        centres_m = {marker_id: float(np.median(values_m)) for marker_id, values_m in floors_m.items()}
         middle_m = float(np.median(list(centres_m.values())))
-        scatter_m = float(np.median([np.median(abs(v - np.median(v))) for v in logs.values()])) * 1.48
+        scatter_m = 1.48 * float(np.median([np.median(abs(v - np.median(v))) for v in floors_m.values()]))
         bound_m = max(_SIZE_SHARE * middle_m, _SIZE_SCATTER * scatter_m)
-        wrong = [n for n, centre_m in centres_m.items() if abs(centre_m - middle_m) > bound_m]
-        if len(wrong) > 1:
+        # The middle of two markers has half of their contradiction on each side.
+        bound = bound_m / 2 if len(floors_m) == 2 else bound_m
+        wrong = [n for n, centre_m in centres_m.items() if abs(centre_m - middle_m) > bound]
+        if set(wrong) <= self._wrong_markers or len(wrong) > (2 if len(floors_m) == 2 else 1):
             return
-        for marker_id in set(wrong) - self._wrong_markers:
-            self._wrong_markers.add(marker_id)
-            share = 100 * (centres_m[marker_id] / middle_m - 1)
+        self._wrong_markers.update(wrong)
+        if len(floors_m) == 2:
+            share = max(centres_m.values()) / min(centres_m.values()) - 1
             yield Contradiction(
-                f"camera {self.camera}: marker {marker_id} looks {abs(share):.0f} % too "
+                f"camera {self.camera}: the sizes of markers {wrong[0]} and {wrong[1]} contradict each other "
+                f"by {100 * share:.0f} %; measure their sides, and correct length_m or the height in the rig"
+            )
+            return
+        for marker_id in wrong:
+            share = centres_m[marker_id] / middle_m - 1
+            yield Contradiction(
+                f"camera {self.camera}: marker {marker_id} looks {100 * abs(share):.0f} % too "
                 f"{'small' if share > 0 else 'large'} beside the others; measure its side, and correct its "
                 "length_m or its height in the rig",
                 marker_id,
@@ -246,11 +260,12 @@ class _Seen(NamedTuple):
 
     def jacobians(self, correction: Array) -> tuple[Array, Array]:
         """Return the Jacobians of the prints at their centres (n, 2, 2), and the centres in (u, v) (n, 2)."""
-        scale, x, y, radial, aspect, skew = correction
+        scale, x, y, radial, outer, aspect, skew = correction
         half_px, centre_px = self.lens.width / 2, self.lens.K[:2, 2]
         moved = (self.corners_px - centre_px) / half_px - np.array([x, y])
         radii2 = (moved * moved).sum(axis=-1, keepdims=True)
-        moved = moved @ np.array([[1 + aspect, skew], [skew, 1 - aspect]]) * (1 + scale + radial * radii2)
+        moved = moved @ np.array([[1 + aspect, skew], [skew, 1 - aspect]])
+        moved *= 1 + scale + (radial + outer * radii2) * radii2
         uv = undistort((moved * half_px + centre_px).reshape(-1, 2), self.lens).reshape(-1, 4, 2)
         return _at_centres(uv)
 
@@ -276,13 +291,11 @@ def _at_centres(uv: Array) -> tuple[Array, Array]:
 class _Explanation(NamedTuple):
     """A least-squares explanation of shapes.
 
-    ``rms`` is the deviation that remains, ``effect`` the deviation that the correction explains, and ``chi2``
-    the square of the correction in units of its sigma. ``distances`` (n,) are those of the markers from the
-    camera, along the normal of the floor, in sides.
+    ``rms`` is the deviation that remains, and ``chi2`` the square of the correction in units of its sigma.
+    ``distances`` (n,) are those of the markers from the camera, along the normal of the floor, in sides.
     """
 
     rms: float
-    effect: float
     chi2: float
     distances: Array
 
@@ -314,22 +327,26 @@ def _explanation(
     seen: _Seen, values: Array, off: Array, spread: float, sigmas: Array, is_corrected: bool
 ) -> _Explanation:
     slopes, weights = _slopes(seen, values, off, is_corrected), _weights(off, spread)
+    weighted = weights[:, None] * off
     freedom = max(weights.sum() * 2 - len(values), 2.0)
-    variance = max(_SHAPE_SIGMA**2, float((weights[:, None] * off * off).sum()) / freedom)
-    normal = _normal(slopes, weights) / (variance * _ALIKE * _design_effect(seen, off)) + np.diag(sigmas**-2)
-    covariance = np.linalg.inv(normal)[:_PARAMETERS, :_PARAMETERS] + np.diag(_CALIBRATED**2)
+    variance = max(_SHAPE_SIGMA**2, float((weighted * off).sum()) / freedom)
+    inverse = np.linalg.inv(_normal(slopes, weights) / variance + np.diag(sigmas**-2))
+    # Sightings in one frame can deviate alike, such as markers of one board, and small images scatter more.
+    pulls = np.einsum("nij,ni->nj", slopes, weighted) / variance
+    _, frames = np.unique(seen.times_ns, return_inverse=True)
+    sums = np.zeros((frames.max() + 1, len(values)))
+    np.add.at(sums, frames, pulls)
+    scatter = inverse @ (sums.T @ sums) @ inverse * (2 * len(off) / freedom)
+    covariance = (inverse + scatter)[:_PARAMETERS, :_PARAMETERS] + np.diag(_CALIBRATED**2)
     correction = values[:_PARAMETERS]
     chi2 = float(correction @ np.linalg.solve(covariance, correction))
-    effect = slopes[:, :, :_PARAMETERS] @ correction
     shapes, centres = seen.jacobians(correction)
     normals = _normals(values, len(seen.ids))
     alpha, _ = _similarity(shapes, centres, normals)
     rays = np.column_stack([centres, np.ones(len(centres))])
     distances = np.abs((rays * normals).sum(axis=1)) / np.abs(alpha)
-    rms, effect_rms = (
-        float(np.sqrt((weights[:, None] * v * v).sum() / weights.sum())) for v in (off, effect)
-    )
-    return _Explanation(rms, effect_rms, chi2, distances)
+    rms = float(np.sqrt((weighted * off).sum() / weights.sum()))
+    return _Explanation(rms, chi2, distances)
 
 
 def _cost(off: Array, values: Array, spread: float, sigmas: Array) -> float:
@@ -346,17 +363,6 @@ def _weights(off: Array, spread: float) -> Array:
 
 def _normal(slopes: Array, weights: Array) -> Array:
     return np.asarray(np.einsum("n,nij,nik->jk", weights, slopes, slopes))
-
-
-def _design_effect(seen: _Seen, off: Array) -> float:
-    """Return how many sightings of a frame deviate alike, such as markers of one board in a hand."""
-    counts = Counter(seen.times_ns.tolist())
-    if len(counts) == len(off):
-        return 1.0
-    _, frames = np.unique(seen.times_ns, return_inverse=True)
-    sums = np.zeros((len(counts), 2))
-    np.add.at(sums, frames, off)
-    return max(1.0, float((sums**2).sum() / max((off**2).sum(), 1e-12)))
 
 
 def _slopes(seen: _Seen, values: Array, off: Array, is_corrected: bool) -> Array:

@@ -50,6 +50,7 @@ from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, channel_of
+from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_inputs
@@ -192,7 +193,7 @@ def measure(
     check_independent_frames(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     with (
-        Consumers(consumers, cameras.add_event, sinks) as show,
+        Consumers([_contradictions(cameras.say), *consumers], cameras.add_event, sinks) as show,
         one_blas_thread(),
         open_recording(target, settings, overwrite) as log,
         RecentFrames(log) as recent,
@@ -245,7 +246,9 @@ def live(
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
     with (
-        Consumers([KnockEvents(cameras), *consumers], cameras.add_event, sinks) as show,
+        Consumers(
+            [KnockEvents(cameras), _contradictions(cameras.say), *consumers], cameras.add_event, sinks
+        ) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         ExitStack() as resources,
@@ -335,6 +338,16 @@ def _put_through(
     except IpsysError as fault:
         return fault
     return None
+
+
+def _contradictions(say: Callable[[str], None]) -> Consumer:
+    """Return a consumer that prints the contradictions between cameras and their calibrations."""
+
+    def print_text(message: Message | None) -> None:
+        if message is not None and getattr(message.payload, "kind", None) in CONTRADICTIONS:
+            say(message.payload.text)
+
+    return print_text
 
 
 def _report_rename(log: Recording, say: Callable[[str], None]) -> None:

@@ -251,6 +251,8 @@ def detections(
     say_unusual(imported.lenses)
     text = ", ".join(f"{count} of {camera}" for camera, count in imported.markers.items())
     console.print(f"run {imported.run}: markers: {text}")
+    for line in imported.remarks:
+        remarks.print(line, style="yellow", markup=False)
     remarks.print(f"results are in {imported.path}", markup=False)
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import announce_assumed
 from ipsys_log.exchange.csv_rows import NamedRow, read_rows
@@ -21,6 +22,7 @@ from ipsys_log.messages import (
     IMPORTED,
     RIG_TOPIC,
     CameraCalibration,
+    Event,
     Marker,
     Markers,
     Message,
@@ -28,7 +30,8 @@ from ipsys_log.messages import (
     Run,
     calibration_topic,
 )
-from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.messages.channels import MARKERS, RIG, RUN_EVENTS
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
 from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.file import check_name
 from ipsys_log.runs.output import append_run, open_target
@@ -62,6 +65,7 @@ class ImportedDetections(NamedTuple):
     """The result of an import: the log, its new run, and the number of markers by camera.
 
     ``lenses`` are the intrinsics from the files of the rig. ``assumed`` is that of the options, with these.
+    ``remarks`` name inputs that the markers contradict.
     """
 
     path: Path
@@ -69,6 +73,7 @@ class ImportedDetections(NamedTuple):
     markers: dict[str, int]
     lenses: dict[str, CameraCalibration]
     assumed: dict[str, str]
+    remarks: list[str]
 
 
 def import_detections(
@@ -109,6 +114,9 @@ def import_detections(
         lenses, assumed = {**known, **from_rig}, {**options.assumed, **assumed}
         run = _run_name(session, options.run)
         messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
+        rig = options.rig or (session.payloads(session.topics(RIG))[-1] if session is not None else None)
+        contradictions = [*_contradictions(messages, lenses, rig, run)] if rig is not None else []
+        messages += contradictions
         if session is None:
             messages = [*announce_assumed(_settings(options.rig, lenses, frames), assumed), *messages]
         last_ns = frames[-1].log_time_ns
@@ -121,7 +129,8 @@ def import_detections(
     counts = Counter(dict.fromkeys(sorted({frame.camera for frame in frames}), 0))
     for frame in frames:
         counts[frame.camera] += len(frame.markers)
-    return ImportedDetections(output or target, run, dict(counts), from_rig, assumed)
+    texts = [message.payload.text for message in contradictions]
+    return ImportedDetections(output or target, run, dict(counts), from_rig, assumed, texts)
 
 
 class _Frame(NamedTuple):
@@ -205,6 +214,19 @@ def _lenses_of_rig(
                 "calibration = FILE to this camera of the rig file"
             )
     return lenses, assumed
+
+
+def _contradictions(
+    messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], rig: Rig, run: str
+) -> Iterator[Message]:
+    """Yield an event, after the last frame, for each contradiction of markers and intrinsics."""
+    tests = {camera: IntrinsicsTest(camera, lens, rig) for camera, lens in lenses.items()}
+    topic, last_ns = RUN_EVENTS.topic_of(run), messages[-1].log_time_ns
+    for message in messages:
+        camera, kind = str(message.camera), CALIBRATION_CONTRADICTED
+        for text, marker_id in tests[camera].add(message.publish_time_ns, message.payload.markers):
+            event = Event(message.publish_time_ns, kind, text, camera, marker_id)
+            yield Message(topic, last_ns, event.timestamp, event, camera)
 
 
 def _run_name(session: Session | None, wanted: str | None) -> str:

@@ -221,13 +221,13 @@ def calibration_covariances(centres_m: Array, lens_slopes: Array) -> Array:
 
 
 def reprojection_px(
-    poses: SquarePoses, lengths_m: Array, corners_px: Array, lens: CameraCalibration
+    rotations: Array, centres_m: Array, lengths_m: Array, corners_px: Array, lens: CameraCalibration
 ) -> Array:
     """Return the RMS reprojection error: the distances between corners from poses and measured corners.
 
     Parameters
     ----------
-    poses : poses of n markers.
+    rotations, centres_m : (n, 2, 3, 3) and (n, 2, 3), both poses of n markers.
     lengths_m : (n,), sides of the black squares, in m.
     corners_px : (n, 4, 2), measured corners in the raw image.
     lens : the camera's calibration.
@@ -237,7 +237,7 @@ def reprojection_px(
     (n, 2), in px.
     """
     corners_m = marker_corners(1.0) * lengths_m[:, None, None]
-    points_m = corners_m[:, None] @ poses.rotations.swapaxes(-1, -2) + poses.centres_m[:, :, None]
+    points_m = corners_m[:, None] @ rotations.swapaxes(-1, -2) + centres_m[:, :, None]
     again_px = project(points_m.reshape(-1, 3), lens).reshape(-1, 2, 4, 2)
     misses_px2 = ((again_px - corners_px[:, None]) ** 2).sum(axis=-1)
     rms_px: Array = np.sqrt(misses_px2.mean(axis=-1))

@@ -8,8 +8,10 @@ from ipsys_log.messages.message import TimeNs
 
 __all__ = [
     "ASSUMED_MODEL",
+    "CALIBRATION_CONTRADICTED",
     "CAMERA_MOVED",
     "CONTRADICTED_HEIGHT",
+    "CONTRADICTIONS",
     "FRAME_SKIPPED",
     "MARK",
     "NODE_ANSWERS",
@@ -20,7 +22,6 @@ __all__ = [
     "SEGMENT_STARTED",
     "STAMP_UNRELIABLE",
     "TILTED_MARKER",
-    "UNFITTING_MARKERS",
     "Event",
     "Latency",
 ]
@@ -31,12 +32,15 @@ FRAME_SKIPPED = "frame_skipped"
 STAMP_UNRELIABLE = "stamp_unreliable"
 # The kind of an event for a camera whose calibration file did not state the lens model.
 ASSUMED_MODEL = "assumed_lens_model"
+# The kind of an event for a camera whose markers contradict its intrinsics, or a marker its length.
+CALIBRATION_CONTRADICTED = "calibration_contradicted"
 # The kind of an event for a camera that was knocked during a live recording.
 CAMERA_MOVED = "camera_moved"
 # The kinds of events for a marker whose corners contradict its height in the rig, and for a tilted marker
 # whose camera point assumes that it is parallel to the image.
 CONTRADICTED_HEIGHT, TILTED_MARKER = "contradicted_height", "tilted_marker"
-UNFITTING_MARKERS = frozenset((CONTRADICTED_HEIGHT, TILTED_MARKER))
+# The kinds of events for inputs that the measurements of the log contradict.
+CONTRADICTIONS = frozenset((CALIBRATION_CONTRADICTED, CONTRADICTED_HEIGHT, TILTED_MARKER))
 # The kinds of events for the first answers of the node of a camera, and for a long wait for them.
 NODE_ANSWERS, NODE_AWAITED = "node_answers", "node_awaited"
 # The kind of an event for a node whose frames are not recorded: a second one, or one of another version.

@@ -21,7 +21,7 @@ from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Run
 from ipsys_log.messages.channels import POSITIONS, RUN_EVENTS
-from ipsys_log.messages.events import UNFITTING_MARKERS
+from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.plain_text import plain_text
 from ipsys_log.runs.frame_times import channel_times
 from ipsys_log.runs.provenance import newest_run
@@ -119,7 +119,7 @@ def contents_json(session: Session) -> dict[str, Any]:
         },
         "calibration_remarks": _calibration_remarks(session),
         "channels": {topic: _channel(session, topic) for topic in topics},
-        "marker_remarks": _marker_remarks(session),
+        "contradictions": _contradictions(session),
         "overlap": overlap_json(session),
         "runs": runs_json(session),
     }
@@ -138,12 +138,12 @@ def _calibration_remarks(session: Session) -> list[dict[str, str]]:
     return [{"camera": camera, "text": text} for camera, text in remarks]
 
 
-def _marker_remarks(session: Session) -> list[dict[str, str]]:
-    """Return the events of runs about markers that contradict the rig or the method, each text once."""
+def _contradictions(session: Session) -> list[dict[str, str]]:
+    """Return the events of runs about contradicted inputs, each text once."""
     runs = {topic: run for run in session.run_names() for topic in session.topics(RUN_EVENTS, run)}
     texts: dict[str, str] = {}
     for message in session.messages(list(runs)):
-        if message.payload.kind in UNFITTING_MARKERS:
+        if message.payload.kind in CONTRADICTIONS:
             texts.setdefault(message.payload.text, runs[message.topic])
     return [{"run": run, "text": text} for text, run in texts.items()]
 
@@ -243,7 +243,7 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     files.caption_justify = "left"
     tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
     tables += [_remarks_table(found)] if found["calibration_remarks"] else []
-    tables += [_marker_remarks_table(found["marker_remarks"])] if found["marker_remarks"] else []
+    tables += [_contradictions_table(found["contradictions"])] if found["contradictions"] else []
     tables += [_overlap_table(found["overlap"])] if found["overlap"] else []
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 
@@ -266,8 +266,8 @@ def _remarks_table(found: dict[str, Any]) -> Table:
     return table
 
 
-def _marker_remarks_table(rows: list[dict[str, str]]) -> Table:
-    table = _table("Remarks on markers", "run", "remark")
+def _contradictions_table(rows: list[dict[str, str]]) -> Table:
+    table = _table("Contradicted inputs", "run", "remark")
     for row in rows:
         table.add_row(row["run"], Text(plain_text(row["text"]), style="yellow"))
     return table

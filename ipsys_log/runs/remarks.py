@@ -11,7 +11,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
 from ipsys_log.messages.channels import MARKERS, POSITIONS
-from ipsys_log.messages.events import UNFITTING_MARKERS
+from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.units import format_time
@@ -29,7 +29,7 @@ class Remarks:
         self._events: Counter[str] = Counter()
         self._first: dict[str, Message] = {}
         self._unknown: set[str] = set()
-        self._unfitting: list[Message] = []
+        self._contradictions: list[Message] = []
         self._frames = self._markers = 0
         self._located: set[str | None] = set()
         # An array takes eight bytes for each offset: a long log has millions of offsets.
@@ -52,8 +52,8 @@ class Remarks:
 
     def _note(self, message: Message) -> None:
         payload = message.payload
-        if isinstance(payload, Event) and payload.kind in UNFITTING_MARKERS:
-            self._unfitting.append(message)
+        if isinstance(payload, Event) and payload.kind in CONTRADICTIONS:
+            self._contradictions.append(message)
         elif isinstance(payload, Event):
             self._events[payload.kind] += 1
             self._first.setdefault(payload.kind, message)
@@ -83,6 +83,8 @@ class Remarks:
                 f"{', '.join(sorted(self._unknown))}: add them as [[markers]] to lab.toml, and give the "
                 "file with --rig"
             )
+        if self._contradictions and not self._markers:
+            raise IpsysError(f"no marker could be measured: {_said(self._contradictions[0])}")
         rejected = self._events["rejected_marker"]
         if rejected and not self._markers:
             raise IpsysError(
@@ -103,7 +105,7 @@ class Remarks:
             f"{count} x {kind.replace('_', ' ')}, first: {_said(self._first[kind])}"
             for kind, count in sorted(self._events.items())
         ]
-        lines += [_said(message) for message in self._unfitting]
+        lines = [*map(_said, self._contradictions), *lines]
         if MARKERS in self._task.stage.writes:
             lines.insert(0, f"{self._markers} markers in {self._frames} frames")
             lines += self._about_offsets()

@@ -18,6 +18,7 @@ from ipsys_log.messages import Event
 from ipsys_log.messages.channels import CHANNELS, EVENTS, IMAGES, RUN_EVENTS, channel_of
 from ipsys_log.messages.events import (
     ASSUMED_MODEL,
+    CALIBRATION_CONTRADICTED,
     CAMERA_MOVED,
     CONTRADICTED_HEIGHT,
     FRAME_SKIPPED,
@@ -46,6 +47,7 @@ _ADVICE = {
     ASSUMED_MODEL: "if the model is wrong, import or record again with the corrected file",
     CONTRADICTED_HEIGHT: "correct lab.toml, and give it with --rig",
     TILTED_MARKER: "run ipsys replay --method pose",
+    CALIBRATION_CONTRADICTED: "correct lab.toml, or give the file with --calibration CAMERA=calibration.yaml",
     CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
     "frames_dropped": "record on a faster disk",
     "frames_missed": "reduce the rate or the size of the images, or use another USB bus",

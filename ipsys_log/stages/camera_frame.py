@@ -188,7 +188,8 @@ def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint
     covariances_m2 = covariances_m2 + calibration_covariances(
         squares.centres_m[:, 0], lens_slopes.mean(axis=1)
     )
-    misses_px = reprojection_px(squares, lengths_m, np.stack([s.marker.corners_px for s in seen]), lens)
+    corners_px = np.stack([s.marker.corners_px for s in seen])
+    misses_px = reprojection_px(squares.rotations, squares.centres_m, lengths_m, corners_px, lens)
     points = []
     for n, (marker, _, _) in enumerate(seen):
         both = zip(squares.centres_m[n].tolist(), squares.rotations[n], misses_px[n].tolist(), strict=True)

@@ -54,7 +54,7 @@ def contents(names: tuple[str, ...]) -> dict[str, Any]:
         "duration_s": 30.0,
         "cameras": {},
         "channels": dict(sorted(channels.items())),
-        "marker_remarks": [],
+        "contradictions": [],
         "overlap": overlap,
         "runs": [],
     }

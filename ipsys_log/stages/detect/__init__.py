@@ -49,8 +49,10 @@ from ipsys_log.stages.detect.reports import (
     NO_KEYFRAME,
     REJECTED_MARKER,
     UNKNOWN_MARKER,
+    LensInUse,
     OtherSize,
     Reports,
+    SeenSquares,
 )
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
 from ipsys_log.units import NS_PER_S
@@ -108,6 +110,7 @@ class FrameDetector:
         self._following: dict[str | None, MarkerTracker] = {}
         self._reset_numbers: dict[str | None, int] = {}
         self._videos: dict[str | None, Video] = {}
+        self._lenses_in_use: dict[str | None, LensInUse] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
@@ -126,6 +129,7 @@ class FrameDetector:
             with suppress(FrameError):
                 self._video(message.camera, payload.frame).skip(payload.frame)
         elif isinstance(payload, Markers):
+            yield from self._new_lens(message)
             yield payload
         elif not isinstance(payload, Event):  # events only tell which frames a replay ``as_live`` skips
             yield from self._frame(message)
@@ -153,6 +157,8 @@ class FrameDetector:
             return
         markers, events = _sift(markers_in_frame, self._rig, message)
         yield from events
+        yield from self._new_lens(message)
+        yield from self._squares(message, self._rig)
         yield from self._rejections(message, self._rig)
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
@@ -172,6 +178,7 @@ class FrameDetector:
     def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], int, int]:
         """Return the markers in a frame, and its width and height."""
         camera = rig.camera(str(message.camera))
+        self._reset(message)
         if self._corners == STOCK:
             grey = decode_grey(message.payload)
             height, width = grey.shape
@@ -179,7 +186,6 @@ class FrameDetector:
                 check_size(self._lenses[message.camera], width, height, message.camera)
             markers = detect_markers(grey, rig.dictionary)
         else:
-            self._reset(message)
             if message.camera not in self._following:
                 self._following[message.camera] = self._follow(message, rig, camera)
             fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
@@ -193,6 +199,7 @@ class FrameDetector:
         number = self._resets.number(str(message.camera), message.log_time_ns)
         if self._reset_numbers.get(message.camera) != number:
             self._following.pop(message.camera, None)
+            self._lenses_in_use.pop(message.camera, None)
             self._reset_numbers[message.camera] = number
 
     def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> MarkerTracker:
@@ -208,6 +215,23 @@ class FrameDetector:
             *(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera),
             is_thorough=self._resets is not None,
         )
+
+    def _new_lens(self, message: Message) -> Iterator[LensInUse]:
+        """Yield the intrinsics and the rig of a frame, if they are new since the last reset."""
+        lens, used = self._lenses.get(message.camera), self._lenses_in_use.get(message.camera)
+        if lens is None or self._rig is None:
+            return
+        if used is None or used.lens is not lens or used.rig is not self._rig:
+            self._lenses_in_use[message.camera] = LensInUse(lens, self._rig)
+            yield self._lenses_in_use[message.camera]
+
+    def _squares(self, message: Message, rig: Rig) -> Iterator[SeenSquares]:
+        """Yield the raw corners of new markers of the rig."""
+        following = self._following.get(message.camera)
+        squares = [s for s in following.squares if rig.knows(s.id)] if following is not None else []
+        if squares:
+            corners_px = np.concatenate([square.corners_px.ravel() for square in squares])
+            yield SeenSquares(tuple(square.id for square in squares), tuple(corners_px.tolist()))
 
     def _rejections(self, message: Message, rig: Rig) -> Iterator[Event]:
         """Yield events for markers that are seen and cannot be measured."""
@@ -330,7 +354,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
         parameters={"corners": corners, **period, **({"as_live": "yes"} if as_live else {})},
         reads=(
             RIG,
-            *([CALIBRATIONS] if corners == EDGES else []),
+            *([CALIBRATIONS] if view.lenses else []),
             *([EVENTS] if as_live else []),
             *([MARKERS] if view.run(MARKERS) else []),
             IMAGES,
@@ -363,8 +387,8 @@ def _resets(options: Mapping[str, str]) -> Resets:
 
 def _pieces(parameters: Mapping[str, str]) -> Pieces:
     """Return how the frames of a camera between two resets are processed alone."""
-    resets = _resets(parameters)
-    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports, (OtherSize,))
+    resets, interim = _resets(parameters), (OtherSize, LensInUse, SeenSquares)
+    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports, interim)
 
 
 def _why_stock(camera: str) -> str:
@@ -401,7 +425,7 @@ def _has_video(view: StageView) -> bool:
 
 STAGE = Stage(
     name="detect",
-    versions={"detect": 2, EDGES: 1, STOCK: 1},
+    versions={"detect": 3, EDGES: 1, STOCK: 1},
     reads=(RIG, CALIBRATIONS, IMAGES, EVENTS, MARKERS),
     writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
     plan=_plan,

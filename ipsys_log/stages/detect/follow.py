@@ -94,6 +94,13 @@ class MarkerTracker:
         self._blurs_px: list[float] = []
         self._tracks: list[Track] = []
         self._rejections: list[Rejection] = []
+        self._candidates: list[Candidate] = []
+
+    @property
+    def squares(self) -> list[Candidate]:
+        """Return the new markers of the last frame with their raw corners, measured or not."""
+        ids = {track[0].pose.id for track in self._tracks} | {rejection.id for rejection in self._rejections}
+        return [candidate for candidate in self._candidates if candidate.id in ids]
 
     @property
     def rejections(self) -> list[Rejection]:
@@ -123,7 +130,7 @@ class MarkerTracker:
         fresh = self._last_ns is None or not 0 < (time_ns - self._last_ns) / NS_PER_S < LONG_S
         due = turn % _SEARCH_EVERY == 0 or fresh
         thorough = turn % _THOROUGH_EVERY == _SEARCH_EVERY or (self._is_thorough and self._last_ns is None)
-        self._rejections = []
+        self._rejections, self._candidates = [], []
         grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
         # A frame that cannot be decoded raises an error before this line: the next frame takes its turn.
         self._frames, self._last_ns = turn + 1, time_ns
@@ -269,6 +276,7 @@ class MarkerTracker:
         ]
         if not new_candidates:
             return fits
+        self._candidates += new_candidates
         upright, other = self._guess(new_candidates)
         new_fits = self._fit(grey, upright)
         # If the upright pose, usual for markers on robots, has a small spread, the other pose is not tried.

@@ -6,10 +6,23 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ipsys_log.errors import SizeError
-from ipsys_log.messages import Event, Markers
+import numpy as np
 
-__all__ = ["NO_KEYFRAME", "REJECTED_MARKER", "UNKNOWN_MARKER", "OtherSize", "Reports"]
+from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
+from ipsys_log.errors import SizeError
+from ipsys_log.geometry.lenses import same_intrinsics
+from ipsys_log.messages import CameraCalibration, Event, Marker, Markers, Rig
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
+
+__all__ = [
+    "NO_KEYFRAME",
+    "REJECTED_MARKER",
+    "UNKNOWN_MARKER",
+    "LensInUse",
+    "OtherSize",
+    "Reports",
+    "SeenSquares",
+]
 
 NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER = _ONCE = ("no_keyframe", "rejected_marker", "unknown_marker")
 
@@ -23,6 +36,26 @@ class OtherSize:
     calibrated_px: tuple[int, int]
 
 
+@dataclass(frozen=True, slots=True)
+class LensInUse:
+    """The intrinsics and the rig that hold from a frame of a camera on."""
+
+    lens: CameraCalibration
+    rig: Rig
+
+
+@dataclass(frozen=True, slots=True)
+class SeenSquares:
+    """New markers of a frame, measured or not: their ids, and raw corners x0 y0 .. x3 y3 in px of each."""
+
+    ids: tuple[int, ...]
+    corners_px: tuple[float, ...]
+
+    def markers(self) -> list[Marker]:
+        corners = np.array(self.corners_px).reshape(-1, 4, 2)
+        return [Marker(*row) for row in zip(self.ids, corners, strict=True)]
+
+
 class Reports:
     """The memory of detection that no reset clears: the events that the log already has.
 
@@ -34,6 +67,7 @@ class Reports:
     def __init__(self) -> None:
         self._said: set[tuple[str | None, str, int | None, str]] = set()
         self._fitted: set[tuple[str | None, tuple[int, int]]] = set()
+        self._tests: dict[str | None, IntrinsicsTest] = {}
 
     def __call__(self, camera: str | None, payloads: Iterable[Any]) -> Iterator[Any]:
         """Yield the payloads of a frame that go into the log.
@@ -43,6 +77,7 @@ class Reports:
         SizeError
             The first frame of a camera has another size than its calibration.
         """
+        squares: SeenSquares | None = None
         for payload in payloads:
             if isinstance(payload, OtherSize):
                 # Without this error, a camera whose frames never fit would give no results at all.
@@ -50,10 +85,31 @@ class Reports:
                     raise SizeError(payload.error)
                 yield payload.event
                 continue
+            if isinstance(payload, LensInUse):
+                self._begin_test(str(camera), payload)
+                continue
+            if isinstance(payload, SeenSquares):
+                squares = payload
+                continue
             if isinstance(payload, Markers):
                 self._fitted.add((camera, (payload.width, payload.height)))
+                yield from self._test(camera, payload, squares)
             if not isinstance(payload, Event) or self._is_new(payload):
                 yield payload
+
+    def _begin_test(self, camera: str, used: LensInUse) -> None:
+        test = self._tests.get(camera)
+        if test is None or not same_intrinsics(test.lens, used.lens) or test.rig != used.rig:
+            self._tests[camera] = IntrinsicsTest(camera, used.lens, used.rig)
+
+    def _test(self, camera: str | None, frame: Markers, squares: SeenSquares | None) -> Iterator[Event]:
+        """Yield an event for each contradiction between the intrinsics of a camera and its markers."""
+        test = self._tests.get(camera)
+        if test is None:
+            return
+        contradictions = [] if squares is None else [*test.add_squares(squares.markers())]
+        for text, marker_id in (*contradictions, *test.add(frame.timestamp, frame.markers)):
+            yield Event(frame.timestamp, CALIBRATION_CONTRADICTED, text, camera, marker_id)
 
     def _is_new(self, event: Event) -> bool:
         said = event.camera, event.kind, event.marker_id, event.text

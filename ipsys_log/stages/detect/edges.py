@@ -28,10 +28,12 @@ from ipsys_log.stages.detect.adjustment import (
     outline,
     poses_of,
     prior,
+    sample_cells,
     solve,
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
 from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, MarkerView, Poses, measure
+from ipsys_log.stages.detect.uneven_light import count_contradictions
 
 __all__ = ["Guess", "MarkerFit", "fit_edges"]
 
@@ -97,7 +99,11 @@ def fit_edges(
     )
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
     colours = _bright_and_dark(view.prints, levels)
-    good = settled.good & inside_image(corners_px, grey) & _same_cells(view.prints, levels, colours)
+    wrong = _count_wrong(view.prints, levels, colours)
+    good = settled.good & inside_image(corners_px, grey) & (wrong <= _WRONG_CELLS)
+    for n in np.flatnonzero(good & (wrong > 0)).tolist():
+        pose = Guess(guesses[n].id, settled.poses.rotations[n], settled.poses.centres[n])
+        good[n] = not count_contradictions(sample_cells(view, pose), dictionary, pose.id)
     uneven = _uneven(view.prints, settled, colours)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
@@ -260,11 +266,11 @@ def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
     return bright, dark
 
 
-def _same_cells(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """Return a mask (m,) of the markers whose cells have the right colours, from grey levels (m, c)."""
+def _count_wrong(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.int_]:
+    """Return the number (m,) of cells with the wrong colour, from grey levels (m, c)."""
     bright, dark = colours
-    wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
-    return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
+    wrong = (levels > ((bright + dark) / 2)[:, None]) != prints.white
+    return np.count_nonzero(wrong, axis=1) + wrong.shape[1] * (bright - dark <= LEAST_CONTRAST)
 
 
 def _uneven(prints: Prints, settled: _Settled, colours: tuple[Array, Array]) -> NDArray[np.bool_]:

@@ -25,6 +25,7 @@ from ipsys_log.stages.detect.adjustment import (
     outline,
     poses_of,
     prior,
+    sample_cells,
     solve,
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
@@ -33,6 +34,7 @@ from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
     compare_pattern,
+    count_contradictions,
     exact_steps,
     masked_median,
     rough_steps,
@@ -175,7 +177,7 @@ class _PartialFit:
         self._guesses, self._id = guesses, guesses[0].id
         self._unknowns = 9 if row_time_s else 7
         self._edge_offset_px = edge_offset_px
-        self._first = _ROUGH - 1 if near else 0
+        self._near, self._first = near, _ROUGH - 1 if near else 0
         prints = build_prints(dictionary, (self._id,))
         self._sides = (prints.by_side[0] > 0).T
         self._real = prints.polarity[0] != 0
@@ -265,8 +267,12 @@ class _PartialFit:
         agreement = compare_pattern(levels[0], self._dictionary, self._id)
         if not inside_image(corners_px, self._grey)[0] or not agreement.likely:
             return None
+        hider = _hider(levels[0], view.prints)
+        pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
+        if count_contradictions(sample_cells(view, pose), self._dictionary, self._id):
+            # Only a marker that was here can be covered by black or white: elsewhere it is another print.
+            return Rejection(self._id, f"{hider} hides some of its cells") if self._near else None
         if not agreement.clear:
-            hider = _hider(levels[0], view.prints)
             return Rejection(self._id, f"{hider} hides too many of its cells")
         cell_px = _width_px(corners_px[0]) / view.prints.cells
         if cell_px < _LEAST_CELL_PX:
@@ -277,11 +283,10 @@ class _PartialFit:
         lost = sum(share < _SEEN for share in seen)
         if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
             hidden_part = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
-            return Rejection(self._id, f"{_hider(levels[0], view.prints)} hides {hidden_part}")
+            return Rejection(self._id, f"{hider} hides {hidden_part}")
         covariance_px2 = self._covariance(solved, n, slopes[0])
         if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
             return Rejection(self._id, "its edges are too disturbed to fit a flat square")
-        pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
         spread_px = float(np.sqrt(solved.variance_px2(n)))
         offset_px = float(solved.unknowns[n, 6])
         return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)

@@ -22,10 +22,12 @@ from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import BLURS_PX, LEAST_CONTRAST
 
 __all__ = [
+    "CELL_SAMPLES",
     "TAPS",
     "Agreement",
     "Steps",
     "compare_pattern",
+    "count_contradictions",
     "exact_steps",
     "masked_median",
     "rough_steps",
@@ -37,6 +39,14 @@ Array = NDArray[np.float64]
 # Cells differ if their levels differ by this share of the print's contrast.
 _DIFFERENT = 0.25
 _AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
+# A cell has the level of the print's black or white within this share of the contrast, at its middle and
+# around it (test_one_cell_of_the_other_colour_is_no_marker, test_edges_in_uneven_light_find_as_many_as_stock).
+_AS_PRINTED, _AS_PRINTED_AROUND = 0.15, 0.3
+# Width in cells of the window whose darkest and brightest cells decide a colour. In windows with less than
+# this share of the marker's contrast, all cells have one colour. Sigma in cells of the levels around a cell.
+_WINDOW_CELLS, _PLAIN, _NEAR_CELLS = 5, 0.4, 1.5
+# Positions of the samples of a cell, in cells from its middle.
+CELL_SAMPLES = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [-0.25, -0.25], [0.25, -0.25]])
 
 
 class Agreement(NamedTuple):
@@ -86,6 +96,56 @@ def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement
     own = float(agreements[4 * marker_id])
     agreements[4 * marker_id] = -1.0
     return Agreement(own, float(agreements.max()))
+
+
+def count_contradictions(samples: Array, dictionary: str, marker_id: int) -> int:
+    """Return the number of cells that clearly have the opposite colour of those of a marker.
+
+    Such a cell has everywhere the level of the black or the white around it, and so have the cells beside it.
+    Otherwise it may be covered, in glare or at the border of a shadow, and says nothing about the print.
+
+    Parameters
+    ----------
+    samples : (5, c), grey levels of the cells, black border included, row after row: at the middle of a cell,
+        and around it.
+    dictionary, marker_id : as for :func:`compare_pattern`.
+    """
+    levels = samples[0]
+    cells = round(len(levels) ** 0.5)
+    white = white_cells(dictionary, marker_id).ravel()
+    middle, contrast = _between(levels, cells)
+    seen_white = levels > middle
+    if contrast < LEAST_CONTRAST or (seen_white == white).all():
+        return 0
+    near = _nearness(cells)
+    light, dark = (
+        near @ (levels * right) / np.maximum(near @ right, 1e-9)
+        for right in (white & seen_white, ~white & ~seen_white)
+    )
+    off = np.abs((samples - dark) / np.maximum(light - dark, LEAST_CONTRAST) - seen_white)
+    odd = (off[0] > _AS_PRINTED).reshape(cells, cells).astype(np.uint8)
+    beside = cv2.dilate(odd, np.ones((3, 3), dtype=np.uint8)).ravel() > 0
+    clear = ~beside & (off[1:].max(axis=0) < _AS_PRINTED_AROUND)
+    return int(np.count_nonzero(clear & (seen_white != white)))
+
+
+def _between(levels: Array, cells: int) -> tuple[Array, float]:
+    """Return for each cell (c,) the level between the black and the white around it, and the contrast."""
+    square = levels.reshape(cells, cells).astype(np.float32)
+    window = np.ones((_WINDOW_CELLS, _WINDOW_CELLS), dtype=np.uint8)
+    low, high = cv2.erode(square, window).ravel(), cv2.dilate(square, window).ravel()
+    contrast = float(levels.max() - levels.min())
+    is_plain = high - low < _PLAIN * contrast
+    middle = np.where(is_plain, (levels.max() + levels.min()) / 2, (low + high) / 2)
+    return np.asarray(middle, dtype=np.float64), contrast
+
+
+@cache
+def _nearness(cells: int) -> Array:
+    """Return the weights (c, c) of cells in the levels around each cell. Far cells count if no others do."""
+    row, column = np.divmod(np.arange(cells * cells), cells)
+    squared = (row[:, None] - row) ** 2 + (column[:, None] - column) ** 2
+    return np.asarray(np.exp(-squared / (2 * _NEAR_CELLS**2)) + 1e-3)
 
 
 def _neighbours(cells: Array) -> Array:

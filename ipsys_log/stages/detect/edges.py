@@ -46,7 +46,9 @@ _SETTLED_PX = 0.12
 _SHORT_PX = 8.0
 # Motion blurs edges that rise by less than this share of the step from black to white.
 _BLURRED = 0.6
-_SEEN = 0.6
+# Least share of visible edges: of all, and of those between cells. Prints with smaller cells, such as those
+# of another dictionary, show a third of the latter at most (test_prints_of_another_kind_are_named).
+_SEEN, _SEEN_INSIDE = 0.6, 0.5
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
 # Signs of glare, a shadow or a cover. First sign: a side is displaced by _SIDE_OFF times the edges' spread.
@@ -236,7 +238,8 @@ def _settle(
     variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
-    good = enough & (moved_px < _SETTLED_PX)
+    inside = ((seen.certainty > 0)[:, None] @ view.prints.inner)[:, 0, 0] > _SEEN_INSIDE
+    good = enough & inside & (moved_px < _SETTLED_PX)
     sided = (left_px * view.prints.polarity * (seen.certainty > 0))[:, None] @ view.prints.by_side
     return _Settled(
         poses,
@@ -270,7 +273,8 @@ def _count_wrong(prints: Prints, levels: Array, colours: tuple[Array, Array]) ->
     """Return the number (m,) of cells with the wrong colour, from grey levels (m, c)."""
     bright, dark = colours
     wrong = (levels > ((bright + dark) / 2)[:, None]) != prints.white
-    return np.count_nonzero(wrong, axis=1) + wrong.shape[1] * (bright - dark <= LEAST_CONTRAST)
+    no_print = bright - dark <= LEAST_CONTRAST
+    return np.asarray(np.count_nonzero(wrong, axis=1) + wrong.shape[1] * no_print)
 
 
 def _uneven(prints: Prints, settled: _Settled, colours: tuple[Array, Array]) -> NDArray[np.bool_]:

@@ -63,6 +63,8 @@ _CHEAPER, _ALIKE_POSES = 0.03, 0.06
 # Least share of visible edges of a side, and of all edges together; and their largest cost.
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
+# Least share of clear edges between cells: other prints show a third at most, markers in glare four fifths.
+_CLEAR_INSIDE = 0.5
 # In cells narrower than this, edges disturb one another.
 _LEAST_CELL_PX = 2.2
 # Factor for covariances: errors of neighbouring edges are correlated, but least squares assumes that they
@@ -267,29 +269,37 @@ class _PartialFit:
         agreement = compare_pattern(levels[0], self._dictionary, self._id)
         if not inside_image(corners_px, self._grey)[0] or not agreement.likely:
             return None
-        hider = _hider(levels[0], view.prints)
         pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
-        if count_contradictions(sample_cells(view, pose), self._dictionary, self._id):
-            # Only a marker that was here can be covered by black or white: elsewhere it is another print.
-            return Rejection(self._id, f"{hider} hides some of its cells") if self._near else None
-        if not agreement.clear:
-            return Rejection(self._id, f"{hider} hides too many of its cells")
-        cell_px = _width_px(corners_px[0]) / view.prints.cells
-        if cell_px < _LEAST_CELL_PX:
+        is_other_print = count_contradictions(sample_cells(view, pose), self._dictionary, self._id) > 0
+        if agreement.clear and solved.clear[n] @ view.prints.inner[0, :, 0] < _CLEAR_INSIDE:
+            is_other_print = True
+        if is_other_print and not self._near:
+            return None  # only a marker that was here can be covered by black or white
+        covariance_px2 = self._covariance(solved, n, slopes[0])
+        hider = _hider(levels[0], view.prints)
+        if is_other_print:
+            reason = f"{hider} hides some of its cells"
+        elif not agreement.clear:
+            reason = f"{hider} hides too many of its cells"
+        elif _width_px(corners_px[0]) / view.prints.cells < _LEAST_CELL_PX:
             reason = f"its cells are under {_LEAST_CELL_PX} px wide, and some of its edges are disturbed"
-            return Rejection(self._id, reason)
-        weights = solved.weights[n]
+        elif hidden_part := self._hidden_part(solved.weights[n]):
+            reason = f"{hider} hides {hidden_part}"
+        elif solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
+            reason = "its edges are too disturbed to fit a flat square"
+        else:
+            spread_px = float(np.sqrt(solved.variance_px2(n)))
+            offset_px = float(solved.unknowns[n, 6])
+            return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        return Rejection(self._id, reason)
+
+    def _hidden_part(self, weights: Array) -> str:
+        """Return the part of the edges that is hidden, if it is too large to fit the marker; else ""."""
         seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
         lost = sum(share < _SEEN for share in seen)
-        if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
-            hidden_part = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
-            return Rejection(self._id, f"{hider} hides {hidden_part}")
-        covariance_px2 = self._covariance(solved, n, slopes[0])
-        if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
-            return Rejection(self._id, "its edges are too disturbed to fit a flat square")
-        spread_px = float(np.sqrt(solved.variance_px2(n)))
-        offset_px = float(solved.unknowns[n, 6])
-        return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        if lost > 1:
+            return f"{lost} of its 4 sides"
+        return "most of its edges" if weights.sum() < _SEEN_OF_ALL * self._real.sum() else ""
 
     def _choose(self, state: _State, solved: _Solved) -> int:
         """Return the hypothesis with all sides, or the hypothesis without a completely disturbed side."""

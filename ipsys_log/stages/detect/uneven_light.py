@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 _DIFFERENT = 0.25
 _AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
 # A cell has the level of the print's black or white within this share of the contrast, at its middle and
-# around it (test_one_cell_of_the_other_colour_is_no_marker, test_edges_in_uneven_light_find_as_many_as_stock).
+# around it. With 0.2 and 0.35, glare counts as white (test_edges_in_uneven_light_are_exact_at_full_size).
 _AS_PRINTED, _AS_PRINTED_AROUND = 0.15, 0.3
 # Width in cells of the window whose darkest and brightest cells decide a colour. In windows with less than
 # this share of the marker's contrast, all cells have one colour. Sigma in cells of the levels around a cell.

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,12 +31,14 @@ from ipsys_log.stages.detect.adjustment import (
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
 from ipsys_log.stages.detect.profiles import EdgePositions, MarkerView, Poses, locate, read_profiles
+from ipsys_log.stages.detect.search import count_wrong_cells
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
     compare_pattern,
     count_contradictions,
     exact_steps,
+    has_clear_cells,
     masked_median,
     rough_steps,
     usual_blur,
@@ -65,6 +68,12 @@ _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
 # Least share of clear edges between cells: other prints show a third at most, markers in glare four fifths.
 _CLEAR_INSIDE = 0.5
+# Prints that are no flat squares: least share of clear edges at the sides, which a wider border lacks; and
+# largest distance of corners from the square, and least sigma, in px
+# (test_edges_find_as_many_photographs_as_stock).
+_CLEAR_SIDES = 0.3
+_FARTHEST_CORNER_PX, _CORNER_SIGMA_PX = 8, 0.3
+_REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
 # In cells narrower than this, edges disturb one another.
 _LEAST_CELL_PX = 2.2
 # Factor for covariances: errors of neighbouring edges are correlated, but least squares assumes that they
@@ -182,7 +191,7 @@ class _PartialFit:
         self._near, self._first = near, _ROUGH - 1 if near else 0
         prints = build_prints(dictionary, (self._id,))
         self._sides = (prints.by_side[0] > 0).T
-        self._real = prints.polarity[0] != 0
+        self._real, self._cells = prints.polarity[0] != 0, prints.cells
 
     def settle(self) -> tuple[_State, _Solved]:
         """Return the five hypotheses of the better pose, and the residuals of each."""
@@ -270,7 +279,8 @@ class _PartialFit:
         if not inside_image(corners_px, self._grey)[0] or not agreement.likely:
             return None
         pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
-        is_other_print = count_contradictions(sample_cells(view, pose), self._dictionary, self._id) > 0
+        samples = sample_cells(view, pose)
+        is_other_print = count_contradictions(samples, self._dictionary, self._id) > 0
         if agreement.clear and solved.clear[n] @ view.prints.inner[0, :, 0] < _CLEAR_INSIDE:
             is_other_print = True
         if is_other_print and not self._near:
@@ -291,7 +301,28 @@ class _PartialFit:
             spread_px = float(np.sqrt(solved.variance_px2(n)))
             offset_px = float(solved.unknowns[n, 6])
             return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        has_sides = (solved.clear[n] @ view.prints.by_side[0]).mean() > _CLEAR_SIDES
+        if agreement.clear and has_sides and has_clear_cells(samples, self._dictionary, self._id):
+            return self._fit_corners(pose, corners_px[0], solved, n) or Rejection(self._id, reason)
         return Rejection(self._id, reason)
+
+    def _fit_corners(self, pose: Guess, outline_px: Array, solved: _Solved, n: int) -> MarkerFit | None:
+        """Return a marker with the corners in the image, if nothing hides the print but it is no flat square.
+
+        Bent paper and wrong intrinsics have this effect. The covariance contains the distance from a square.
+        """
+        window_px = max(3, min(round(_width_px(outline_px) / (3 * self._cells)), _FARTHEST_CORNER_PX))
+        corners_px = outline_px
+        for reach_px in (window_px, 3):
+            start = corners_px.astype(np.float32).reshape(-1, 1, 2)
+            refined = cv2.cornerSubPix(self._grey, start, (reach_px, reach_px), (-1, -1), _REFINE)
+            corners_px = refined.reshape(4, 2).astype(np.float64)
+        off_px = float(np.sqrt(np.square(corners_px - outline_px).sum(axis=1).mean()))
+        if off_px > window_px or count_wrong_cells(self._grey, self._id, corners_px, self._dictionary):
+            return None
+        covariance_px2 = np.eye(8) * max(off_px, _CORNER_SIGMA_PX) ** 2
+        offset_px = float(solved.unknowns[n, 6])
+        return MarkerFit(pose, corners_px, covariance_px2, offset_px, off_px, solved.blur_px, True)
 
     def _hidden_part(self, weights: Array) -> str:
         """Return the part of the edges that is hidden, if it is too large to fit the marker; else ""."""

@@ -29,6 +29,7 @@ __all__ = [
     "compare_pattern",
     "count_contradictions",
     "exact_steps",
+    "has_clear_cells",
     "masked_median",
     "rough_steps",
     "usual_blur",
@@ -110,23 +111,45 @@ def count_contradictions(samples: Array, dictionary: str, marker_id: int) -> int
         and around it.
     dictionary, marker_id : as for :func:`compare_pattern`.
     """
+    white = white_cells(dictionary, marker_id).ravel()
+    seen_white, off = _compare_levels(samples, white)
+    if (seen_white == white).all():
+        return 0
+    cells = round(len(white) ** 0.5)
+    odd = (off[0] > _AS_PRINTED).reshape(cells, cells).astype(np.uint8)
+    beside = cv2.dilate(odd, np.ones((3, 3), dtype=np.uint8)).ravel() > 0
+    clear = ~beside & (off[1:].max(axis=0) < _AS_PRINTED_AROUND)
+    return int(np.count_nonzero(clear & (seen_white != white)))
+
+
+def has_clear_cells(samples: Array, dictionary: str, marker_id: int) -> bool:
+    """Return whether all cells clearly have the colours of a marker, in even light.
+
+    The parameters are those of :func:`count_contradictions`.
+    """
+    white = white_cells(dictionary, marker_id).ravel()
+    seen_white, off = _compare_levels(samples, white)
+    is_clear = off[0].max() < _AS_PRINTED and off[1:].max() < _AS_PRINTED_AROUND
+    return bool(is_clear and (seen_white == white).all())
+
+
+def _compare_levels(samples: Array, white: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Array]:
+    """Return the cells (c,) that look white, and the distances (5, c) of samples from the level of the print.
+
+    The unit of distances is the contrast of the print around the cell.
+    """
     levels = samples[0]
     cells = round(len(levels) ** 0.5)
-    white = white_cells(dictionary, marker_id).ravel()
     middle, contrast = _between(levels, cells)
+    if contrast < LEAST_CONTRAST:
+        return white, np.full(samples.shape, np.inf)
     seen_white = levels > middle
-    if contrast < LEAST_CONTRAST or (seen_white == white).all():
-        return 0
     near = _nearness(cells)
     light, dark = (
         near @ (levels * right) / np.maximum(near @ right, 1e-9)
         for right in (white & seen_white, ~white & ~seen_white)
     )
-    off = np.abs((samples - dark) / np.maximum(light - dark, LEAST_CONTRAST) - seen_white)
-    odd = (off[0] > _AS_PRINTED).reshape(cells, cells).astype(np.uint8)
-    beside = cv2.dilate(odd, np.ones((3, 3), dtype=np.uint8)).ravel() > 0
-    clear = ~beside & (off[1:].max(axis=0) < _AS_PRINTED_AROUND)
-    return int(np.count_nonzero(clear & (seen_white != white)))
+    return seen_white, np.abs((samples - dark) / np.maximum(light - dark, LEAST_CONTRAST) - seen_white)
 
 
 def _between(levels: Array, cells: int) -> tuple[Array, float]:

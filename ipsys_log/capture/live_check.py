@@ -14,7 +14,8 @@ from ipsys_log.errors import FrameError
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
 from ipsys_log.stages.detect import decode_grey
-from ipsys_log.stages.detect.search import search
+from ipsys_log.stages.detect.misprints import find_misprints
+from ipsys_log.stages.detect.search import count_wrong_cells, search
 
 __all__ = ["CameraMonitor", "FrameCheck"]
 
@@ -92,7 +93,10 @@ class CameraMonitor:
             grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
         except FrameError as error:
             return FrameCheck((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
-        seen = Counter(sighting.id for sighting in search(grey, self._rig.dictionary))
+        dictionary = self._rig.dictionary
+        seen = Counter(
+            n for n, px in search(grey, dictionary) if not count_wrong_cells(grey, n, px, dictionary)
+        )
         counts = {n: count for n, count in seen.items() if self._rig.knows(n)}
         unknown = tuple(sorted(set(seen) - set(counts)))
         small = grey[::_SHRINK, ::_SHRINK]
@@ -105,7 +109,10 @@ class CameraMonitor:
             warnings.append("the image is dark or empty: check that the lens is not covered")
         elif sharpness < _BLURRED:
             warnings.append("the image is blurred: add light, or set a fixed exposure_s in lab.toml")
-        if unknown:
+        misprints = None if counts else find_misprints(grey, dictionary, [])
+        if misprints is not None:
+            warnings.append(misprints.advice)
+        elif unknown:
             warnings.append(_unknown(unknown))
         return FrameCheck(tuple(sorted(counts)), unknown, brightness, sharpness, tuple(warnings))
 

@@ -77,6 +77,11 @@ class Remarks:
         if corrupt and not self._frames:
             first = _said(self._first["corrupt_frame"])
             raise IpsysError(f"none of {corrupt} frames can be decoded, first: {first}")
+        for kind in ("mirrored_camera", "other_prints"):
+            if self._events[kind] and not self._markers:
+                raise IpsysError(
+                    f"no marker could be read in {self._frames} frames: {_said(self._first[kind])}"
+                )
         if self._unknown and not self._markers:
             raise IpsysError(
                 "no frame has a marker of the rig, but the frames have ids "

@@ -59,7 +59,7 @@ def test_exact_corners_give_the_exact_pose(model: str) -> None:
     np.testing.assert_allclose(found.centres_m[:, 0], centres_m, atol=3e-6)
     assert np.median(np.abs(found.centres_m[:, 0] - centres_m)) < 1e-11
     np.testing.assert_allclose(found.rotations[:, 0], axes, atol=1e-4)
-    misses_px = reprojection_px(found, np.full(100, LENGTH_M), seen_px, lens)
+    misses_px = reprojection_px(found.rotations, found.centres_m, np.full(100, LENGTH_M), seen_px, lens)
     assert misses_px[:, 0].max() < 1e-3
 
 

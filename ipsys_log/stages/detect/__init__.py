@@ -45,11 +45,13 @@ from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.stage import Pieces, Plan, Stage, StageView
 from ipsys_log.stages.detect.edges import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
+from ipsys_log.stages.detect.misprints import Inspection, Misprints
 from ipsys_log.stages.detect.reports import (
     NO_KEYFRAME,
     REJECTED_MARKER,
     UNKNOWN_MARKER,
     LensInUse,
+    OtherPrints,
     OtherSize,
     Reports,
     SeenSquares,
@@ -86,7 +88,8 @@ class FrameDetector:
 
     It yields for a frame its :class:`Markers` and their drawing for viewers. Markers that a node has detected
     pass unchanged. It yields an :class:`Event` for
-    a frame that cannot be decoded, and :class:`OtherSize` for a frame of another size than the calibration.
+    a frame that cannot be decoded, :class:`OtherSize` for a frame of another size than the calibration, and
+    :class:`OtherPrints` for prints that are no markers of the rig.
     It leaves out a marker id that is seen twice in a frame or is not in the rig; an event names the id.
     Another event names a marker of the rig that is seen and cannot be measured.
 
@@ -108,6 +111,7 @@ class FrameDetector:
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
         self._following: dict[str | None, MarkerTracker] = {}
+        self._inspections: dict[str | None, Inspection] = {}
         self._reset_numbers: dict[str | None, int] = {}
         self._videos: dict[str | None, Video] = {}
         self._lenses_in_use: dict[str | None, LensInUse] = {}
@@ -147,7 +151,7 @@ class FrameDetector:
                     yield Event(message.publish_time_ns, NO_KEYFRAME, text, message.camera)
                     return
                 message = replace(message, payload=picture)
-            markers_in_frame, width, height = self._find(message, self._rig)
+            markers_in_frame, misprints, width, height = self._find(message, self._rig)
         except FrameError as error:
             text = f"{message.topic}: corrupt frame: {error}"
             yield Event(message.publish_time_ns, "corrupt_frame", text, message.camera)
@@ -159,6 +163,8 @@ class FrameDetector:
         yield from events
         yield from self._new_lens(message)
         yield from self._squares(message, self._rig)
+        if misprints is not None:
+            yield _other_prints(message, misprints, markers)
         yield from self._rejections(message, self._rig)
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
@@ -175,8 +181,8 @@ class FrameDetector:
             self._videos[camera] = Video(frame.format)
         return self._videos[camera]
 
-    def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], int, int]:
-        """Return the markers in a frame, and its width and height."""
+    def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], Misprints | None, int, int]:
+        """Return the markers in a frame, other prints, and its width and height."""
         camera = rig.camera(str(message.camera))
         self._reset(message)
         if self._corners == STOCK:
@@ -185,12 +191,15 @@ class FrameDetector:
             if message.camera in self._lenses:
                 check_size(self._lenses[message.camera], width, height, message.camera)
             markers = detect_markers(grey, rig.dictionary)
+            inspect = self._inspections.setdefault(message.camera, Inspection())
+            misprints = inspect(grey, rig.dictionary, [marker.corners_px for marker in markers])
         else:
             if message.camera not in self._following:
                 self._following[message.camera] = self._follow(message, rig, camera)
-            fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
-            markers = [_marker(fit) for fit in fits]
-        return [_timed(marker, camera) for marker in markers], width, height
+            follow = self._following[message.camera]
+            fits, width, height = follow(message.payload, message.publish_time_ns)
+            markers, misprints = [_marker(fit) for fit in fits], follow.misprints
+        return [_timed(marker, camera) for marker in markers], misprints, width, height
 
     def _reset(self, message: Message) -> None:
         """Forget the markers of a camera at the first frame after a reset."""
@@ -200,6 +209,7 @@ class FrameDetector:
         if self._reset_numbers.get(message.camera) != number:
             self._following.pop(message.camera, None)
             self._lenses_in_use.pop(message.camera, None)
+            self._inspections.pop(message.camera, None)
             self._reset_numbers[message.camera] = number
 
     def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> MarkerTracker:
@@ -306,6 +316,13 @@ def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker
     return tuple(marker for marker in found if marker.id not in left_out), events
 
 
+def _other_prints(message: Message, misprints: Misprints, markers: Iterable[Marker]) -> OtherPrints:
+    text = f"{message.topic}: {misprints.advice}"
+    event = Event(message.publish_time_ns, misprints.kind, text, message.camera)
+    own = tuple(marker.id for marker in markers)
+    return OtherPrints(event, misprints.ids, own, misprints.symmetric)
+
+
 def _drawing(time_ns: int, markers: tuple[Marker, ...]) -> ImageAnnotations:
     """Return outlines and ids for viewers.
 
@@ -387,7 +404,7 @@ def _resets(options: Mapping[str, str]) -> Resets:
 
 def _pieces(parameters: Mapping[str, str]) -> Pieces:
     """Return how the frames of a camera between two resets are processed alone."""
-    resets, interim = _resets(parameters), (OtherSize, LensInUse, SeenSquares)
+    resets, interim = _resets(parameters), (OtherSize, OtherPrints, LensInUse, SeenSquares)
     return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports, interim)
 
 
@@ -425,7 +442,7 @@ def _has_video(view: StageView) -> bool:
 
 STAGE = Stage(
     name="detect",
-    versions={"detect": 3, EDGES: 1, STOCK: 1},
+    versions={"detect": 3, EDGES: 2, STOCK: 2},
     reads=(RIG, CALIBRATIONS, IMAGES, EVENTS, MARKERS),
     writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
     plan=_plan,

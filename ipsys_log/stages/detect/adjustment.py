@@ -18,8 +18,19 @@ from ipsys_log.geometry.lenses import project
 from ipsys_log.images.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import MarkerView, Poses
+from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES
 
-__all__ = ["Guess", "MarkerFit", "edge_derivatives", "inside_image", "outline", "poses_of", "prior", "solve"]
+__all__ = [
+    "Guess",
+    "MarkerFit",
+    "edge_derivatives",
+    "inside_image",
+    "outline",
+    "poses_of",
+    "prior",
+    "sample_cells",
+    "solve",
+]
 
 Array = NDArray[np.float64]
 
@@ -138,6 +149,16 @@ def outline(view: MarkerView, poses: Poses) -> tuple[Array, Array, Array]:
     inplane[..., 3], inplane[..., 4] = aside * y[:, None], aside * -x[:, None]
     levels = levels_at(view.grey, *np.ascontiguousarray(px[:, 12:].transpose(2, 0, 1), dtype=np.float32))
     return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), levels
+
+
+def sample_cells(view: MarkerView, pose: Guess) -> Array:
+    """Return grey levels of the cells of one marker, (5, c): at the middle of each cell and around it."""
+    prints = view.prints
+    middles = prints.outline[12:]
+    points = (middles + CELL_SAMPLES[:, None] / prints.cells).reshape(1, -1, 2)
+    px = project(poses_of([pose]).into_camera(points).reshape(-1, 3), view.lens)
+    levels = levels_at(view.grey, *np.ascontiguousarray(px.T, dtype=np.float32))
+    return np.asarray(levels, dtype=np.float64).reshape(len(CELL_SAMPLES), -1)
 
 
 def inside_image(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:

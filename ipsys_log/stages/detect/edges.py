@@ -28,10 +28,12 @@ from ipsys_log.stages.detect.adjustment import (
     outline,
     poses_of,
     prior,
+    sample_cells,
     solve,
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
 from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, MarkerView, Poses, measure
+from ipsys_log.stages.detect.uneven_light import count_contradictions
 
 __all__ = ["Guess", "MarkerFit", "fit_edges"]
 
@@ -44,7 +46,9 @@ _SETTLED_PX = 0.12
 _SHORT_PX = 8.0
 # Motion blurs edges that rise by less than this share of the step from black to white.
 _BLURRED = 0.6
-_SEEN = 0.6
+# Least share of visible edges: of all, and of those between cells. Prints with smaller cells, such as those
+# of another dictionary, show a third of the latter at most (test_prints_of_another_kind_are_named).
+_SEEN, _SEEN_INSIDE = 0.6, 0.5
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
 # Signs of glare, a shadow or a cover. First sign: a side is displaced by _SIDE_OFF times the edges' spread.
@@ -97,7 +101,11 @@ def fit_edges(
     )
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
     colours = _bright_and_dark(view.prints, levels)
-    good = settled.good & inside_image(corners_px, grey) & _same_cells(view.prints, levels, colours)
+    wrong = _count_wrong(view.prints, levels, colours)
+    good = settled.good & inside_image(corners_px, grey) & (wrong <= _WRONG_CELLS)
+    for n in np.flatnonzero(good & (wrong > 0)).tolist():
+        pose = Guess(guesses[n].id, settled.poses.rotations[n], settled.poses.centres[n])
+        good[n] = not count_contradictions(sample_cells(view, pose), dictionary, pose.id)
     uneven = _uneven(view.prints, settled, colours)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
@@ -230,7 +238,8 @@ def _settle(
     variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
-    good = enough & (moved_px < _SETTLED_PX)
+    inside = ((seen.certainty > 0)[:, None] @ view.prints.inner)[:, 0, 0] > _SEEN_INSIDE
+    good = enough & inside & (moved_px < _SETTLED_PX)
     sided = (left_px * view.prints.polarity * (seen.certainty > 0))[:, None] @ view.prints.by_side
     return _Settled(
         poses,
@@ -260,11 +269,12 @@ def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
     return bright, dark
 
 
-def _same_cells(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """Return a mask (m,) of the markers whose cells have the right colours, from grey levels (m, c)."""
+def _count_wrong(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.int_]:
+    """Return the number (m,) of cells with the wrong colour, from grey levels (m, c)."""
     bright, dark = colours
-    wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
-    return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
+    wrong = (levels > ((bright + dark) / 2)[:, None]) != prints.white
+    no_print = bright - dark <= LEAST_CONTRAST
+    return np.asarray(np.count_nonzero(wrong, axis=1) + wrong.shape[1] * no_print)
 
 
 def _uneven(prints: Prints, settled: _Settled, colours: tuple[Array, Array]) -> NDArray[np.bool_]:

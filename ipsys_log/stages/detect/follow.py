@@ -14,6 +14,7 @@ from ipsys_log.images.decode import Grey, decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.changes import ChangeDetector
 from ipsys_log.stages.detect.edges import Guess, MarkerFit, fit_edges
+from ipsys_log.stages.detect.misprints import Inspection, Misprints
 from ipsys_log.stages.detect.motion import LONG_S, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.partial import Rejection, fit_visible_edges, resembles
 from ipsys_log.stages.detect.search import (
@@ -95,6 +96,9 @@ class MarkerTracker:
         self._tracks: list[Track] = []
         self._rejections: list[Rejection] = []
         self._candidates: list[Candidate] = []
+        self._inspect = Inspection()
+        # The prints in the last frame that are no markers of the rig, if it was inspected.
+        self.misprints: Misprints | None = None
 
     @property
     def squares(self) -> list[Candidate]:
@@ -152,6 +156,9 @@ class MarkerTracker:
         elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
             # A new object without a detected marker may be a marker in shadow.
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
+        self.misprints = None
+        if due:
+            self.misprints = self._inspect(grey, self._dictionary, [fit.corners_px for fit in fits])
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]

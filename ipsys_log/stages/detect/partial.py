@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,15 +26,19 @@ from ipsys_log.stages.detect.adjustment import (
     outline,
     poses_of,
     prior,
+    sample_cells,
     solve,
 )
 from ipsys_log.stages.detect.prints import Prints, build_prints
 from ipsys_log.stages.detect.profiles import EdgePositions, MarkerView, Poses, locate, read_profiles
+from ipsys_log.stages.detect.search import count_wrong_cells
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
     compare_pattern,
+    count_contradictions,
     exact_steps,
+    has_clear_cells,
     masked_median,
     rough_steps,
     usual_blur,
@@ -61,6 +66,14 @@ _CHEAPER, _ALIKE_POSES = 0.03, 0.06
 # Least share of visible edges of a side, and of all edges together; and their largest cost.
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
+# Least share of clear edges between cells: other prints show a third at most, markers in glare four fifths.
+_CLEAR_INSIDE = 0.5
+# Prints that are no flat squares: least share of clear edges at the sides, which a wider border lacks; and
+# largest distance of corners from the square, and least sigma, in px
+# (test_edges_find_as_many_photographs_as_stock).
+_CLEAR_SIDES = 0.3
+_FARTHEST_CORNER_PX, _CORNER_SIGMA_PX = 8, 0.3
+_REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
 # In cells narrower than this, edges disturb one another.
 _LEAST_CELL_PX = 2.2
 # Factor for covariances: errors of neighbouring edges are correlated, but least squares assumes that they
@@ -175,10 +188,10 @@ class _PartialFit:
         self._guesses, self._id = guesses, guesses[0].id
         self._unknowns = 9 if row_time_s else 7
         self._edge_offset_px = edge_offset_px
-        self._first = _ROUGH - 1 if near else 0
+        self._near, self._first = near, _ROUGH - 1 if near else 0
         prints = build_prints(dictionary, (self._id,))
         self._sides = (prints.by_side[0] > 0).T
-        self._real = prints.polarity[0] != 0
+        self._real, self._cells = prints.polarity[0] != 0, prints.cells
 
     def settle(self) -> tuple[_State, _Solved]:
         """Return the five hypotheses of the better pose, and the residuals of each."""
@@ -265,26 +278,59 @@ class _PartialFit:
         agreement = compare_pattern(levels[0], self._dictionary, self._id)
         if not inside_image(corners_px, self._grey)[0] or not agreement.likely:
             return None
-        if not agreement.clear:
-            hider = _hider(levels[0], view.prints)
-            return Rejection(self._id, f"{hider} hides too many of its cells")
-        cell_px = _width_px(corners_px[0]) / view.prints.cells
-        if cell_px < _LEAST_CELL_PX:
+        pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
+        samples = sample_cells(view, pose)
+        is_other_print = count_contradictions(samples, self._dictionary, self._id) > 0
+        if agreement.clear and solved.clear[n] @ view.prints.inner[0, :, 0] < _CLEAR_INSIDE:
+            is_other_print = True
+        if is_other_print and not self._near:
+            return None  # only a marker that was here can be covered by black or white
+        covariance_px2 = self._covariance(solved, n, slopes[0])
+        hider = _hider(levels[0], view.prints)
+        if is_other_print:
+            reason = f"{hider} hides some of its cells"
+        elif not agreement.clear:
+            reason = f"{hider} hides too many of its cells"
+        elif _width_px(corners_px[0]) / view.prints.cells < _LEAST_CELL_PX:
             reason = f"its cells are under {_LEAST_CELL_PX} px wide, and some of its edges are disturbed"
-            return Rejection(self._id, reason)
-        weights = solved.weights[n]
+        elif hidden_part := self._hidden_part(solved.weights[n]):
+            reason = f"{hider} hides {hidden_part}"
+        elif solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
+            reason = "its edges are too disturbed to fit a flat square"
+        else:
+            spread_px = float(np.sqrt(solved.variance_px2(n)))
+            offset_px = float(solved.unknowns[n, 6])
+            return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        has_sides = (solved.clear[n] @ view.prints.by_side[0]).mean() > _CLEAR_SIDES
+        if agreement.clear and has_sides and has_clear_cells(samples, self._dictionary, self._id):
+            return self._fit_corners(pose, corners_px[0], solved, n) or Rejection(self._id, reason)
+        return Rejection(self._id, reason)
+
+    def _fit_corners(self, pose: Guess, outline_px: Array, solved: _Solved, n: int) -> MarkerFit | None:
+        """Return a marker with the corners in the image, if nothing hides the print but it is no flat square.
+
+        Bent paper and wrong intrinsics have this effect. The covariance contains the distance from a square.
+        """
+        window_px = max(3, min(round(_width_px(outline_px) / (3 * self._cells)), _FARTHEST_CORNER_PX))
+        corners_px = outline_px
+        for reach_px in (window_px, 3):
+            start = corners_px.astype(np.float32).reshape(-1, 1, 2)
+            refined = cv2.cornerSubPix(self._grey, start, (reach_px, reach_px), (-1, -1), _REFINE)
+            corners_px = refined.reshape(4, 2).astype(np.float64)
+        off_px = float(np.sqrt(np.square(corners_px - outline_px).sum(axis=1).mean()))
+        if off_px > window_px or count_wrong_cells(self._grey, self._id, corners_px, self._dictionary):
+            return None
+        covariance_px2 = np.eye(8) * max(off_px, _CORNER_SIGMA_PX) ** 2
+        offset_px = float(solved.unknowns[n, 6])
+        return MarkerFit(pose, corners_px, covariance_px2, offset_px, off_px, solved.blur_px, True)
+
+    def _hidden_part(self, weights: Array) -> str:
+        """Return the part of the edges that is hidden, if it is too large to fit the marker; else ""."""
         seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
         lost = sum(share < _SEEN for share in seen)
-        if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
-            hidden_part = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
-            return Rejection(self._id, f"{_hider(levels[0], view.prints)} hides {hidden_part}")
-        covariance_px2 = self._covariance(solved, n, slopes[0])
-        if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
-            return Rejection(self._id, "its edges are too disturbed to fit a flat square")
-        pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
-        spread_px = float(np.sqrt(solved.variance_px2(n)))
-        offset_px = float(solved.unknowns[n, 6])
-        return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        if lost > 1:
+            return f"{lost} of its 4 sides"
+        return "most of its edges" if weights.sum() < _SEEN_OF_ALL * self._real.sum() else ""
 
     def _choose(self, state: _State, solved: _Solved) -> int:
         """Return the hypothesis with all sides, or the hypothesis without a completely disturbed side."""

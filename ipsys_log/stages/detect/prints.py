@@ -38,6 +38,7 @@ class Prints:
     white : (m, c), True for white cells.
     by_axis : (m, s, 2), maps values at points to their means over the edges along y, and along x.
     by_side : (m, s, 4), maps them to means over the top, right, bottom and left side of the square.
+    inner : (m, s, 1), maps them to the mean over the edges between cells.
     by_colour : (m, c, 2), maps values at cells to their means over the white cells and the black cells.
     cells : number of cells along a side.
     """
@@ -51,6 +52,7 @@ class Prints:
     white: NDArray[np.bool_]
     by_axis: Array
     by_side: Array
+    inner: Array
     by_colour: Array
     cells: int
     reach: float
@@ -70,6 +72,7 @@ def build_prints(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     cells = white.shape[1]
     points, level, real = rows[..., :2].copy(), rows[..., 2], np.abs(rows[..., 3])
     reach = _REACH / cells
+    on_sides = _on_sides(points, level)
     aside = np.stack([1 - level, level], axis=2) * reach
     return Prints(
         points,
@@ -80,7 +83,8 @@ def build_prints(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
         _outline(cells),
         white.reshape(len(white), -1),
         _means(np.stack([real * (1 - level), real * level], axis=2)),
-        _means(real[..., None] * _on_sides(points, level)),
+        _means(real[..., None] * on_sides),
+        _means(real[..., None] * ~on_sides.any(axis=2, keepdims=True)),
         _means(np.stack([white, ~white], axis=3).reshape(len(white), -1, 2).astype(np.float64)),
         cells,
         reach,

@@ -1,9 +1,10 @@
-"""Reports of detection over the whole log: first sightings of unknown markers, and frames of another size."""
+"""Reports of detection over the whole log: unknown markers, other prints, and frames of another size."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,20 +12,25 @@ import numpy as np
 from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import SizeError
 from ipsys_log.geometry.lenses import same_intrinsics
-from ipsys_log.messages import CameraCalibration, Event, Marker, Markers, Rig
+from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers, Rig
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
+from ipsys_log.stages.detect.misprints import MIRRORED, OTHER_PRINTS
 
 __all__ = [
     "NO_KEYFRAME",
     "REJECTED_MARKER",
     "UNKNOWN_MARKER",
     "LensInUse",
+    "OtherPrints",
     "OtherSize",
     "Reports",
     "SeenSquares",
 ]
 
-NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER = _ONCE = ("no_keyframe", "rejected_marker", "unknown_marker")
+NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER = ("no_keyframe", "rejected_marker", "unknown_marker")
+_ONCE = (NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER, MIRRORED, OTHER_PRINTS)
+# A camera is mirrored if its prints show this number of mirrored ids for each id that is not mirrored.
+_CLEARLY_MIRRORED = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,18 +62,56 @@ class SeenSquares:
         return [Marker(*row) for row in zip(self.ids, corners, strict=True)]
 
 
+@dataclass(frozen=True, slots=True)
+class OtherPrints:
+    """Prints in a frame that are no markers of the rig: the event, and their ids if they are mirrored.
+
+    ``own`` are the ids of the markers in the frame. ``symmetric`` ids do not tell if an image is mirrored.
+    """
+
+    event: Event
+    ids: tuple[int, ...]
+    own: tuple[int, ...]
+    symmetric: tuple[int, ...]
+
+
+class _Prints:
+    """The prints that a camera has seen so far."""
+
+    def __init__(self) -> None:
+        self.own: set[int] = set()
+        self.mirrored: set[int] = set()
+        self.others = 0
+        self._symmetric: frozenset[int] = frozenset()
+
+    def add(self, prints: OtherPrints) -> None:
+        self._symmetric = frozenset(prints.symmetric)
+        self.own.update(prints.own)
+        if prints.event.kind == MIRRORED:
+            self.mirrored.update(prints.ids)
+        else:
+            self.others += len(prints.ids)
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Return whether mirror images of ids fit the prints clearly better than ids."""
+        return len(self.mirrored) > _CLEARLY_MIRRORED * len(self.own - self._symmetric)
+
+
 class Reports:
     """The memory of detection that no reset clears: the events that the log already has.
 
     It repeats no event of an unknown marker, of a rejected marker with the same reason, or of missing
     keyframes. A frame of another size is an event only after a frame of the camera had the size of its
-    calibration.
+    calibration. Other prints are an event only if the camera has seen no marker of the rig. A mirrored camera
+    gives no markers: their positions would be mirrored, too.
     """
 
     def __init__(self) -> None:
         self._said: set[tuple[str | None, str, int | None, str]] = set()
         self._fitted: set[tuple[str | None, tuple[int, int]]] = set()
         self._tests: dict[str | None, IntrinsicsTest] = {}
+        self._prints: defaultdict[str | None, _Prints] = defaultdict(_Prints)
 
     def __call__(self, camera: str | None, payloads: Iterable[Any]) -> Iterator[Any]:
         """Yield the payloads of a frame that go into the log.
@@ -85,6 +129,11 @@ class Reports:
                     raise SizeError(payload.error)
                 yield payload.event
                 continue
+            if isinstance(payload, OtherPrints):
+                self._prints[camera].add(payload)
+                if self._explains(camera, payload.event) and self._is_new(payload.event):
+                    yield payload.event
+                continue
             if isinstance(payload, LensInUse):
                 self._begin_test(str(camera), payload)
                 continue
@@ -93,8 +142,11 @@ class Reports:
                 continue
             if isinstance(payload, Markers):
                 self._fitted.add((camera, (payload.width, payload.height)))
+                self._prints[camera].own.update(marker.id for marker in payload.markers)
                 yield from self._test(camera, payload, squares)
-            if not isinstance(payload, Event) or self._is_new(payload):
+            if not isinstance(payload, Event):
+                yield self._without_mirrored(camera, payload)
+            elif self._is_new(payload):
                 yield payload
 
     def _begin_test(self, camera: str, used: LensInUse) -> None:
@@ -105,13 +157,29 @@ class Reports:
     def _test(self, camera: str | None, frame: Markers, squares: SeenSquares | None) -> Iterator[Event]:
         """Yield an event for each contradiction between the intrinsics of a camera and its markers."""
         test = self._tests.get(camera)
-        if test is None:
+        if test is None or self._prints[camera].is_mirrored:
             return
         contradictions = [] if squares is None else [*test.add_squares(squares.markers())]
         for text, marker_id in (*contradictions, *test.add(frame.timestamp, frame.markers)):
             yield Event(frame.timestamp, CALIBRATION_CONTRADICTED, text, camera, marker_id)
 
+    def _explains(self, camera: str | None, event: Event) -> bool:
+        """Return whether other prints explain why a camera sees no markers."""
+        if event.kind == MIRRORED:
+            return self._prints[camera].is_mirrored
+        return self._prints[camera].others > 1 and not self._prints[camera].own
+
+    def _without_mirrored(self, camera: str | None, payload: Any) -> Any:
+        if not self._prints[camera].is_mirrored:
+            return payload
+        if isinstance(payload, Markers):
+            return replace(payload, markers=())
+        return ImageAnnotations((), ()) if isinstance(payload, ImageAnnotations) else payload
+
     def _is_new(self, event: Event) -> bool:
+        prints = self._prints[event.camera]
+        if event.kind == REJECTED_MARKER and (prints.is_mirrored or (prints.others and not prints.own)):
+            return False  # the other print only resembles this marker
         said = event.camera, event.kind, event.marker_id, event.text
         if event.kind not in _ONCE:
             return True

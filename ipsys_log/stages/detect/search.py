@@ -17,8 +17,19 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.images.decode import Grey, levels_at
+from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES, count_contradictions
 
-__all__ = ["WHOLE", "Candidate", "sample", "search", "search_thoroughly", "search_unexplained_areas"]
+__all__ = [
+    "WHOLE",
+    "Candidate",
+    "count_wrong_cells",
+    "find_squares",
+    "read_cells",
+    "sample",
+    "search",
+    "search_thoroughly",
+    "search_unexplained_areas",
+]
 
 Array = NDArray[np.float64]
 
@@ -88,16 +99,27 @@ def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candida
 
 
 def _search(grey: Grey, small: Grey, dictionary: str) -> list[Candidate]:
+    corners_px, ids = _read_squares(grey, small, dictionary)
+    return _candidates(corners_px[: len(ids)], ids) + _read(grey, corners_px[len(ids) :], dictionary)
+
+
+def find_squares(grey: Grey, dictionary: str) -> Array:
+    """Return the corners (n, 4, 2) in px of all squares in an image, markers and others."""
+    return _read_squares(grey, sample(grey), dictionary)[0]
+
+
+def _read_squares(grey: Grey, small: Grey, dictionary: str) -> tuple[Array, list[int]]:
+    """Return the corners (n, 4, 2) of squares, and the ids of the first of them, which are markers."""
     if not small.size:
-        return []
+        return np.empty((0, 4, 2)), []
     marker_corners, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
     squares = [*marker_corners, *rejected]
     if not squares:
-        return []
+        return np.empty((0, 4, 2)), []
     rough = np.concatenate(squares).reshape(-1, 1, 2) * np.float32(_SHRINK) + np.float32(_SHRINK // 2)
     corners_px = cv2.cornerSubPix(grey, rough, _NEAR, (-1, -1), _REFINE).reshape(-1, 4, 2).astype(np.float64)
-    read = len(marker_corners)
-    return _candidates(corners_px[:read], ids) + _read(grey, corners_px[read:], dictionary)
+    # OpenCV 5 returns ids of shape (n,), OpenCV 4 returns ids of shape (n, 1), or None.
+    return corners_px, [] if ids is None else [int(n) for n in np.ravel(ids)]
 
 
 def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
@@ -202,7 +224,6 @@ def _widened(first: int, count: int) -> slice:
 
 
 def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:
-    # OpenCV 5 returns ids of shape (n,), OpenCV 4 returns ids of shape (n, 1), or None.
     numbers = [] if ids is None else np.ravel(ids).tolist()
     return [
         Candidate(n, np.asarray(square, dtype=np.float64).reshape(4, 2))
@@ -237,9 +258,8 @@ def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
     """Return the markers among the squares (n, 4, 2), by their cells."""
     if not len(corners):
         return []
-    words, positions = _words(dictionary)
-    x, y = (np.ascontiguousarray(corners[..., axis] @ positions.T, dtype=np.float32) for axis in (0, 1))
-    levels = levels_at(grey, x, y)
+    words = _words(dictionary)
+    levels = read_cells(grey, corners, round(words.shape[1] ** 0.5))
     middle = levels.min(axis=1) / 2 + levels.max(axis=1) / 2
     signs = np.where(levels > middle[:, None], np.float32(1), np.float32(-1))
     # Number of cells that differ, (squares, ids * turns).
@@ -252,21 +272,46 @@ def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
     return candidates
 
 
-@cache
-def _words(dictionary: str) -> tuple[NDArray[np.float32], Array]:
-    """Return the cells of all markers of a dictionary, and the positions of the cells in a square.
+def count_wrong_cells(grey: Grey, marker_id: int, corners_px: Array, dictionary: str) -> int:
+    """Return the number of cells in a square (4, 2) that clearly have another colour than those of an id."""
+    cells = len(white_cells(dictionary, marker_id))
+    samples = [read_cells(grey, corners_px[None], cells, *aside)[0] for aside in CELL_SAMPLES.tolist()]
+    return count_contradictions(np.array(samples), dictionary, marker_id)
 
-    Returns
-    -------
-    words : (ids * 4, cells), border included, 1 for white and -1 for black, turned by 0 to 3 quarters.
-    places : (cells, 4), weights of the corners. Perspective and lens distortion bend a square of this size
-        only a little, so linear interpolation between the corners is sufficient.
+
+def read_cells(grey: Grey, corners_px: Array, cells: int, right: float = 0.0, down: float = 0.0) -> Array:
+    """Return the grey levels (n, cells * cells) of squares (n, 4, 2): at the middles of their cells.
+
+    Parameters
+    ----------
+    cells : number of cells along a side, border included.
+    right, down : distance from the middles, in cells.
+    """
+    positions = _positions(cells, right, down)
+    x, y = (np.ascontiguousarray(corners_px[..., axis] @ positions.T, dtype=np.float32) for axis in (0, 1))
+    return levels_at(grey, x, y)
+
+
+@cache
+def _positions(cells: int, right: float, down: float) -> Array:
+    """Return the weights (cells * cells, 4) of the corners of a square at the points of its cells.
+
+    Perspective and lens distortion bend a square of this size only a little, so linear interpolation between
+    the corners is sufficient.
+    """
+    steps = np.arange(cells) + 0.5
+    x, y = (axis.ravel() / cells for axis in np.meshgrid(steps + right, steps + down))
+    return np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+
+
+@cache
+def _words(dictionary: str) -> NDArray[np.float32]:
+    """Return the cells of all markers of a dictionary, (ids * 4, cells), border included.
+
+    They are 1 for white and -1 for black, turned by 0 to 3 quarters.
     """
     images = [white_cells(dictionary, n) for n in range(len(_known(dictionary).bytesList))]
-    cells = len(images[0])
     # If the marker's top left is corner k of a square, the square shows the marker turned k quarters
     # clockwise.
     turned = [np.rot90(image, -turn).ravel() for image in images for turn in range(4)]
-    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [(np.arange(cells) + 0.5) / cells]))
-    positions = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-    return np.where(turned, np.float32(1), np.float32(-1)), positions
+    return np.where(turned, np.float32(1), np.float32(-1))

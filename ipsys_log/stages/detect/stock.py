@@ -6,11 +6,18 @@ import cv2
 import numpy as np
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.markers import white_cells
 from ipsys_log.images.decode import Grey
 from ipsys_log.messages import Marker
+from ipsys_log.stages.detect.search import count_wrong_cells, read_cells
 
 __all__ = ["detect_markers", "marker_detector"]
 
+# OpenCV corrects wrong cells, up to three of 6x6, and a third of the border. More than one is another print.
+_WRONG_CELLS = 1
+# Distance outside a marker, in cells, that is black only in a border wider than one cell; darker than this
+# share of the contrast is black.
+_OUTSIDE, _BLACK = 0.2, 0.25
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
 
 
@@ -53,4 +60,22 @@ def detect_markers(grey: Grey, dictionary: str) -> list[Marker]:
     refined = cv2.cornerSubPix(grey, flat, (3, 3), (-1, -1), _REFINE).reshape(-1, 4, 2)
     # OpenCV 5 returns ids of shape (n,), OpenCV 4 returns ids of shape (n, 1).
     order = np.argsort(np.ravel(ids), kind="stable")
-    return [Marker(int(np.ravel(ids)[i]), np.asarray(refined[i], dtype=np.float64)) for i in order]
+    markers = [Marker(int(np.ravel(ids)[i]), np.asarray(refined[i], dtype=np.float64)) for i in order]
+    return [marker for marker in markers if _is_print(grey, marker, dictionary)]
+
+
+def _is_print(grey: Grey, marker: Marker, dictionary: str) -> bool:
+    """Return whether the cells have the colours of the id, and the border ends at the corners."""
+    if count_wrong_cells(grey, marker.id, marker.corners_px, dictionary) > _WRONG_CELLS:
+        return False
+    white = white_cells(dictionary, marker.id)
+    cells = len(white)
+    middle_px = marker.corners_px.mean(axis=0)
+    # The outer cells of a larger square are outside the marker.
+    larger_px = middle_px + (marker.corners_px - middle_px) * (cells + 2 * _OUTSIDE) / (cells - 1)
+    levels, around = (
+        read_cells(grey, px[None], cells).reshape(cells, cells) for px in (marker.corners_px, larger_px)
+    )
+    around[1:-1, 1:-1] = np.nan
+    dark, light = np.median(levels[~white]), np.median(levels[white])
+    return bool(np.nanmedian(around) > dark + _BLACK * (light - dark))

@@ -22,11 +22,14 @@ from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import BLURS_PX, LEAST_CONTRAST
 
 __all__ = [
+    "CELL_SAMPLES",
     "TAPS",
     "Agreement",
     "Steps",
     "compare_pattern",
+    "count_contradictions",
     "exact_steps",
+    "has_clear_cells",
     "masked_median",
     "rough_steps",
     "usual_blur",
@@ -37,6 +40,14 @@ Array = NDArray[np.float64]
 # Cells differ if their levels differ by this share of the print's contrast.
 _DIFFERENT = 0.25
 _AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
+# A cell has the level of the print's black or white within this share of the contrast, at its middle and
+# around it. With 0.2 and 0.35, glare counts as white (test_edges_in_uneven_light_are_exact_at_full_size).
+_AS_PRINTED, _AS_PRINTED_AROUND = 0.15, 0.3
+# Width in cells of the window whose darkest and brightest cells decide a colour. In windows with less than
+# this share of the marker's contrast, all cells have one colour. Sigma in cells of the levels around a cell.
+_WINDOW_CELLS, _PLAIN, _NEAR_CELLS = 5, 0.4, 1.5
+# Positions of the samples of a cell, in cells from its middle.
+CELL_SAMPLES = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [-0.25, -0.25], [0.25, -0.25]])
 
 
 class Agreement(NamedTuple):
@@ -86,6 +97,78 @@ def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement
     own = float(agreements[4 * marker_id])
     agreements[4 * marker_id] = -1.0
     return Agreement(own, float(agreements.max()))
+
+
+def count_contradictions(samples: Array, dictionary: str, marker_id: int) -> int:
+    """Return the number of cells that clearly have the opposite colour of those of a marker.
+
+    Such a cell has everywhere the level of the black or the white around it, and so have the cells beside it.
+    Otherwise it may be covered, in glare or at the border of a shadow, and says nothing about the print.
+
+    Parameters
+    ----------
+    samples : (5, c), grey levels of the cells, black border included, row after row: at the middle of a cell,
+        and around it.
+    dictionary, marker_id : as for :func:`compare_pattern`.
+    """
+    white = white_cells(dictionary, marker_id).ravel()
+    seen_white, off = _compare_levels(samples, white)
+    if (seen_white == white).all():
+        return 0
+    cells = round(len(white) ** 0.5)
+    odd = (off[0] > _AS_PRINTED).reshape(cells, cells).astype(np.uint8)
+    beside = cv2.dilate(odd, np.ones((3, 3), dtype=np.uint8)).ravel() > 0
+    clear = ~beside & (off[1:].max(axis=0) < _AS_PRINTED_AROUND)
+    return int(np.count_nonzero(clear & (seen_white != white)))
+
+
+def has_clear_cells(samples: Array, dictionary: str, marker_id: int) -> bool:
+    """Return whether all cells clearly have the colours of a marker, in even light.
+
+    The parameters are those of :func:`count_contradictions`.
+    """
+    white = white_cells(dictionary, marker_id).ravel()
+    seen_white, off = _compare_levels(samples, white)
+    is_clear = off[0].max() < _AS_PRINTED and off[1:].max() < _AS_PRINTED_AROUND
+    return bool(is_clear and (seen_white == white).all())
+
+
+def _compare_levels(samples: Array, white: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Array]:
+    """Return the cells (c,) that look white, and the distances (5, c) of samples from the level of the print.
+
+    The unit of distances is the contrast of the print around the cell.
+    """
+    levels = samples[0]
+    cells = round(len(levels) ** 0.5)
+    middle, contrast = _between(levels, cells)
+    if contrast < LEAST_CONTRAST:
+        return white, np.full(samples.shape, np.inf)
+    seen_white = levels > middle
+    near = _nearness(cells)
+    light, dark = (
+        near @ (levels * right) / np.maximum(near @ right, 1e-9)
+        for right in (white & seen_white, ~white & ~seen_white)
+    )
+    return seen_white, np.abs((samples - dark) / np.maximum(light - dark, LEAST_CONTRAST) - seen_white)
+
+
+def _between(levels: Array, cells: int) -> tuple[Array, float]:
+    """Return for each cell (c,) the level between the black and the white around it, and the contrast."""
+    square = levels.reshape(cells, cells).astype(np.float32)
+    window = np.ones((_WINDOW_CELLS, _WINDOW_CELLS), dtype=np.uint8)
+    low, high = cv2.erode(square, window).ravel(), cv2.dilate(square, window).ravel()
+    contrast = float(levels.max() - levels.min())
+    is_plain = high - low < _PLAIN * contrast
+    middle = np.where(is_plain, (levels.max() + levels.min()) / 2, (low + high) / 2)
+    return np.asarray(middle, dtype=np.float64), contrast
+
+
+@cache
+def _nearness(cells: int) -> Array:
+    """Return the weights (c, c) of cells in the levels around each cell. Far cells count if no others do."""
+    row, column = np.divmod(np.arange(cells * cells), cells)
+    squared = (row[:, None] - row) ** 2 + (column[:, None] - column) ** 2
+    return np.asarray(np.exp(-squared / (2 * _NEAR_CELLS**2)) + 1e-3)
 
 
 def _neighbours(cells: Array) -> Array:

@@ -1,0 +1,191 @@
+"""Prints that are no markers of the rig: mirrored, negative, of another dictionary, or with a wider border.
+
+Squares that no marker explains are read again with other grids and patterns. Only exact patterns with clear
+cells count, so that other squares in the image are not taken for prints.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.images.decode import Grey
+from ipsys_log.stages.detect.search import find_squares, read_cells
+
+__all__ = ["MIRRORED", "OTHER_PRINTS", "Inspection", "Misprints", "find_misprints"]
+
+Array = NDArray[np.float64]
+Bits = NDArray[np.uint8]
+
+# Kinds of events, and of misprints.
+MIRRORED, OTHER_PRINTS = "mirrored_camera", "other_prints"
+_NEGATIVE, _WIDE, _FOREIGN = "negative", "wide border", "dictionary"
+
+# Least difference of black and white, in grey levels, and largest distance of a cell from both as a share of
+# it. Squares of other objects have cells between both (test_squares_without_a_pattern_are_no_prints).
+_CONTRAST, _CLEAR = 25.0, 0.25
+# Cells of a side without the border.
+_CELLS = (4, 5, 6, 7)
+# Dictionaries of square prints: the largest of each family, and the sizes of its parts.
+_SIZES = (50, 100, 250, 1000)
+_FAMILIES = (
+    *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)),
+    *("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9"),
+    *("DICT_APRILTAG_36h10", "DICT_APRILTAG_36h11", "DICT_ARUCO_MIP_36h12"),
+)
+
+
+class Misprints(NamedTuple):
+    """Prints of one image that are no markers of the rig: the explanation that fits most of them.
+
+    ``ids`` are theirs in the dictionary that fits. ``advice`` says what they are and what to do. ``kind`` is
+    that of the event. ``symmetric`` are the ids of the rig's dictionary whose mirror image is an id, too.
+    """
+
+    kind: str
+    ids: tuple[int, ...]
+    advice: str
+    symmetric: tuple[int, ...]
+
+
+class Inspection:
+    """The search of one camera for misprints: in few of its images, ever fewer."""
+
+    def __init__(self) -> None:
+        self._images = 0
+
+    def __call__(self, grey: Grey, dictionary: str, markers_px: Sequence[Array]) -> Misprints | None:
+        """Return the misprints among the squares in an image that are none of the measured markers.
+
+        Parameters
+        ----------
+        markers_px : corners (4, 2) of the measured markers.
+        """
+        self._images += 1
+        if self._images & (self._images - 1):
+            return None
+        return find_misprints(grey, dictionary, markers_px)
+
+
+def find_misprints(grey: Grey, dictionary: str, markers_px: Sequence[Array]) -> Misprints | None:
+    """Return the explanation of most squares without a marker, or None, for an image (height, width)."""
+    squares_px = _unexplained(find_squares(grey, dictionary), markers_px)
+    seen = set(_explain(grey, squares_px, dictionary))
+    if not seen and not len(markers_px):
+        inverse = 255 - grey
+        squares_px = find_squares(inverse, dictionary)
+        for bits in _clear_prints(inverse, squares_px, _size(dictionary), 1).values():
+            if (marker_id := _words(dictionary).get(bits.tobytes())) is not None:
+                seen.add((_NEGATIVE, dictionary, marker_id))
+    counts = Counter((kind, name) for kind, name, _ in seen)
+    if not counts:
+        return None
+    # The first kind is the likeliest if counts are equal: one dictionary has all prints of a lab.
+    order = (MIRRORED, _NEGATIVE, _WIDE, _FOREIGN)
+    best = min(counts, key=lambda key: (-counts[key], order.index(key[0]), key[1]))
+    ids = tuple(sorted(marker_id for kind, name, marker_id in seen if (kind, name) == best))
+    kind = MIRRORED if best[0] == MIRRORED else OTHER_PRINTS
+    return Misprints(kind, ids, _advice(*best, ids, dictionary), _symmetric_ids(dictionary))
+
+
+@cache
+def _symmetric_ids(dictionary: str) -> tuple[int, ...]:
+    words, size = _words(dictionary), _size(dictionary)
+    mirrored = {n: np.frombuffer(bits, dtype=np.uint8).reshape(size, size).T for bits, n in words.items()}
+    return tuple(sorted(n for n, bits in mirrored.items() if bits.tobytes() in words))
+
+
+def _unexplained(squares_px: Array, markers_px: Sequence[Array]) -> Array:
+    """Return the squares (n, 4, 2) whose middle is in the box of no marker."""
+    middles = squares_px.mean(axis=1)
+    left = np.ones(len(squares_px), dtype=bool)
+    for corners_px in markers_px:
+        inside = (middles > corners_px.min(axis=0)) & (middles < corners_px.max(axis=0))
+        left &= ~inside.all(axis=1)
+    return squares_px[left]
+
+
+def _explain(grey: Grey, squares_px: Array, dictionary: str) -> Iterator[tuple[str, str, int]]:
+    """Yield the kind, the dictionary and the id of each explanation of a square."""
+    own = _words(dictionary)
+    for size in _CELLS:
+        for bits in _clear_prints(grey, squares_px, size, 1).values():
+            if bits.tobytes() in own:
+                continue
+            if (marker_id := own.get(bits.T.tobytes())) is not None:
+                yield MIRRORED, dictionary, marker_id
+            for family in _families(size):
+                if (marker_id := _words(family).get(bits.tobytes())) is not None:
+                    yield _FOREIGN, family, marker_id
+    for bits in _clear_prints(grey, squares_px, _size(dictionary), 2).values():
+        if (marker_id := own.get(bits.tobytes())) is not None:
+            yield _WIDE, dictionary, marker_id
+
+
+def _clear_prints(grey: Grey, squares_px: Array, size: int, border: int) -> dict[int, Bits]:
+    """Return the inner cells (size, size), 1 for white, of squares with clear cells and a black border."""
+    if not len(squares_px):
+        return {}
+    levels = read_cells(grey, squares_px, size + 2 * border)
+    low, high = levels.min(axis=1, keepdims=True), levels.max(axis=1, keepdims=True)
+    white = levels > (low + high) / 2
+    off = np.minimum(levels - low, high - levels) / np.maximum(high - low, 1.0)
+    cells = white.reshape(len(white), size + 2 * border, -1)
+    inner = cells[:, border:-border, border:-border]
+    black_border = white.sum(axis=1) == inner.sum(axis=(1, 2))
+    clear = (off.max(axis=1) < _CLEAR) & (high - low > _CONTRAST)[:, 0] & black_border
+    return {int(n): np.ascontiguousarray(inner[n], dtype=np.uint8) for n in np.flatnonzero(clear)}
+
+
+def _advice(kind: str, name: str, ids: Sequence[int], dictionary: str) -> str:
+    if kind == MIRRORED:
+        return (
+            f"the image is mirrored: its prints fit the mirror images of {dictionary}; switch off the "
+            "mirroring (flip) of the camera or its driver, and record again"
+        )
+    if kind == _NEGATIVE:
+        return (
+            f"the prints are negatives of {dictionary}, white on black: print the markers again, black on "
+            "white (ipsys markers)"
+        )
+    if kind == _WIDE:
+        return (
+            f"the prints of {dictionary} have a black border of two cells: print the markers again, with a "
+            "border of one cell (ipsys markers)"
+        )
+    stem, _, size = name.rpartition("_")
+    if size == str(_SIZES[-1]):
+        name = f"{stem}_{next(n for n in _SIZES if n > max(ids))}"
+    return f'the prints are of {name}, not of {dictionary}: write dictionary = "{name}" into lab.toml'
+
+
+@cache
+def _known(dictionary: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+
+
+def _size(dictionary: str) -> int:
+    return int(_known(dictionary).markerSize)
+
+
+@cache
+def _families(size: int) -> tuple[str, ...]:
+    return tuple(name for name in _FAMILIES if hasattr(cv2.aruco, name) and _size(name) == size)
+
+
+@cache
+def _words(dictionary: str) -> dict[bytes, int]:
+    """Return the ids by the bytes of their cells, in all four turns."""
+    known, size = _known(dictionary), _size(dictionary)
+    words: dict[bytes, int] = {}
+    for n in range(len(known.bytesList)):
+        bits = np.asarray(known.getBitsFromByteList(known.bytesList[n : n + 1], size), dtype=np.uint8)
+        for turn in range(4):
+            words.setdefault(np.ascontiguousarray(np.rot90(bits, turn)).tobytes(), n)
+    return words

@@ -18,7 +18,17 @@ import pytest
 
 BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 # Benchmarks without ratios.
-FIGURES_ONLY = ("contradictions", "dashboard", "hall", "hall_nodes", "live", "node_clock", "remote", "robot_run", "streams")
+FIGURES_ONLY = (
+    "contradictions",
+    "dashboard",
+    "hall",
+    "hall_nodes",
+    "live",
+    "node_clock",
+    "remote",
+    "robot_run",
+    "streams",
+)
 
 
 @pytest.mark.slow

@@ -47,22 +47,27 @@ def with_remaining_error(
     if not (tapes > 0).all():  # the sigma of the tape is not known
         return errors
     squares = (offsets_m**2).sum(axis=2)
-    mean_m2, tape_mean_m2 = float(squares.mean()), float(tapes.mean())
-    if mean_m2 <= 0:
+    if not squares.any():
         return errors
+    # A point where the tapes cross at a small angle tells little of a small error of the model.
+    shares = 1 / (tapes + max(float((squares - tapes).mean()), 0.0))
+    shares /= shares.sum()
+    mean_m2, tape_mean_m2 = float((squares.mean(axis=0) * shares).sum()), float((tapes * shares).sum())
     remaining_m2 = max(mean_m2 - tape_mean_m2, 0.0)
     size = offsets_m.shape[2]
     spread_m2 = tape_m2 + remaining_m2 / size * np.eye(size)
     variances = 2 * (spread_m2**2).sum(axis=(1, 2))
     _, numbers = np.unique(np.array(points), return_inverse=True)
     # All squares of one point are taken for completely dependent.
-    variance = float((np.bincount(numbers, np.sqrt(variances)) ** 2).sum()) / len(points) ** 2
+    variance = float((np.bincount(numbers, shares * np.sqrt(variances)) ** 2).sum())
     expected_m2 = tape_mean_m2 + remaining_m2
     degrees = 2 * expected_m2**2 / variance
-    low_m2, high_m2 = (mean_m2 * degrees / chi2.ppf(share, degrees) - tape_mean_m2 for share in (_HIGH, _LOW))
+    low_m2, high_m2 = (
+        mean_m2 * degrees / chi2.ppf(probability, degrees) - tape_mean_m2 for probability in (_HIGH, _LOW)
+    )
     scale_m2 = (chi2.ppf(0.95, 1) * scale_m**2).mean()
     # The ratio of the mean to the root mean square is about that of all distances.
-    ratio = errors.mean_m / np.sqrt(mean_m2)
+    ratio = errors.mean_m / np.sqrt(squares.mean())
     low_m, mean_m, high_m = (
         float(ratio * np.sqrt(max(value_m2, 0.0))) for value_m2 in (low_m2, remaining_m2, high_m2)
     )

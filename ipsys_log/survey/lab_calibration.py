@@ -234,7 +234,8 @@ def describe_fit(
         sizes_px,
         expected,
         _candidates(rig, low_m, high_m, step_m),
-        expected_tape_covariances(rig),
+        # Another reading has the same scale: it tells nothing of the part of the error by the scale.
+        expected_tape_covariances(rig, scale_sigma=fit.observations.tape.scale_sigma),
         length_m,
         goal_m if max(c.mean_m for c in cameras if len(c.expected.errors_m)) > goal_m else np.inf,
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,

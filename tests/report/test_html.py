@@ -87,7 +87,8 @@ def test_the_page_in_a_browser(page: str, width: int, tmp_path: Path) -> None:
         assert natural_height > 50
         assert 0.8 * min(width, 450) < shown <= width
     for words in (
-        "Mean distance to the tape points", "Recommended model", "Models", "Error map", "Number of calibration points",
+        "Mean distance to the tape points", "Recommended model", "Models", "Error map",
+        "Number of calibration points",
         "Outliers", "Uncertain tape measurements", "Extrapolation",
         "Consistency of the covariance", "Runs and versions", "seed=0", "would fit on the other side",
         "100.0, 200.0, 10.0", "rigid+kriging-regression", "Camera white",

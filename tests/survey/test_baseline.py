@@ -63,14 +63,14 @@ def test_terminal_asks_once_where_the_baseline_counts(monkeypatch: pytest.Monkey
     asked: list[str] = []
     typed = iter(["9", "200.3"])
 
-    def answer(question: str, usual: str = "") -> str:  # noqa: ARG001
+    def answer(question: str, usual: str = "") -> str:
         asked.append(question)
         return next(typed)
 
     monkeypatch.setattr(dialog, "answer", answer)
     for rig in (RIG, KNOWN):
         scene = EmptyScene(rig)
-        dialog._ask_baseline(scene)  # noqa: SLF001
+        dialog._ask_baseline(scene)
     assert asked == ["distance from A to B with this tape, cm [Enter: skip]"] * 2
     assert [(one.id, one.timestamp, one.distances[0].distance_m) for one in scene.done] == [("ab", 7, 2.003)]
     assert not needs_baseline(KNOWN, scene.done)

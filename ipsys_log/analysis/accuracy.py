@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.camera_models import fit_camera_models, height_sigmas, tape_covariances
 from ipsys_log.analysis.cross_validation import FOLDS, cross_validate, gather_points, make_folds
 from ipsys_log.analysis.pairs import level_cameras
+from ipsys_log.analysis.remaining_error import with_remaining_error
+from ipsys_log.geometry.trilateration import USUAL_TAPE_SCALE_SIGMA
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Model, Pair, Residual
 from ipsys_log.models.table import AppliedModel, reads_height
 
@@ -257,6 +259,7 @@ def error_rows(
     rows: list[CameraEvaluation] = []
     for against in ("tape", "truth"):
         compared: list[tuple[Array, Array | None, list[str]]] = []
+        tapes: list[tuple[Array, Array]] = []
         for camera, (pairs, predicted_m) in found.items():
             known = {p.measurement: p.world_m for p in pairs} if against == "tape" else ground_truth
             keep = [n for n, pair in enumerate(pairs) if pair.measurement in known]
@@ -267,10 +270,11 @@ def error_rows(
             offsets_m = predicted_m[:, keep] - targets_m
             known_m2 = covariances[camera]
             shares = None
+            tape_m2 = tape_covariances(kept) if against == "tape" else np.zeros((len(kept), 3, 3))
+            # A known height, or the only height of all calibration points, has no error.
+            size = 2 if camera in level or reads_height(model.name) else 3
+            tapes.append((_of_size(tape_m2, size), _scale_sigmas(targets_m)))
             if known_m2 is not None:
-                tape_m2 = tape_covariances(kept) if against == "tape" else np.zeros((3, 3))
-                # A known height, or the only height of all calibration points, has no error.
-                size = 2 if camera in level or reads_height(model.name) else 3
                 shares = _shares(offsets_m[0], known_m2[keep] + tape_m2, size)
             names = [pair.calibration_point or pair.measurement for pair in kept]
             residuals = tuple(
@@ -278,14 +282,21 @@ def error_rows(
                 for repeat in predicted_m[:, keep]
                 for pair, target, point in zip(kept, targets_m, repeat, strict=True)
             )
-            rows.append(_row(camera, against, scheme, offsets_m, names, shares, residuals, camera in level))
+            rows.append(
+                _row(
+                    camera, against, scheme, offsets_m, names, shares, residuals, camera in level, *tapes[-1]
+                )
+            )
             compared.append((offsets_m, shares, names))
         if len(compared) > 1:
             offsets_m = np.concatenate([offsets for offsets, _, _ in compared], axis=1)
             known_shares = [s for _, s, _ in compared if s is not None]
             shares = np.concatenate(known_shares) if len(known_shares) == len(compared) else None
             names = [name for _, _, own in compared for name in own]
-            rows.append(_row(POOLED, against, scheme, offsets_m, names, shares, (), bool(level)))
+            tape_m2, scales_m = (np.concatenate(parts) for parts in zip(*tapes, strict=True))
+            rows.append(
+                _row(POOLED, against, scheme, offsets_m, names, shares, (), bool(level), tape_m2, scales_m)
+            )
     return rows
 
 
@@ -298,20 +309,41 @@ def _row(
     shares: Array | None,
     residuals: tuple[Residual, ...],
     level: bool,
+    tape_m2: Array,
+    scales_m: Array,
 ) -> CameraEvaluation:
+    def statistics(size: int) -> ErrorStatistics:
+        own_m = offsets_m[:, :, :size]
+        errors = error_statistics(np.linalg.norm(own_m, axis=2), points=names)
+        if against != "tape":
+            return errors
+        return with_remaining_error(errors, own_m, tape_m2[:, :size, :size], scales_m, names)
+
     within = [None, None] if shares is None else [float((shares <= region).mean()) for region in _REGIONS]
     return CameraEvaluation(
         camera,
         against,
         # If all calibration points have the same height, the 3D error is not meaningful.
-        None if level else error_statistics(np.linalg.norm(offsets_m, axis=2), points=names),  # eq. (26)
-        error_statistics(np.linalg.norm(offsets_m[:, :, :2], axis=2), points=names),  # eq. (27)
+        None if level else statistics(3),  # eq. (26)
+        statistics(2),  # eq. (27)
         residuals,
         scheme,
         offsets_m.reshape(-1, 3).mean(axis=0),
         within[0],
         within[1],
     )
+
+
+def _of_size(tape_m2: Array, size: int) -> Array:
+    """Return covariances (n, 3, 3) whose heights have no error if ``size`` is 2."""
+    known = np.array([1.0, 1.0, float(size == 3)])
+    return np.asarray(tape_m2 * known[:, None] * known)
+
+
+def _scale_sigmas(world_m: Array) -> Array:
+    """Return the standard deviations (n,) of points by the scale of a usual tape, about their middle."""
+    away_m = np.linalg.norm(world_m[:, :2] - world_m[:, :2].mean(axis=0), axis=1)
+    return np.asarray(USUAL_TAPE_SCALE_SIGMA * away_m)
 
 
 def _shares(offsets_m: Array, covariances_m2: Array, size: int) -> Array:

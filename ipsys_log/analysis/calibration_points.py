@@ -80,4 +80,4 @@ def measured_part(rig: Rig, model: str) -> object:
         (m.id, rig.length_of(m.id), rig.height_of(m.id), rig.height_sigma_of(m.id)) for m in rig.markers
     }
     cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
-    return points, markers, cameras, rig.tape_sigma_m
+    return points, markers, cameras, (rig.tape_sigma_m, rig.tape_scale_sigma, rig.ab_sigma_m)

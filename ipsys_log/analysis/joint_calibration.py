@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.analysis.calibration_points import find_pairs, measured
+from ipsys_log.analysis.pairs import active_baselines
 from ipsys_log.errors import FitError
 from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import JointFit, fit_jointly
@@ -17,7 +18,7 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.selection import seeing_cameras, without_points
 from ipsys_log.messages import CameraCalibration, Markers, Model
-from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import Progress, StageView
 
 __all__ = ["fit_joint_model", "fit_without", "is_nominal", "observe"]
@@ -40,7 +41,9 @@ def observe(view: StageView) -> Observations:
         raise FitError("joint is fitted to the corners of markers, but the log has none; use best")
     lenses = view.calibrations()
     nominal = {camera for camera, lens in lenses.items() if is_nominal(lens)}
-    return gather_observations(rig, lenses, markers, [point.measurement for point in points], nominal)
+    baselines = active_baselines(view.payloads(MEASUREMENTS))
+    measurements = [point.measurement for point in points]
+    return gather_observations(rig, lenses, markers, measurements, nominal, baselines=baselines)
 
 
 def is_nominal(lens: CameraCalibration) -> bool:

@@ -18,6 +18,7 @@ __all__ = [
     "Place",
     "RiggedMeasurement",
     "Sightings",
+    "active_baselines",
     "active_measurements",
     "build_pairs",
     "gather_sightings",
@@ -132,6 +133,13 @@ def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement
         if measurement.marker_id is None:
             raise IpsysError(f"measurement {measurement.id} has no marker; withdraw it and measure again")
     return active
+
+
+def active_baselines(measurements: Iterable[Measurement]) -> list[Measurement]:
+    """Return the readings of distances between reference points that are not withdrawn."""
+    measurements = list(measurements)
+    withdrawn = withdrawals(measurements)
+    return [one for one in measurements if one.from_reference is not None and one.id not in withdrawn]
 
 
 def withdrawals(measurements: Iterable[Measurement]) -> dict[str, Measurement]:

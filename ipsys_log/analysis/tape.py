@@ -61,7 +61,9 @@ def with_usual_tape(rig: Rig) -> Rig:
     return replace(rig, tape_sigma_m=USUAL_TAPE_SIGMA_M) if rig.tape_sigma_m is None else rig
 
 
-def expected_tape_covariances(rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_M) -> TapeCovariances:
+def expected_tape_covariances(
+    rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_M, scale_sigma: float = 0.0
+) -> TapeCovariances:
     """Return the covariances of points that are measured from all reference points of a rig.
 
     With fewer than two reference points, a point is known as well as a tape measures a distance.
@@ -69,6 +71,7 @@ def expected_tape_covariances(rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_
     Parameters
     ----------
     usual_sigma_m : sigma of a distance, if the rig has none.
+    scale_sigma : relative sigma of the scale of the tape, about the middle of the reference points.
     """
     known_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points]).reshape(-1, 2)
     sigma_m = rig.tape_sigma_m or usual_sigma_m
@@ -77,9 +80,10 @@ def expected_tape_covariances(rig: Rig, usual_sigma_m: float = USUAL_TAPE_SIGMA_
     def covariances(points_m: Array) -> Array:
         if len(known_m) < 2:
             return np.broadcast_to(sigma_m**2 * np.eye(2), (len(points_m), 2, 2))
-        return np.array([tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m]).reshape(
-            -1, 2, 2
-        )
+        read_m2 = [tape_covariance(point_m, known_m, sigmas_m) for point_m in points_m]
+        by_scale_m = scale_sigma * (points_m - known_m.mean(axis=0))
+        spread_m2: Array = by_scale_m[:, :, None] * by_scale_m[:, None]
+        return spread_m2 + np.array(read_m2).reshape(-1, 2, 2)
 
     return covariances
 

@@ -148,6 +148,7 @@ def ask_places(scene: MeasuringScene) -> None:
     with suppress(ImportError):  # arrow keys, if the system has readline
         import readline  # noqa: F401
     console.print(HELP, style="dim", markup=False)
+    _ask_baseline(scene)
     active = active_measurements(scene.history())
     saved: list[str] = []
     left: list[int | None] = [
@@ -166,6 +167,26 @@ def ask_places(scene: MeasuringScene) -> None:
         elif scene.intervals:
             del left[0]
     console.print("all stationary intervals are done")
+
+
+def _ask_baseline(scene: MeasuringScene) -> None:
+    """Ask once for the distance AB with this tape, where it counts; Enter or a letter skips it."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.survey.baseline import baseline_names, needs_baseline, read_baseline
+
+    while needs_baseline(scene.rig, scene.history()):
+        first, second = baseline_names(scene.rig)
+        try:
+            typed = answer(f"distance from {first} to {second} with this tape, cm [Enter: skip]")
+        except LetterError:
+            return
+        if not typed:
+            return
+        time_ns = max((view.time_ns for view in scene.views(None)), default=0)
+        try:
+            scene.add([read_baseline(typed, scene.rig, scene.history(), time_ns)])
+        except IpsysError as error:
+            _complain([str(error)])
 
 
 def _ask_place(scene: MeasuringScene, interval: int | None, saved: list[str]) -> str | Measurement:

@@ -69,6 +69,16 @@ Places = Annotated[
     ),
 ]
 
+Baseline = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        "--ab",
+        metavar="CM",
+        help="With LOG: the distance between the first two reference points, read with this tape, in cm. It "
+        "shows the scale of the tape if the rig has ab_sigma_m.",
+    ),
+]
+
 # The model that a replay fits, and the number of calibration points that gives good results.
 _MODEL, _GOOD = "poly", 40
 
@@ -84,6 +94,7 @@ def measure(
     terminal: Terminal = False,
     csv: Sheet = None,
     places: Places = False,
+    ab: Baseline = None,
     host: Host = None,
     port: Port = 8000,
     rig: RigFile = None,
@@ -102,13 +113,13 @@ def measure(
 
     The command checks each entry at once. Undo withdraws a measurement and erases nothing.
     """
-    ends = csv is not None or places
+    ends = csv is not None or places or ab is not None
     allow_interrupt(None if ends else "stopped; every saved point is in the log")
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
 
-    if sum((terminal, csv is not None, places)) > 1:
-        raise IpsysError("--terminal, --csv and --places cannot be used together; give one of them")
+    if sum((terminal, csv is not None, places, ab is not None)) > 1:
+        raise IpsysError("--terminal, --csv, --places and --ab cannot be used together; give one of them")
     if not (terminal or ends):
         check_installed("the measuring page needs", "starlette", "uvicorn")
     if log is not None:
@@ -120,9 +131,9 @@ def measure(
         )
         if csv is None:
             _refuse("--csv or live cameras; leave it out", force=force)
-        _measure_log(log, terminal, csv, force, places, host, port, rig, calibration, corners, as_json)
+        _measure_log(log, terminal, csv, force, places, ab, host, port, rig, calibration, corners, as_json)
         return
-    _refuse("a finished log; name the log", csv=csv, places=places)
+    _refuse("a finished log; name the log", csv=csv, places=places, ab=ab)
     if rig is None or output is None:
         raise IpsysError(
             "no log is given; name a finished log, or give --rig lab.toml -o places.mcap to use cameras"
@@ -149,6 +160,7 @@ def _measure_log(
     csv: Path | None,
     force: bool,
     places: bool,
+    ab: str | None,
     host: str | None,
     port: int,
     rig: Path | None,
@@ -172,7 +184,11 @@ def _measure_log(
             _show_places(scene, as_json)
             return
         before = len(scene.history())
-        if csv is not None:
+        if ab is not None:
+            from ipsys_log.survey.baseline import read_baseline
+
+            scene.add([read_baseline(ab, scene.rig, scene.history(), scene.start_ns)])
+        elif csv is not None:
             for text in add_sheet(scene, csv, force):
                 remarks.print(text, style="yellow", markup=False)
         elif terminal:

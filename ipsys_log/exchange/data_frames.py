@@ -299,6 +299,7 @@ def _measurement(message: Message) -> dict[str, Any]:
         "splits": measurement.splits,
         "withdraws": measurement.withdraws,
         "readmits": measurement.readmits,
+        "from_reference": measurement.from_reference,
         "reason": measurement.reason,
     }
 

@@ -55,9 +55,9 @@ class LogFacts:
 class FitFacts:
     """The newest evaluation of the calibration logs.
 
-    ``answer`` are the sentences of ``ipsys replay``, ``mean_cm`` the mean position error. ``outliers`` are
-    the points that contradict the fit. ``stale`` is the reason if the evaluation is out of date; "" if it is
-    current.
+    ``answer`` are the sentences of ``ipsys replay``, ``mean_cm`` the mean distance to the tape points.
+    ``outliers`` are the points that contradict the fit. ``stale`` is the reason if the evaluation is out of
+    date; "" if it is current.
     """
 
     run: str

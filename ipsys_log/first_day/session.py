@@ -297,5 +297,5 @@ class SetupSession:
 
 def _describe_fit(fit: FitFacts) -> dict[str, Any]:
     """Return the result of the fit: one figure, the points to measure again, and the full answer."""
-    figure = "" if fit.mean_cm is None else f"Mean position error: {fit.mean_cm:.1f} cm"
+    figure = "" if fit.mean_cm is None else f"Mean distance to the tape points: {fit.mean_cm:.1f} cm"
     return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}

@@ -208,7 +208,7 @@ def _accuracy_step(calibration: list[Path], logs: tuple[LogFacts, ...], fit: Fit
     names = shell_words(*(path.name for path in calibration)) or "calibration.mcap"
     title, command = "Fit and evaluation", f"ipsys replay {names}"
     if fit is not None and not fit.stale:
-        text = "fitted" if fit.mean_cm is None else f"mean position error {fit.mean_cm:.1f} cm"
+        text = "fitted" if fit.mean_cm is None else f"mean distance to the tape points {fit.mean_cm:.1f} cm"
         return StepState("accuracy", title, command, Status.DONE, text)
     if sum(log.points for log in logs) < min_pairs(_MODEL):
         return StepState("accuracy", title, command, Status.WAITS, "first measure calibration points")

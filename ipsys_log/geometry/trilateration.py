@@ -13,6 +13,7 @@ from ipsys_log.errors import IpsysError
 __all__ = [
     "ON_REFERENCE_SIGMA_M",
     "SIDES",
+    "USUAL_TAPE_SCALE_SIGMA",
     "USUAL_TAPE_SIGMA_M",
     "TapePosition",
     "are_collinear",
@@ -31,6 +32,8 @@ SIDES = ("left", "right")
 ON_REFERENCE_SIGMA_M = 0.001
 # Standard deviation of a tape reading, if neither the reading nor the rig gives one.
 USUAL_TAPE_SIGMA_M = 0.003
+# Relative standard deviation of the scale of a tape, if the rig gives none: 1 mm per metre.
+USUAL_TAPE_SCALE_SIGMA = 0.001
 
 
 def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.robust import limit_of, robust_loss
+from ipsys_log.joint.tape_scale import tape_contradiction
 from ipsys_log.joint.trajectories import Kind
 from ipsys_log.units import CM_PER_M
 
@@ -19,6 +20,8 @@ Array = NDArray[np.float64]
 
 # A reading is wrong if its error exceeds this many standard deviations.
 _WRONG = 4.5
+# The same for the scale of the tape. A lab has one, so a smaller limit rarely gives a false alarm.
+_WRONG_TAPE = 3.5
 # A tape reading that fits the place of another point this well was swapped with it.
 _SAME_PLACE_M = 0.03
 
@@ -42,9 +45,9 @@ class Reading:
 class Finding:
     """A probable fault.
 
-    ``kind`` is ``distance``, ``height``, ``place``, ``swapped``, ``length``, ``robot_height``, ``sighting``
-    or ``camera``; ``subject`` is the point, marker or camera. ``score`` is in standard deviations.
-    ``moving`` is True for a sighting of a moving marker.
+    ``kind`` is ``distance``, ``height``, ``place``, ``swapped``, ``length``, ``robot_height``, ``sighting``,
+    ``tape`` or ``camera``; ``subject`` is the point, marker, tape or camera. ``score`` is in standard
+    deviations. ``moving`` is True for a sighting of a moving marker.
     """
 
     kind: str
@@ -69,11 +72,10 @@ def standardise_readings(fit: JointFit) -> list[Reading]:
     spread = _spread_of_points(fit)
     readings = []
     seen: dict[int, int] = {}
+    by_position_m, by_tape_m = factors.distance_slopes(fit.state, fit.problem.layout)
     for row, number in enumerate(factors.distance_points.tolist()):
-        away = fit.state.positions_m[number, :2] - factors.references_m[row]
-        direction = np.r_[away / np.linalg.norm(away), 0.0]
         sigma_m = float(factors.distance_sigmas_m[row])
-        variance = spread.along(number, direction)
+        variance = spread.along(number, np.r_[by_position_m[row], 0.0], by_tape_m[row])
         scored = _left_out(float(residuals.distances[row]) * sigma_m, sigma_m, variance)
         detail = seen[number] = seen.get(number, -1) + 1
         readings.append(Reading(names[number], "distance", detail, *scored))
@@ -82,11 +84,14 @@ def standardise_readings(fit: JointFit) -> list[Reading]:
         scored = _left_out(float(residuals.heights[row]) * sigma_m, sigma_m, spread.above_floor(number))
         readings.append(Reading(names[number], "height", 0, *scored))
     for row, number in enumerate(factors.place_points.tolist()):
-        offset_m = fit.state.positions_m[number, :2] - factors.places_m[row]
+        size = float(fit.state.values[fit.problem.layout.tape][1])
+        given_m = factors.places_m[row] + (size - 1) * factors.place_arms_m[row]
+        offset_m = fit.state.positions_m[number, :2] - given_m
         away_m = max(float(np.hypot(*offset_m)), 1e-12)
         direction = np.r_[offset_m / away_m, 0.0]
         sigma_m = 1 / float(np.linalg.norm(factors.place_whitening[row] @ direction[:2]))
-        scored = _left_out(away_m, sigma_m, spread.along(number, direction))
+        by_size_m = np.array([0.0, -direction[:2] @ factors.place_arms_m[row]])
+        scored = _left_out(away_m, sigma_m, spread.along(number, direction, by_size_m))
         readings.append(Reading(names[number], "place", 0, *scored))
     return readings
 
@@ -105,17 +110,19 @@ class _PointSpread:
     """Uncertainty of the estimated calibration points.
 
     ``own`` (t, 3, 3) is that for constant global unknowns, ``by_global`` (t, 3, g) the slopes by these,
-    ``floor`` (t, g) the slopes of the floor's height.
+    ``floor`` (t, g) the slopes of the floor's height. ``tape`` are the columns of the tape.
     """
 
     own: Array
     by_global: Array
     floor: Array
     covariance: Array
+    tape: slice
 
-    def along(self, number: int, direction: Array) -> float:
-        """Return the variance of a point along a direction (3,)."""
+    def along(self, number: int, direction: Array, by_tape: Array) -> float:
+        """Return the variance of a point along a direction (3,), with slopes (2,) by the tape's scales."""
         slope = direction @ self.by_global[number]
+        slope[self.tape] += by_tape
         return float(direction @ self.own[number] @ direction + slope @ self.covariance @ slope)
 
     def above_floor(self, number: int) -> float:
@@ -136,6 +143,7 @@ def _spread_of_points(fit: JointFit) -> _PointSpread:
         slopes[rows].reshape(count, 3, -1),
         floor,
         fit.covariance,
+        layout.tape,
     )
 
 
@@ -148,13 +156,25 @@ def point_covariances(fit: JointFit) -> Array:
 def find_faults(fit: JointFit) -> list[Finding]:
     """Return probable faults: causes of other faults first, then by their scores."""
     findings = [
+        *_wrong_tape(fit),
         *_wrong_readings(fit),
         *_wrong_bodies(fit),
         *_wrong_sightings(fit),
         *_moved_cameras(fit),
     ]
-    first = ("camera", "length", "robot_height")
+    first = ("camera", "length", "robot_height", "tape")
     return sorted(findings, key=lambda one: (one.kind not in first, -one.score, one.kind, one.subject))
+
+
+def _wrong_tape(fit: JointFit) -> list[Finding]:
+    longer, score = tape_contradiction(fit.problem.layout, fit.state, fit.covariance, fit.observations)
+    if abs(score) <= _WRONG_TAPE:
+        return []
+    text = (
+        f"tape: its readings are {abs(longer):.2%} too {'long' if longer > 0 else 'short'} for the reference "
+        "points of the rig; measure their distance with another instrument, and correct the rig or the tape"
+    )
+    return [Finding("tape", "tape", abs(score), text)]
 
 
 def _wrong_readings(fit: JointFit) -> list[Finding]:

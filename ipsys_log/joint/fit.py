@@ -21,6 +21,7 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.joint.start import PlacedCamera, place_cameras
+from ipsys_log.joint.tape_scale import widen_tape
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
 __all__ = ["JointFit", "fit_jointly"]
@@ -117,10 +118,11 @@ def _solve(
 
 
 def _with_floor(fit: JointFit, factor: float) -> tuple[Problem, State]:
-    """Return the problem with another standard deviation of the floor, and the same floor as its start."""
+    """Return the problem with other standard deviations of floor and tape, and the floor as its start."""
     layout, values = fit.problem.layout, fit.state.values.copy()
     values[layout.modes] /= factor
-    problem = replace(fit.problem, layout=replace(layout, floor=layout.floor.scaled(factor)))
+    layout = replace(widen_tape(layout, fit.state, fit.covariance), floor=layout.floor.scaled(factor))
+    problem = replace(fit.problem, layout=layout)
     return problem, replace(fit.state, values=values)
 
 
@@ -157,7 +159,7 @@ def _build(
     trajectories = Trajectories(
         len(observations.points), paths, settings.acceleration_sigma, settings.turn_sigma
     )
-    points = make_point_factors(observations.points, settings.point_tilt_sigma_rad)
+    points = make_point_factors(observations.points, observations.tape, settings.point_tilt_sigma_rad)
     values = layout.mean.copy()
     for block, camera_pose in zip(layout.cameras, placed, strict=True):
         values[block.start + 3 : block.start + 6] = camera_pose.origin_m

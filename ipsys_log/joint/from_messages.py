@@ -10,13 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.geometry.trilateration import ON_REFERENCE_SIGMA_M, USUAL_TAPE_SIGMA_M, multilaterate
+from ipsys_log.geometry.trilateration import (
+    ON_REFERENCE_SIGMA_M,
+    USUAL_TAPE_SCALE_SIGMA,
+    USUAL_TAPE_SIGMA_M,
+    multilaterate,
+)
 from ipsys_log.joint.observations import (
     Body,
     CalibrationPoint,
     CameraPrior,
     Observations,
     Sightings,
+    Tape,
     marker_body,
 )
 from ipsys_log.joint.settings import JointSettings
@@ -74,6 +80,7 @@ def gather_observations(
     nominal: Collection[str] = (),
     settings: JointSettings | None = None,
     with_drives: bool = True,
+    baselines: Sequence[Measurement] = (),
 ) -> Observations:
     """Return the observations of a session.
 
@@ -90,6 +97,8 @@ def gather_observations(
     nominal : cameras whose intrinsics are nominal, and not from a chessboard.
     settings : prior standard deviations; None: the defaults.
     with_drives : whether to use the sightings of moving robots.
+    baselines : the valid readings of distances between reference points. They count if the rig says that
+        another instrument has measured these points.
 
     Raises
     ------
@@ -120,7 +129,34 @@ def gather_observations(
         CameraPrior(camera, calibrations[camera], camera in nominal, _row_time(rig, camera))
         for camera in tracks
     )
-    return Observations(cameras, bodies, points, tuple(sightings))
+    return Observations(cameras, bodies, points, tuple(sightings), _tape(rig, baselines))
+
+
+def _tape(rig: Rig, baselines: Sequence[Measurement]) -> Tape:
+    known_m = {point.name: np.array([point.x_m, point.y_m]) for point in rig.reference_points}
+    scale_sigma = rig.tape_scale_sigma or USUAL_TAPE_SCALE_SIGMA
+    if not known_m:
+        return Tape(scale_sigma, scale_sigma)
+    places_m = np.array(list(known_m.values()))
+    middle_m = places_m.mean(axis=0)
+    longest_m = 2 * float(np.linalg.norm(places_m - middle_m, axis=1).max())
+    if rig.ab_sigma_m is None or not longest_m:
+        # This tape may have measured the reference points, too: then a baseline tells nothing of its scale.
+        return Tape(scale_sigma, scale_sigma, middle_m)
+    readings = [
+        (known_m[reading.from_reference], known_m[d.reference], d.distance_m, d.sigma_m)
+        for reading in baselines
+        for d in reading.distances
+        if reading.from_reference in known_m and d.reference in known_m
+    ]
+    return Tape(
+        scale_sigma,
+        rig.ab_sigma_m / longest_m,
+        middle_m,
+        np.array([np.linalg.norm(end_m - start_m) for start_m, end_m, _, _ in readings]),
+        np.array([distance_m for _, _, distance_m, _ in readings], dtype=np.float64),
+        np.array([sigma_m or rig.tape_sigma_m or USUAL_TAPE_SIGMA_M for _, _, _, sigma_m in readings]),
+    )
 
 
 def _row_time(rig: Rig, camera: str) -> float | None:
@@ -174,10 +210,10 @@ def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
     ranges_m = np.array([d.distance_m for d in distances], dtype=np.float64)
     sigmas_m = np.array([d.sigma_m or usual_m for d in distances], dtype=np.float64)
     given = np.array([entered.x_m, entered.y_m]) if entered is not None else None
-    given_m = usual_m
+    given_m, on_reference = usual_m, False
     if given is None and len(distances) == 1 and distances[0].distance_m == 0:
         # At a distance of 0, only a point determines both coordinates: a distance has no direction there.
-        given, given_m = references_m[0], distances[0].sigma_m or ON_REFERENCE_SIGMA_M
+        given, given_m, on_reference = references_m[0], distances[0].sigma_m or ON_REFERENCE_SIGMA_M, True
         references_m, ranges_m, sigmas_m = references_m[:0], ranges_m[:0], sigmas_m[:0]
     start_m = given if given is not None else _start(references_m, ranges_m, sigmas_m, measurement.side)
     height_m = measurement.height_m if entered is None else entered.z_m
@@ -193,6 +229,7 @@ def _point(measurement: Measurement, rig: Rig, body: int) -> CalibrationPoint:
         given_m**2 * np.eye(2) if placed else None,
         height_m,
         _ON_FLOOR_M if height_m == 0 else measurement.height_sigma_m or _USUAL_RULER_M,
+        on_reference,
     )
 
 

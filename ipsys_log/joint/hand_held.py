@@ -195,7 +195,7 @@ def _build(
         np.zeros((0, 3)),
         free_knots,
     )
-    points = make_point_factors(observations.points, np.inf)
+    points = make_point_factors(observations.points, observations.tape, np.inf)
     return Problem(layout, trajectories, tuple(factors), points), state
 
 

@@ -17,6 +17,7 @@ __all__ = [
     "CameraPrior",
     "Observations",
     "Sightings",
+    "Tape",
     "lens_model_of",
     "marker_body",
 ]
@@ -89,7 +90,8 @@ class CalibrationPoint:
 
     ``distances_m`` (k,) with ``distance_sigmas_m`` (k,) are tape distances from ``references_m`` (k, 2), in
     the plane of the floor. ``start_m`` (2,) is a rough position, from these distances. ``point_m`` (2,) with
-    ``covariance_m2`` (2, 2) is a given world point. ``height_m`` is the height above the floor.
+    ``covariance_m2`` (2, 2) is a given world point; ``on_reference``: it is a reference point of the rig.
+    ``height_m`` is the height above the floor.
     """
 
     name: str
@@ -102,6 +104,29 @@ class CalibrationPoint:
     covariance_m2: Array | None = None
     height_m: float | None = None
     height_sigma_m: float = 0.001
+    on_reference: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tape:
+    """The tape of a lab, and the coordinates of the reference points from which it measures.
+
+    Attributes
+    ----------
+    scale_sigma : relative error of all its readings together.
+    references_sigma : relative error of the distances between the reference points in the rig. If the rig
+        does not name another instrument, a tape has measured them, too.
+    middle_m : (2,), the middle of the reference points, which this error does not move.
+    baselines_m, readings_m, reading_sigmas_m : (k,), distances of two reference points in the rig, and the
+        readings of these distances with this tape.
+    """
+
+    scale_sigma: float = 0.001
+    references_sigma: float = 0.001
+    middle_m: Array = field(default_factory=lambda: np.zeros(2))
+    baselines_m: Array = field(default_factory=lambda: np.zeros(0))
+    readings_m: Array = field(default_factory=lambda: np.zeros(0))
+    reading_sigmas_m: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,6 +170,7 @@ class Observations:
     bodies: tuple[Body, ...]
     points: tuple[CalibrationPoint, ...]
     sightings: tuple[Sightings, ...]
+    tape: Tape = Tape()
 
     @property
     def in_hall(self) -> bool:

@@ -13,7 +13,7 @@ from ipsys_log.joint.floor_field import FloorField
 from ipsys_log.joint.observations import CameraPrior, Observations, lens_model_of
 from ipsys_log.joint.settings import JointSettings
 
-__all__ = ["CameraBlock", "Layout", "State", "make_layout"]
+__all__ = ["CameraBlock", "Layout", "State", "make_layout", "tape_sigmas"]
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class CameraBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Order of the global unknowns: cameras, scales of bodies, heights of bodies, modes of the floor.
+    """Order of the global unknowns: cameras, scales and heights of bodies, modes of the floor, tape.
 
     ``mean`` (g,) and ``sigma`` (g,) are the prior. A sigma of 0 keeps an unknown constant; infinity is no
     prior.
@@ -75,6 +75,11 @@ class Layout:
     def modes(self) -> slice:
         """The columns of the floor's modes."""
         return slice(self.heights.stop, self.heights.stop + self.floor.count)
+
+    @property
+    def tape(self) -> slice:
+        """The columns of the scale of the tape, and of the scale of the reference points in the rig."""
+        return slice(self.modes.stop, self.modes.stop + 2)
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -137,13 +142,22 @@ def make_layout(
     bodies = observations.bodies
     heights_m = np.array([body.height_m or 0.0 for body in bodies])
     height_sigmas_m = [body.height_sigma_m if body.height_m is not None else _FIXED for body in bodies]
-    means += [np.ones(len(bodies)), heights_m, np.zeros(floor.count)]
+    means += [np.ones(len(bodies)), heights_m, np.zeros(floor.count), np.ones(2)]
     sigmas += [
         np.array([body.scale_sigma for body in bodies]),
         np.array(height_sigmas_m) if moving else np.zeros(len(bodies)),
         np.ones(floor.count),
+        tape_sigmas(observations),
     ]
     return Layout(tuple(blocks), len(bodies), floor, np.concatenate(means), np.concatenate(sigmas))
+
+
+def tape_sigmas(observations: Observations) -> Array:
+    """Return the standard deviations (2,) of the scales of tape and reference points, 0 without a use."""
+    tape, points = observations.tape, observations.points
+    reads = any(len(point.distances_m) for point in points)
+    refers = reads or any(point.on_reference for point in points)
+    return np.array([tape.scale_sigma if reads else _FIXED, tape.references_sigma if refers else _FIXED])
 
 
 def _free_clocks(observations: Observations) -> list[bool]:

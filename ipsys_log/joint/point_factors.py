@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.joint.normal import NormalEquations
-from ipsys_log.joint.observations import CalibrationPoint
+from ipsys_log.joint.observations import CalibrationPoint, Tape
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.robust import limit_of, robust_loss
 
@@ -20,12 +20,13 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointResiduals:
-    """Standardised residuals: of distances (d,), heights (h,), world points (w, 2), and tilts (t, 2)."""
+    """Standardised residuals: distances (d,), heights (h,), places (w, 2), tilts (t, 2), baselines (b,)."""
 
     distances: Array
     heights: Array
     places: Array
     tilts: Array
+    baselines: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +39,8 @@ class PointFactors:
     references_m, distances_m, distance_sigmas_m : (d, 2), (d,), (d,).
     height_points, heights_m, height_sigmas_m : (h,), heights above the floor.
     place_points, places_m, place_whitening : (w,), (w, 2), (w, 2, 2), given world points.
+    place_on_reference : (w,), which of them are reference points.
+    tape : the readings of distances between reference points.
     count : number of calibration points t; each has a prior on its tilts, with ``tilt_sigma_rad``.
     """
 
@@ -51,22 +54,45 @@ class PointFactors:
     place_points: Indices
     places_m: Array
     place_whitening: Array
+    place_on_reference: NDArray[np.bool_]
+    tape: Tape
     count: int
     tilt_sigma_rad: float
 
     def residuals(self, state: State, layout: Layout) -> PointResiduals:
         """Return the standardised residuals."""
-        positions_m = state.positions_m
-        ranges_m = np.linalg.norm(positions_m[self.distance_points, :2] - self.references_m, axis=1)
+        positions_m, tape = state.positions_m, self.tape
+        scale, size = state.values[layout.tape]
+        ranges_m = np.linalg.norm(self._arms(state, layout), axis=1)
         at = positions_m[self.height_points]
         floor_m, _ = layout.floor.heights(at, state.values[layout.modes])
-        offsets_m = positions_m[self.place_points, :2] - self.places_m
+        offsets_m = positions_m[self.place_points, :2] - self.places_m - (size - 1) * self.place_arms_m
         return PointResiduals(
-            (ranges_m - self.distances_m) / self.distance_sigmas_m,
+            (scale * ranges_m - self.distances_m) / self.distance_sigmas_m,
             (at[:, 2] - floor_m - self.heights_m) / self.height_sigmas_m,
             (self.place_whitening @ offsets_m[:, :, None])[:, :, 0],
             state.turns[:, :2, 2] / self.tilt_sigma_rad,
+            (scale * size * tape.baselines_m - tape.readings_m) / tape.reading_sigmas_m,
         )
+
+    def _arms(self, state: State, layout: Layout) -> Array:
+        """Return the vectors (d, 2) from the reference points, with their estimated scale, to the points."""
+        middle_m, size = self.tape.middle_m, state.values[layout.tape][1]
+        references_m = middle_m + size * (self.references_m - middle_m)
+        return np.asarray(state.positions_m[self.distance_points, :2] - references_m)
+
+    def distance_slopes(self, state: State, layout: Layout) -> tuple[Array, Array]:
+        """Return the derivatives of the expected readings: by the point (d, 2), and by both scales (d, 2)."""
+        arms_m, scale = self._arms(state, layout), state.values[layout.tape][0]
+        ranges_m = np.maximum(np.linalg.norm(arms_m, axis=1), 1e-9)
+        slopes = scale * arms_m / ranges_m[:, None]
+        by_size_m = -(slopes * (self.references_m - self.tape.middle_m)).sum(axis=1)
+        return slopes, np.stack([ranges_m, by_size_m], axis=1)
+
+    @property
+    def place_arms_m(self) -> Array:
+        """Return the derivatives (w, 2) of the given world points by the scale of the reference points."""
+        return np.where(self.place_on_reference[:, None], self.places_m - self.tape.middle_m, 0.0)
 
     def cost(self, state: State, layout: Layout, ease: float) -> float:
         """Return half the sum of the losses."""
@@ -79,17 +105,36 @@ class PointFactors:
         residuals = self.residuals(state, layout)
         normal.cost += self.cost(state, layout, ease)
         roots = [np.sqrt(robust_loss(chi2, limit * ease)[1]) for chi2, limit in _robust_parts(residuals)]
-        self._add_distances(normal, state, residuals.distances * roots[0], roots[0])
+        self._add_distances(normal, state, layout, residuals.distances * roots[0], roots[0])
         self._add_heights(normal, state, layout, residuals.heights * roots[1], roots[1])
-        whitening = self.place_whitening * roots[2][:, None, None]
-        normal.add_local(6 * self.place_points, whitening, residuals.places * roots[2][:, None])
+        self._add_places(normal, layout, residuals.places * roots[2][:, None], roots[2])
+        self._add_baselines(normal, state, layout, residuals.baselines * roots[3], roots[3])
         self._add_tilts(normal, state, residuals.tilts)
 
-    def _add_distances(self, normal: NormalEquations, state: State, residuals: Array, roots: Array) -> None:
-        offsets_m = state.positions_m[self.distance_points, :2] - self.references_m
-        ranges_m = np.maximum(np.linalg.norm(offsets_m, axis=1), 1e-9)
-        slopes = offsets_m * (roots / (ranges_m * self.distance_sigmas_m))[:, None]
-        normal.add_local(6 * self.distance_points, slopes[:, None], residuals[:, None])
+    def _add_distances(
+        self, normal: NormalEquations, state: State, layout: Layout, residuals: Array, roots: Array
+    ) -> None:
+        weights = (roots / self.distance_sigmas_m)[:, None]
+        slopes, by_tape = ((weights * one)[:, None] for one in self.distance_slopes(state, layout))
+        starts = 6 * self.distance_points
+        normal.add_local(starts, slopes, residuals[:, None])
+        normal.add_mixed(starts, slopes, layout.tape, by_tape)
+        normal.add_global(_columns(layout.tape), by_tape, residuals[:, None])
+
+    def _add_places(self, normal: NormalEquations, layout: Layout, residuals: Array, roots: Array) -> None:
+        starts, whitening = 6 * self.place_points, self.place_whitening * roots[:, None, None]
+        by_size = -(whitening @ self.place_arms_m[:, :, None])
+        size = slice(layout.tape.stop - 1, layout.tape.stop)
+        normal.add_local(starts, whitening, residuals)
+        normal.add_mixed(starts, whitening, size, by_size)
+        normal.add_global(_columns(size), by_size, residuals)
+
+    def _add_baselines(
+        self, normal: NormalEquations, state: State, layout: Layout, residuals: Array, roots: Array
+    ) -> None:
+        weights = roots * self.tape.baselines_m / self.tape.reading_sigmas_m
+        slopes = weights[:, None, None] * state.values[layout.tape][::-1]
+        normal.add_global(_columns(layout.tape), slopes, residuals[:, None])
 
     def _add_heights(
         self, normal: NormalEquations, state: State, layout: Layout, residuals: Array, roots: Array
@@ -101,7 +146,7 @@ class PointFactors:
         starts = 6 * self.height_points
         normal.add_local(starts, slopes[:, None], residuals[:, None])
         if layout.floor.count:
-            modes = np.arange(layout.modes.start, layout.modes.stop)
+            modes = _columns(layout.modes)
             by_modes = -layout.floor.modes(at)[:, None] * scale[:, None, None]
             normal.add_mixed(starts, slopes[:, None], layout.modes, by_modes)
             normal.add_global(modes, by_modes, residuals[:, None])
@@ -116,16 +161,23 @@ class PointFactors:
 
 
 def _robust_parts(residuals: PointResiduals) -> list[tuple[Array, float]]:
-    """Return chi2 of the distances, the heights and the world points, each with its limit."""
+    """Return chi2 of distances, heights, world points and baselines, each with its limit."""
     one, two = float(limit_of(1.0)), float(limit_of(2.0))
     return [
         (residuals.distances**2, one),
         (residuals.heights**2, one),
         ((residuals.places**2).sum(axis=1), two),
+        (residuals.baselines**2, one),
     ]
 
 
-def make_point_factors(points: tuple[CalibrationPoint, ...], tilt_sigma_rad: float) -> PointFactors:
+def _columns(part: slice) -> Indices:
+    return np.arange(part.start, part.stop)
+
+
+def make_point_factors(
+    points: tuple[CalibrationPoint, ...], tape: Tape, tilt_sigma_rad: float
+) -> PointFactors:
     """Return the factors of calibration points."""
     counts = [len(point.distances_m) for point in points]
     heights = [n for n, point in enumerate(points) if point.height_m is not None]
@@ -142,6 +194,8 @@ def make_point_factors(points: tuple[CalibrationPoint, ...], tilt_sigma_rad: flo
         np.array(placed, dtype=np.intp),
         np.array([points[n].point_m for n in placed], dtype=np.float64).reshape(-1, 2),
         np.linalg.inv(np.linalg.cholesky(covariances)) if placed else covariances,
+        np.array([points[n].on_reference for n in placed], dtype=np.bool_),
+        tape,
         len(points),
         tilt_sigma_rad,
     )

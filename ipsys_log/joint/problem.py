@@ -108,11 +108,13 @@ def find_blocks(
 ) -> tuple[Block, ...]:
     """Return one block for all stationary poses, and one for each path over the floor.
 
-    A block has the cameras and the bodies of its sightings, and all modes of the floor.
+    A block has the cameras and the bodies of its sightings, and all modes of the floor. The tape belongs to
+    the stationary poses.
     """
     starts = trajectories.path_starts
     used = np.zeros((len(starts), len(layout.mean)), dtype=np.bool_)
     used[:, layout.modes] = True
+    used[0, layout.tape] = True
     for factors in sightings:
         block, bodies = layout.cameras[factors.camera], factors.sightings.body
         moving = factors.kind is Kind.FLOOR

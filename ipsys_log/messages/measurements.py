@@ -31,10 +31,11 @@ class WorldPoint:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A tape measurement of one marker at one calibration point; or a withdrawal, or a re-admission.
+    """A tape measurement of one marker at one calibration point; or a baseline, a withdrawal, a re-admission.
 
-    A message with ``withdraws`` or ``readmits`` has the id of a measurement there, and perhaps a reason. The
-    last message about a measurement counts.
+    A message with ``from_reference`` is a baseline: distances from this reference point to others, read with
+    the same tape. A message with ``withdraws`` or ``readmits`` has the id of a measurement there, and perhaps
+    a reason. The last message about a measurement counts.
     """
 
     timestamp: TimeNs
@@ -51,11 +52,12 @@ class Measurement:
     calibration_point: str | None = None
     readmits: str | None = None
     reason: str | None = None
+    from_reference: str | None = None
 
     @property
     def is_point(self) -> bool:
-        """Return whether the message is a measurement, and no withdrawal or re-admission."""
-        return self.refers_to is None
+        """Return whether the message is a measurement of a marker, and nothing else."""
+        return self.refers_to is None and self.from_reference is None
 
     @property
     def refers_to(self) -> str | None:

@@ -84,7 +84,8 @@ class ErrorStatistics:
     """Statistics of a set of distances.
 
     ``std_m`` divides by count - 1, as in Tables I and II. ``mean_low_m`` and ``mean_high_m`` are the 95 %
-    confidence interval of the mean.
+    confidence interval of the mean. ``remaining_m`` is the mean without the stated error of the tape, with
+    its interval; None against the ground truth, or if the tape has no sigma.
     """
 
     count: int
@@ -96,6 +97,9 @@ class ErrorStatistics:
     p95_m: float | None = None
     mean_low_m: float | None = None
     mean_high_m: float | None = None
+    remaining_m: float | None = None
+    remaining_low_m: float | None = None
+    remaining_high_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -129,6 +129,8 @@ class Rig:
     stream: RigStream | None = None
     reference_markers: tuple[ReferenceMarker, ...] = ()
     nodes: RigNodes | None = None
+    tape_scale_sigma: float | None = None
+    ab_sigma_m: float | None = None
 
     @property
     def all_markers(self) -> tuple[RigMarker | ReferenceMarker, ...]:

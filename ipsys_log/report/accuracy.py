@@ -30,7 +30,14 @@ from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Accuracy", "accuracy_json", "gather_outliers", "read_accuracy", "read_trajectories"]
+__all__ = [
+    "Accuracy",
+    "accuracy_json",
+    "gather_outliers",
+    "read_accuracy",
+    "read_trajectories",
+    "remaining_json",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,7 +243,17 @@ def _statistics(errors: ErrorStatistics, rmse_m: float | None) -> dict[str, floa
         "mean_high_cm": errors.mean_high_m,
     }
     values_cm: dict[str, float | int] = {k: v * CM_PER_M for k, v in values.items() if v is not None}
-    return {**values_cm, "n": errors.count}
+    return {**values_cm, **remaining_json(errors), "n": errors.count}
+
+
+def remaining_json(errors: ErrorStatistics) -> dict[str, float]:
+    """Return the mean error after the stated error of the tape, in cm; empty if it is not known."""
+    values = {
+        "remaining_cm": errors.remaining_m,
+        "remaining_low_cm": errors.remaining_low_m,
+        "remaining_high_cm": errors.remaining_high_m,
+    }
+    return {name: value_m * CM_PER_M for name, value_m in values.items() if value_m is not None}
 
 
 def _learning_json(point: LearningPoint) -> dict[str, Any]:

@@ -192,7 +192,11 @@ def label(model: str) -> str:
 
 
 def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
-    """Return the advice from learning curves; None without curves for at least two numbers of points."""
+    """Return the advice from learning curves; None without curves for at least two numbers of points.
+
+    A curve that ends far below the points of a camera gives no advice for them: the camera with the fewest
+    points ends it.
+    """
     published = has_published(evaluations)
     in_space = all(row.error_3d is not None for e in evaluations for row in e.cameras)
     table: dict[int, list[_Candidate]] = {}
@@ -201,11 +205,21 @@ def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
         for point in mean_curve(evaluation, published, in_space):
             candidate = _Candidate(evaluation.model, point.mean_m, _noise_m(point, noise))
             table.setdefault(point.places, []).append(candidate)
-    if len(table) < 2:
+    if len(table) < 2 or (not published and max(table) < _REACH * _most_points(evaluations)):
         return None
     choices = {places: _choices(candidates) for places, candidates in sorted(table.items())}
     sentences = (*_sentences(choices, table), *_too_few(evaluations, in_space))
     return Advice(published, in_space, choices, sentences)
+
+
+# A curve of random subsets reaches this share of the points of a camera, if all cameras have about as many.
+_REACH = 0.5
+
+
+def _most_points(evaluations: Sequence[Evaluation]) -> int:
+    """Return the largest number of calibration points of a camera, by the cross-validation."""
+    rows = [row for evaluation in evaluations for row in evaluation.cameras if row.camera != POOLED]
+    return max((row.error_2d.count for row in rows if row.scheme == CROSS_VALIDATION), default=0)
 
 
 def _relative_noise(evaluation: Evaluation, published: bool, in_space: bool) -> float:

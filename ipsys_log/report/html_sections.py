@@ -65,6 +65,7 @@ def headline(findings: Findings) -> dict[str, Any]:
         "interval": [
             format_cm(end_m, 1) for end_m in (errors.mean_low_m, errors.mean_high_m) if end_m is not None
         ],
+        "remaining": _remaining(errors),
         "in_space": findings.in_space,
         "crossed": bool(best.rows(True)),
         "count": errors.count,
@@ -80,6 +81,12 @@ def headline(findings: Findings) -> dict[str, Any]:
         "fitted": _fitted(findings),
         "cameras": findings.cameras,
     }
+
+
+def _remaining(errors: ErrorStatistics) -> list[str]:
+    """Return the mean error after the error of the tape and the ends of its interval; empty if unknown."""
+    values_m = errors.remaining_m, errors.remaining_low_m, errors.remaining_high_m
+    return [] if None in values_m else [format_cm(value_m) for value_m in values_m]
 
 
 def _fitted(findings: Findings) -> dict[str, str] | None:

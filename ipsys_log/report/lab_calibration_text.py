@@ -65,6 +65,8 @@ def lab_advice(lab: LabCalibration) -> Iterator[str]:
     if lab.is_enough:
         return
     yield ""
+    if lab.tape_advice:
+        yield lab.tape_advice
     if lab.gap is not None:
         low, high = (
             [f"{value * CM_PER_M:.0f}" for value in corner_m] for corner_m in (lab.gap.low_m, lab.gap.high_m)

@@ -14,7 +14,7 @@ from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_squa
 from ipsys_log.analysis.consistency import FEWEST_POINTS
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.models.table import reads_corners
-from ipsys_log.report.accuracy import Accuracy, gather_outliers
+from ipsys_log.report.accuracy import Accuracy, gather_outliers, remaining_json
 from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
 from ipsys_log.report.tables import format_interval, name_cell, plain_table, wrap_text
@@ -101,7 +101,7 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     knows = ", with known marker heights" if uses_height(best.model) else ""
     yield Text(f"{'Best model' if several else 'Model'}: {name_cell(best.model)}{knows}", style="bold")
     errors = ranking_errors(row, space)
-    yield f"Mean position error: {_figures(errors, best.rmse_m(row, errors))}"
+    yield f"Mean distance to the tape points: {_figures(errors, best.rmse_m(row, errors))}"
     cameras = {camera_row.camera for camera_row in (best.evaluation.cameras if best.evaluation else ())} - {
         POOLED
     }
@@ -110,6 +110,7 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
         f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; each pair of "
         "a camera and a point counts as one)."
     )
+    yield from _remaining_lines(errors)
     if best.evaluation and best.evaluation.excluded:
         yield _excluded_line(best, row, space)
     truth = overall_row(best, row.scheme == CROSS_VALIDATION, _TRUTH)
@@ -121,6 +122,17 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
         errors = ranking_errors(told_row, space)
         figures = _figures(errors, told.rmse_m(told_row, errors))
         yield f"With known marker heights: {told.model}, {figures} (2D)."
+
+
+def _remaining_lines(errors: ErrorStatistics) -> Iterator[str]:
+    """Yield the mean position error without the error of the tape, if the tape has a sigma."""
+    if errors.remaining_m is None or errors.remaining_low_m is None or errors.remaining_high_m is None:
+        return
+    low, high = (f"{value_m * CM_PER_M:.2f}" for value_m in (errors.remaining_low_m, errors.remaining_high_m))
+    yield (
+        f"Mean position error, after the stated error of the tape: {errors.remaining_m * CM_PER_M:.2f} cm "
+        f"(95 % CI {low} to {high})."
+    )
 
 
 def _scheme(row: CameraEvaluation) -> str:
@@ -197,6 +209,7 @@ def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
     figures: dict[str, Any] = {"mean_cm": errors.mean_m * CM_PER_M} | (
         {} if rmse_m is None else {"rmse_cm": rmse_m * CM_PER_M}
     )
+    figures |= remaining_json(errors)
     names = [suspect.measurement for suspect, _ in gather_outliers(accuracies)]
     excluded = [suspect.measurement for suspect in best.evaluation.excluded] if best.evaluation else []
     if excluded:

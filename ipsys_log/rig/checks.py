@@ -27,6 +27,7 @@ _KINDS = {
     "marker_length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "tape_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
+    "ab_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
     "marker_height_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
     "height_sigma_m": _Kind("m", 0.0, 0.1, _LENGTHS),
     "width_m": _Kind("m", 0.0, 100.0, _LENGTHS),

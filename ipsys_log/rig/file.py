@@ -50,6 +50,7 @@ _LARGEST_INT = {"_ns": 2**62}  # by the last three characters of a name
 _LARGEST_ID = 2**31 - 1
 _LARGEST_FILE = 1 << 18  # bytes
 _LARGEST_PORT = 65535
+_LARGEST_SCALE_SIGMA = 0.05  # of a tape: a stick that somebody made
 _MARKER = re.compile(r"marker_\d{1,4}")
 _LONGEST_LINE = 120  # characters of a line that an error repeats
 
@@ -300,10 +301,18 @@ def _check_tape(rig: Rig, where: str) -> None:
     at_m = ((round(point.x_m, 3), round(point.y_m, 3)) for point in rig.reference_points)
     _check_unique(at_m, f"{where}: two reference points are at")
     sigmas_m = {"tape_sigma_m": rig.tape_sigma_m, "marker_height_sigma_m": rig.marker_height_sigma_m}
+    sigmas_m |= {"ab_sigma_m": rig.ab_sigma_m}
     sigmas_m |= {f"height_sigma_m of marker {marker.id}": marker.height_sigma_m for marker in rig.markers}
     for key, sigma_m in sigmas_m.items():
         if sigma_m is not None and not (math.isfinite(sigma_m) and sigma_m > 0):
             raise IpsysError(f"{where}: {key} = {sigma_m} m is not a standard deviation; it must be above 0")
+
+    scale_sigma = rig.tape_scale_sigma
+    if scale_sigma is not None and not 0 < scale_sigma <= _LARGEST_SCALE_SIGMA:
+        raise IpsysError(
+            f"{where}: tape_scale_sigma = {scale_sigma} is not a relative standard deviation from 0 to "
+            f"{_LARGEST_SCALE_SIGMA:g}; write 0.001 for 0.1 %"
+        )
 
 
 def _check_heights(rig: Rig, where: str) -> None:

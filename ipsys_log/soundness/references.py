@@ -111,7 +111,7 @@ def check_measurements(session: Session) -> Iterator[LogFinding]:
 
 def _follow(measurement: Measurement, active: set[str], withdrawn: set[str]) -> None:
     """Move the id of a message about a measurement to the valid or to the withdrawn ids."""
-    if measurement.is_point:
+    if measurement.refers_to is None:
         active.add(measurement.id)
     elif measurement.withdraws is not None and measurement.withdraws in active:
         active.remove(measurement.withdraws)
@@ -138,12 +138,12 @@ def _faults(
         return
     if measurement.id in active:
         yield "an earlier measurement has the same id", "withdraw one of them"
-    if measurement.marker_id is None:
+    if measurement.from_reference is None and measurement.marker_id is None:
         yield "has no marker", again
         return
     if rig is None:
         return
-    if not rig.knows(measurement.marker_id):
+    if measurement.marker_id is not None and not rig.knows(measurement.marker_id):
         yield f"marker {measurement.marker_id} is not in the rig", complete
     points = {point.name for point in rig.reference_points}
     for name in sorted({distance.reference for distance in measurement.distances} - points):

@@ -228,7 +228,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
 STAGE = Stage(
     name="evaluate",
-    versions={"evaluate": 2},
+    versions={"evaluate": 3},
     reads=(*JOINT_READS, MODEL, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,

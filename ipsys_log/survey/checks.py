@@ -97,7 +97,7 @@ def withdrawal_of(history: Sequence[Measurement], name: str, reason: str | None 
         No measurement has this id, or it is withdrawn already.
     """
     # A faulty measurement can be withdrawn, too.
-    named = [one for one in history if one.is_point and one.id == name]
+    named = [one for one in history if one.refers_to is None and one.id == name]
     if named and name not in withdrawals(history):
         message_id = free_id(history, f"{name}_withdrawn")
         return Measurement(named[-1].timestamp, message_id, withdraws=name, reason=reason)

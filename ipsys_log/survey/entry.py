@@ -14,7 +14,7 @@ from ipsys_log.geometry.trilateration import SIDES, are_collinear
 from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Entry", "Fault", "TypedEntry", "check_references", "needs_side", "parse_entry"]
+__all__ = ["Entry", "Fault", "TypedEntry", "check_references", "needs_side", "parse_baseline", "parse_entry"]
 
 _NUMBER = re.compile(r"\d+(?:[.,]\d*)?|[.,]\d+")
 _ZERO = re.compile(r"0+(?:[.,]0*)?")
@@ -26,6 +26,8 @@ _HIGHEST_M = 5.0
 _NEAR_CM = 10.0
 _METRES = re.compile(r"\d?[.,]\d{3,}")
 _LOWEST_CM = 1.0
+# No tape differs from the distance AB of the rig by more than this share of it.
+_FAR_FROM_AB = 0.05
 
 
 class Fault(NamedTuple):
@@ -129,6 +131,20 @@ def parse_entry(typed: TypedEntry, rig: Rig) -> tuple[Entry, list[Fault]]:
         faults += [Fault(key, f"{key} {text!r}: use letters, digits and _") for text in bad]
     entry = Entry(marker_id, distances, side, height_m, splits, name, tuple(doubts))
     return entry, faults
+
+
+def parse_baseline(text: str, rig: Rig) -> tuple[float, Fault | None]:
+    """Return the distance in m between the first two reference points, typed in cm, or the fault."""
+    first, second, *_ = rig.reference_points
+    faults: list[Fault] = []
+    named = f"distance from {first.name} to {second.name}"
+    read_cm = _number(_bare(text), named, "ab", faults)
+    known_cm = float(np.hypot(second.x_m - first.x_m, second.y_m - first.y_m)) * CM_PER_M
+    if read_cm is not None and abs(read_cm - known_cm) > _FAR_FROM_AB * known_cm:
+        faults.append(
+            Fault("ab", f"{named}: {read_cm:g} cm, but {known_cm:.1f} cm in the rig; correct one of them")
+        )
+    return (read_cm or 0.0) / CM_PER_M, faults[0] if faults else None
 
 
 def _line(rig: Rig, distances: tuple[Distance, ...]) -> str:

@@ -42,8 +42,10 @@ _STEP_M, _SPAN_M = 0.4, 10.0
 _MOST_POINTS = 4
 # A gap is worth a drive if its mean expected error exceeds the goal, and this multiple of the camera's mean.
 _WORSE = 1.1
+# The scale of the tape is worth a reading if it gives this share of the expected error.
+_LARGE_SHARE = 0.4
 # Kinds of faults after which the covariance of the fit is not true. The robust loss removes the others.
-_CAUSES = ("camera", "length", "robot_height")
+_CAUSES = ("camera", "length", "robot_height", "tape")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +108,7 @@ class LabCalibration:
     ignored : number of sightings of moving markers that do not fit; they have little weight.
     missing : cameras of the log without a model, because they saw no marker of the fit.
     notes : remarks.
+    tape_advice : how to find the scale of the tape, where this helps most; else empty.
     """
 
     run: str
@@ -121,6 +124,7 @@ class LabCalibration:
     ignored: int
     missing: tuple[str, ...]
     notes: tuple[str, ...]
+    tape_advice: str = ""
 
     @property
     def mean_m(self) -> float:
@@ -230,7 +234,8 @@ def describe_fit(
         sizes_px,
         expected,
         _candidates(rig, low_m, high_m, step_m),
-        expected_tape_covariances(rig),
+        # Another reading has the same scale: it tells nothing of the part of the error by the scale.
+        expected_tape_covariances(rig, scale_sigma=fit.observations.tape.scale_sigma),
         length_m,
         goal_m if max(c.mean_m for c in cameras if len(c.expected.errors_m)) > goal_m else np.inf,
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,
@@ -255,7 +260,26 @@ def describe_fit(
         ignored,
         missing,
         notes,
+        _tape_advice(rig, fit, float(np.nanmean([camera.mean_m for camera in cameras]))),
     )
+
+
+def _tape_advice(rig: Rig, fit: JointFit, mean_m: float) -> str:
+    """Return the next step if the scale of the tape is a large part of the expected error."""
+    columns, middle_m = fit.problem.layout.tape, fit.observations.tape.middle_m
+    scale_sigma = float(np.sqrt(fit.covariance[columns.start, columns.start]))
+    away_m = float(np.linalg.norm(fit.state.positions_m[:, :2] - middle_m, axis=1).mean())
+    if len(rig.reference_points) < 2 or scale_sigma * away_m < _LARGE_SHARE * mean_m:
+        return ""
+    first, second = (point.name for point in rig.reference_points[:2])
+    if rig.ab_sigma_m is None:
+        return (
+            f"The scale of the tape is known to {scale_sigma:.2%}: if another instrument measured {first} "
+            f"and {second}, give ab_sigma_m in lab.toml; else compare the tape, and give tape_scale_sigma"
+        )
+    if not len(fit.observations.tape.readings_m):
+        return f"Read the distance from {first} to {second} with the tape: ipsys measure LOG --ab CM."
+    return ""
 
 
 def _inputs(session: Session, run: str) -> dict[Channel, str]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal
-from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.analysis.pairs import active_baselines, active_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
@@ -110,7 +110,10 @@ class LiveCalibration:
     def _fit(self, active: list[Measurement]) -> LabCalibration:
         nominal = {camera for camera, lens in self._lenses.items() if is_nominal(lens)}
         markers = {camera: list(seen) for camera, seen in self._markers.items()}
-        observations = gather_observations(self._rig, self._lenses, markers, active, nominal)
+        baselines = active_baselines(list(self._entered))
+        observations = gather_observations(
+            self._rig, self._lenses, markers, active, nominal, baselines=baselines
+        )
         fit = fit_without(observations, ())
         return describe_fit(fit, sorted(markers), "joint", self._rig, self._lenses, self._goal_m)
 

@@ -11,11 +11,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from ipsys_log.analysis.pairs import active_measurements, locate_measurements, withdrawals
+from ipsys_log.analysis.pairs import active_baselines, active_measurements, locate_measurements, withdrawals
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import are_collinear
 from ipsys_log.messages import Measurement
 from ipsys_log.report.styles import camera_styles
+from ipsys_log.survey.baseline import baseline_names, read_baseline
 from ipsys_log.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.scene import (
@@ -40,6 +41,7 @@ def scene_json(scene: MeasuringScene) -> dict[str, Any]:
         "references": [{"name": p.name, "x_m": p.x_m, "y_m": p.y_m} for p in rig.reference_points],
         "floor": None if rig.floor is None else [rig.floor.width_m, rig.floor.depth_m],
         "one_line": are_collinear(points_m),
+        "baseline": {"names": baseline_names(rig), "counts": rig.ab_sigma_m is not None},
         "stops": [
             {"marker": interval.marker_id, "seconds": (interval.end_ns - interval.start_ns) / NS_PER_S}
             for interval in scene.intervals
@@ -52,13 +54,13 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
     """Return all measurements so far, newest first, also withdrawn ones; and the measured intervals."""
     history = scene.history()
     active = active_measurements(history)
-    withdrawn = withdrawals(history)
+    withdrawn, baselines = withdrawals(history), active_baselines(history)
     points = {place.id: place.point_m for place in locate_measurements(active, scene.rig)[0]}
     rows = [
         {
             "id": measurement.id,
             "marker": measurement.marker_id,
-            "counts": measurement in active,
+            "counts": measurement in active or measurement in baselines,
             "point_m": points[measurement.id].tolist()
             if measurement in active and measurement.id in points
             else None,
@@ -66,7 +68,7 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
             "tapes": _tapes(measurement),
         }
         for measurement in reversed(history)
-        if measurement.is_point
+        if measurement.refers_to is None
     ]
     return {"next": next_id(history), "places": rows, "measured": _measured(scene.intervals, active)}
 
@@ -185,6 +187,7 @@ def build_app(scene: MeasuringScene, setup: str | None = None) -> Starlette:
             Route("/api/views", questions.views),
             Route("/api/check", questions.check, methods=["POST"]),
             Route("/api/measure", questions.measure, methods=["POST"]),
+            Route("/api/baseline", questions.baseline, methods=["POST"]),
             Route("/api/undo", questions.undo, methods=["POST"]),
         ],
         exception_handlers=ERROR_HANDLERS,
@@ -235,6 +238,14 @@ class _Questions:
             return JSONResponse(checked_json(checked), 409)
         self._scene.add([checked.measurement])
         return JSONResponse({"saved": checked.id, "history": history_json(self._scene)})
+
+    async def baseline(self, request: Request) -> Response:
+        """Append a reading of the distance between the first two reference points."""
+        scene, text = self._scene, str((await read_json(request)).get("distance", ""))
+        time_ns = max((view.time_ns for view in scene.views(None)), default=0)
+        reading = read_baseline(text, scene.rig, scene.history(), time_ns)
+        scene.add([reading])
+        return JSONResponse({"saved": reading.id, "history": history_json(scene)})
 
     async def undo(self, request: Request) -> Response:
         name = str((await read_json(request)).get("id", ""))

@@ -244,7 +244,7 @@ function nextOpen() {
 
 // The number of points, and how many of them each camera has seen.
 function count() {
-  const points = history.places.filter((place) => place.counts).length;
+  const points = history.places.filter((place) => place.counts && place.marker !== null).length;
   const cameras = Object.entries(view.measured ?? {});
   const seen = cameras.some(([, number]) => number) ? ` (${cameras.map(([camera, number]) => `${camera} ${number}`).join(", ")})` : "";
   $("count").textContent = points ? `: ${points} ${points === 1 ? "point" : "points"}${seen}` : "";
@@ -253,7 +253,7 @@ function count() {
 function list() {
   const rows = history.places.map((place) => {
     const where = place.point_m ? `at x ${cm(place.point_m[0] * 100)}, y ${cm(place.point_m[1] * 100)} cm` : place.counts ? "" : place.reason ? `withdrawn: ${place.reason}` : "withdrawn";
-    const text = make("div", {}, make("b", {}, place.id), make("span", {}, ` marker ${place.marker}`), " ", make("em", {}, where), make("small", {}, place.tapes));
+    const text = make("div", {}, make("b", {}, place.id), make("span", {}, place.marker === null ? "" : ` marker ${place.marker}`), " ", make("em", {}, where), make("small", {}, place.tapes));
     if (!place.counts) return make("li", { className: "gone" }, text);
     const undo = make("button", { type: "button" }, "Undo");
     undo.setAttribute("aria-label", `Undo ${place.id}`);
@@ -294,6 +294,25 @@ const save = guarded(async () => {
   if (stop !== null) await go(nextOpen());
 });
 
+// The distance between the reference points, with this tape: it shows the scale of the tape.
+function buildBaseline() {
+  const [from, to] = lab.baseline.names;
+  document.querySelector("#ab summary").textContent = `Distance from ${from} to ${to} with this tape`;
+  document.querySelector("#ab label").textContent = `Distance from ${from} to ${to}`;
+  $("ab-use").textContent = lab.baseline.counts ? "It shows the scale of the tape."
+    : "It counts if lab.toml has ab_sigma_m: another instrument has measured the reference points.";
+  $("ab").open = lab.baseline.counts && !history.places.some((place) => place.counts && place.marker === null);
+}
+
+const saveBaseline = guarded(async () => {
+  const answer = await write("baseline", { distance: $("ab-distance").value });
+  history = answer.history;
+  tell(`${answer.saved} is in the log`);
+  $("ab-distance").value = "";
+  $("ab").open = false;
+  refresh();
+});
+
 // --- start ------------------------------------------------------------------------------------
 
 async function watch() {
@@ -309,9 +328,14 @@ guarded(async () => {
   }
   $("lab").textContent = lab.model ? `${lab.lab}, model ${lab.model}` : lab.lab;
   buildFields();
+  buildBaseline();
   list();
   draw();
   $("form").addEventListener("input", soon);
+  $("ab-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    saveBaseline();
+  });
   $("form").addEventListener("submit", (event) => {
     event.preventDefault();
     if (!$("save").disabled) save();

@@ -161,6 +161,11 @@ def test_missing_learning_curve_gives_no_advice() -> None:
     assert advise([replace(evaluation("rigid", {10: 3.0}), learning=())]) is None
 
 
+def test_curve_far_below_the_points_of_a_camera_gives_no_advice() -> None:
+    means_cm = {5: 0.5, 7: 0.5}
+    assert advise([evaluation("rigid", means_cm), evaluation("poly", means_cm)]) is None
+
+
 def test_single_model_advice_gives_the_gain_of_more_points() -> None:
     advice = advise([evaluation("best", {10: 3.0, 40: 1.5})])
     assert advice is not None

@@ -87,7 +87,8 @@ def test_the_page_in_a_browser(page: str, width: int, tmp_path: Path) -> None:
         assert natural_height > 50
         assert 0.8 * min(width, 450) < shown <= width
     for words in (
-        "Mean position error", "Recommended model", "Models", "Error map", "Number of calibration points",
+        "Mean distance to the tape points", "Recommended model", "Models", "Error map",
+        "Number of calibration points",
         "Outliers", "Uncertain tape measurements", "Extrapolation",
         "Consistency of the covariance", "Runs and versions", "seed=0", "would fit on the other side",
         "100.0, 200.0, 10.0", "rigid+kriging-regression", "Camera white",
@@ -239,7 +240,7 @@ def test_one_exchanged_pair_does_not_change_the_title(tmp_path: Path) -> None:
         outcomes = replay([tmp_path / f"{name}.mcap"], Request(models=("rigid", "poly")), "evaluate")
         with Session([tmp_path / f"{name}.mcap"]) as session:
             pages.append(render_report(session, read_accuracy(session, outcomes)))
-    titles = [re.search("<h1>Mean position error: ([0-9.]+) cm", page) for page in pages]
+    titles = [re.search("<h1>Mean distance to the tape points: ([0-9.]+) cm", page) for page in pages]
     assert titles[0] is not None
     assert titles[1] is not None
     assert float(titles[1][1]) == pytest.approx(float(titles[0][1]), abs=0.11)

@@ -76,7 +76,7 @@ def test_page_has_frames_gaps_and_events(page: str) -> None:
     # The last text of the kind, with escaped names.
     assert ["frames_dropped", "red", "–", "3", "2.0", "4.0", f"4 frames dropped {EVIL}"] in gaps
     assert "<script" not in page
-    assert "Mean position error" not in page
+    assert "Mean distance to the tape points" not in page
 
 
 def test_page_has_the_percentiles_of_the_latency(page: str) -> None:

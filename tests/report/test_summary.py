@@ -118,7 +118,7 @@ def test_answer_names_model_error_and_outliers_first(paper: Findings) -> None:
     first, *rest = printed(accuracies, 200).splitlines()
     assert first == "Best model: poly"
     found = accuracy_json(accuracies)["models"]["poly"]["pooled"]["cross_validation"]["3d"]
-    assert rest[0].startswith(f"Mean position error: {found['mean_cm']:.1f} cm (95 % CI ")
+    assert rest[0].startswith(f"Mean distance to the tape points: {found['mean_cm']:.1f} cm (95 % CI ")
     assert f"RMSE {found['rmse_cm']:.1f} cm" in rest[0]
     text = "\n".join(rest)
     outliers, errors = text.index("Outliers: measure 5 points again"), text.index("Errors in cm")
@@ -168,7 +168,7 @@ def test_figures_are_without_gross_outliers_and_those_with_them_beside(paper: Fi
     assert (best["mean_cm"], best["excluded"], best["outliers"][0]) == (mean_cm, ["gross_1"], "gross_1")
     assert best["mean_with_excluded_cm"] == pytest.approx(10 * mean_cm)
     words = " ".join(text.split())
-    assert f"Mean position error: {mean_cm:.1f} cm" in words
+    assert f"Mean distance to the tape points: {mean_cm:.1f} cm" in words
     assert (
         "The errors and the advice are without the gross outlier gross_1. With it, the mean error is "
         f"{10 * mean_cm:.1f} cm."

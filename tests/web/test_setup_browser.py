@@ -126,7 +126,7 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: 
         visitor.run_job("#sheet")
         visitor.tap("#onward")
         visitor.run_job("#replay")
-        says(browser, "#panel", "Mean position error")
+        says(browser, "#panel", "Mean distance to the tape points")
         visitor.tap("#onward")
         visitor.tap("#live")
         visitor.wait("document.querySelector('#open-live')")

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
+from ipsys_log.cli.app import app
 from tests.conftest import ROOT
 from tests.shared_files import make_once
 
@@ -67,29 +69,93 @@ def test_wheel_has_every_file_of_the_package(wheel: Path) -> None:
     assert any(name.endswith("LICENSE") for name in names)
 
 
+# In this order: the later commands read the files of the earlier ones.
+_RUNS = """
+simulate -o lab.mcap --width 960 --height 540 --stations 12 --drive-s 0.6 --markers 2
+init lab.toml --from lab.mcap
+markers -o markers.pdf --ids 0-1 --length 0.1
+detect lab.mcap
+camera-frame lab.mcap
+fit lab.mcap --model rigid
+evaluate lab.mcap --model rigid
+locate lab.mcap
+fuse lab.mcap
+smooth lab.mcap
+replay lab.mcap --model rigid --plots figures
+report lab.mcap --model rigid
+info lab.mcap
+runs lab.mcap
+check lab.mcap
+du lab.mcap
+cat lab.mcap --topics /rig
+plan lab.mcap --model rigid
+view lab.mcap --save lab.rrd
+export lab.mcap -o tracks.csv
+stream lab.mcap --udp 9870 --rate 100
+cut lab.mcap -o part.mcap --exclude-topics /truth/tracks
+compact lab.mcap -o compact.mcap
+verify lab.mcap
+diff lab.mcap lab.mcap
+repair lab.mcap
+catalogue . -o logs.parquet
+drive --model-from lab.mcap -o run.mcap --model rigid --lockstep --seconds 1 --port 0
+batch check part.mcap --workers 1
+"""
+# They need cameras, a person, another host, or data of another program: their help alone is printed.
+_HELP = """
+setup, cameras, calibrate, align, record, measure, calibrate-lab, live, exclude, drift, merge, latency, pack,
+score, node, import imsel, import images, import videos, import ros, import truth, import detections,
+import pairs, batch replay, batch evaluate, batch verify, batch export
+"""
+# Runs each command of the standard input in this process, and prints those that fail.
+_DRIVER = """
+import contextlib, io, sys
+from pathlib import Path
+import ipsys_log
+from ipsys_log.cli import main
+
+print(ipsys_log.__file__)
+for line in sys.stdin:
+    sys.argv = ["ipsys", *line.split()]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said):
+            main()
+    except SystemExit as end:
+        if end.code:
+            print("FAILED", line.strip(), end.code, file=sys.stderr)
+"""
+
+
+def commands_of(command: Any, *names: str) -> set[str]:
+    """Return the names of all commands, with those of their groups."""
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        return {" ".join(names)}
+    return {name for key, value in inner.items() for name in commands_of(value, *names, key)}
+
+
+def test_every_command_is_tried_from_the_wheel() -> None:
+    tried = [" ".join(line.split()) for line in _RUNS.strip().splitlines()]
+    tried += [" ".join(name.split()) for name in _HELP.split(",")]
+    known = commands_of(typer.main.get_command(app))
+    assert {name for name in known if not any(f"{line} ".startswith(f"{name} ") for line in tried)} == set()
+
+
 @pytest.mark.slow
-def test_command_runs_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
-    """The rig file, the schemas and the templates come from the wheel, and not from the tree."""
-    installed = tmp_path / "installed"
+def test_commands_run_from_the_wheel_in_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
+    """All files come from the wheel, and not from the tree: rig, schemas, templates, the example robot."""
+    installed, empty = tmp_path / "installed", tmp_path / "empty"
     zipfile.ZipFile(wheel).extractall(installed)
-    shutil.copy(ROOT / "tests" / "golden" / "v0_1_0.mcap", tmp_path / "lab.mcap")
-    commands = (
-        ["init", "lab.toml"],
-        ["export", "lab.mcap", "-o", "tracks.csv"],
-        ["report", "lab.mcap", "--model", "rigid"],
-    )
-    for command in commands:
-        done = subprocess.run(
-            [sys.executable, "-m", "ipsys_log", *command], cwd=tmp_path, capture_output=True, text=True,
-            env={**os.environ, "PYTHONPATH": str(installed)}, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-    used = subprocess.run(
-        [sys.executable, "-c", "import ipsys_log; print(ipsys_log.__file__)"], cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(installed)}, capture_output=True, text=True, check=True,
+    empty.mkdir()
+    lines = [*_RUNS.strip().splitlines(), *(f"{name.strip()} --help" for name in _HELP.split(","))]
+    done = subprocess.run(
+        [sys.executable, "-c", _DRIVER], input="\n".join(map(str.strip, lines)), cwd=empty,
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(installed)}, check=False,
     )  # fmt: skip
-    assert Path(used.stdout.strip()).is_relative_to(installed)
-    assert (tmp_path / "lab.toml").read_bytes() == (_PACKAGE / "rig" / "lab.toml").read_bytes()
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(installed)
+    assert [line for line in done.stderr.splitlines() if line.startswith("FAILED")] == [], done.stderr
 
 
 def test_citation_has_the_version_and_the_license_of_the_package() -> None:

@@ -21,17 +21,19 @@ __all__ = ["continue_newest"]
 def continue_newest(request: Request, paths: Sequence[LogLocation], until: Stage) -> Request:
     """Return the request with the model and the settings of the newest run, if the user selects no model.
 
-    The stages that make or evaluate models have their own default. Settings of the user take precedence. A
-    run with a model that is only fitted and evaluated was not selected: ``evaluate`` fits all models.
+    The stages that make or evaluate models have their own default. Settings of the user take precedence.
+    Several models that are only fitted and evaluated were not selected: ``evaluate`` fits all models.
     """
     has_default = MODEL in until.writes or EVALUATION in until.writes or not is_of_model(until)
     if request.models or request.model_from is not None or has_default:
         return request
     with Session(paths) as session:
         records = complete_runs(session)
-        evaluated = {run.run for run in records if writes(run, EVALUATION)}
+        applied = {run.run for run in records if _applies_model(run)}
+        only_evaluated = {run.run for run in records if writes(run, EVALUATION)} - applied
+        of_evaluation = only_evaluated if len(only_evaluated) > 1 else set()
         for run in reversed(records):
-            is_candidate = run.run not in evaluated if writes(run, MODEL) else _applies_model(run)
+            is_candidate = _applies_model(run) or (writes(run, MODEL) and run.run not in of_evaluation)
             chain = _chain(run, records) if is_candidate else []
             fitted = next((one for one in chain if writes(one, MODEL)), None)
             if fitted is not None and "model" in fitted.parameters:
@@ -41,7 +43,7 @@ def continue_newest(request: Request, paths: Sequence[LogLocation], until: Stage
 
 def _applies_model(run: Run) -> bool:
     stage = stage_named(run.stage)
-    return stage is not None and is_of_model(stage) and not writes(run, EVALUATION)
+    return stage is not None and is_of_model(stage) and not (writes(run, EVALUATION) or writes(run, MODEL))
 
 
 def _chain(run: Run, records: Sequence[Run]) -> list[Run]:

@@ -397,8 +397,11 @@ def test_stage_without_model_continues_the_newest_run(ipsys: Ipsys, replayed: Pa
         assert track.robot.startswith("bus")
         assert (track.run, track.channel) == ("monday", "smoothed_tracks")
     # An evaluation of all models selects none.
-    assert ipsys("evaluate", replayed, "--model", "kriging").code == 0
+    assert ipsys("evaluate", replayed, "--model", "kriging", "--model", "rayplane").code == 0
     assert runs_of(ipsys, "smooth", replayed)["smooth"] == ("monday", False)
+    # One model is fitted and evaluated before it is applied.
+    assert ipsys("fit", replayed, "--model", "kriging-regression").code == 0
+    assert runs_of(ipsys, "locate", replayed)["locate"] == ("kriging_regression", True)
     # A setting of the user counts.
     assert runs_of(ipsys, "smooth", replayed, "--model", "poly")["smooth"] == ("poly", True)
 

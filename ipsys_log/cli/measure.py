@@ -229,7 +229,9 @@ def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
     if as_json:
         print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
         return
-    also = f", {withdrawn} withdrawn" if withdrawn else ""
+    baselines = sum(measurement.from_reference is not None for measurement in added)
+    also = f", {baselines} distance AB" if baselines else ""
+    also += f", {withdrawn} withdrawn" if withdrawn else ""
     console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
 
 

@@ -102,7 +102,7 @@ def test_the_spread_over_random_subsets_is_noise_too() -> None:
 
 def test_labelled_subsets_of_several_sizes_have_priority() -> None:
     labelled = evaluation("rigid", {10: 1.0, 20: 1.0}, labelled=True)
-    drawn = evaluation("rigid", {5: 2.0, 10: 2.0})
+    drawn = evaluation("rigid", {10: 2.0, 15: 2.0})
     both = advise([replace(drawn, learning=(*drawn.learning, *labelled.learning))])
     assert both is not None
     assert both.published
@@ -111,7 +111,7 @@ def test_labelled_subsets_of_several_sizes_have_priority() -> None:
     one = advise([replace(drawn, learning=(*drawn.learning, labelled.learning[0]))])
     assert one is not None
     assert not one.published
-    assert list(one.choices) == [5, 10]
+    assert list(one.choices) == [10, 15]
 
 
 def test_models_with_known_heights_are_compared_separately() -> None:

@@ -401,7 +401,7 @@ def _has_video(view: StageView) -> bool:
 
 STAGE = Stage(
     name="detect",
-    versions={"detect": 2, EDGES: 1, STOCK: 1},
+    versions={"detect": 3, EDGES: 1, STOCK: 1},
     reads=(RIG, CALIBRATIONS, IMAGES, EVENTS, MARKERS),
     writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
     plan=_plan,

@@ -107,7 +107,7 @@ def test_damage_that_loses_pixels_is_an_error(damage: str) -> None:
 
 @pytest.mark.parametrize("interval", first_fast(1, [20, 0]))
 def test_few_bit_flips_pass_as_a_flaw(interval: int) -> None:
-    """Of 200 flips that a decoder warns of, at most 5 pass; the limits for surplus bytes hold this bound."""
+    """At most 5 of 200 flips pass that a decoder warns of: the limits for surplus bytes hold this bound."""
     data, rng = packed(colourful(320, 240, 1), "4:2:2", interval), np.random.default_rng(1)
     warned = passed = 0
     while warned < 200:

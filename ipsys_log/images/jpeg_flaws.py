@@ -20,12 +20,15 @@ __all__ = ["decode_flawed", "remove_stray_bytes"]
 
 _END, _SCAN = b"\xff\xd9", 0xDA
 _RESTARTS = re.compile(rb"\xff([\xd0-\xd7])")
-# Coded data that change every block: noise without 0xff, which begins a marker.
-_NOISE = np.random.default_rng(5).integers(0, 255, 32, np.uint8).tobytes()
+# Coded data that change every block: a long code, which stands for a large value, and noise without 0xff,
+# which begins a marker.
+_NOISE = b"\xfe\xfd" + np.random.default_rng(5).integers(0, 255, 32, np.uint8).tobytes()
 # Most surplus bytes at the end of coded data that count as a flaw. After damage within the data, the decoder
 # gets out of step, and surplus bytes remain, too: of 400 bit flips in an image of the lab, 2 % pass as a flaw
 # (test_few_bit_flips_pass_as_a_flaw); 63 to 70 % cause no warning at all.
-_MOST_BETWEEN_MARKERS, _MOST_AT_END = 4, 16
+_MOST_BETWEEN_MARKERS, _MOST_AT_END = 6, 16
+# The coded data of grey blocks may end with zeros: a byte for a block, and 0xff is followed by one.
+_MOST_REAL_ZEROS = 3
 # With more surplus bytes in this share of at least so many pieces, the camera makes them.
 _USUAL_SHARE, _LEAST_PIECES = 0.5, 4
 
@@ -97,7 +100,7 @@ class _Pieces:
 
 
 def _split(coded: bytes, header: JpegHeader) -> list[bytes]:
-    """Return the coded data between restart markers, without filler (zeros or 0xff) at their ends.
+    """Return the coded data between restart markers, with little filler (zeros or 0xff) at their ends.
 
     Raises
     ------
@@ -109,9 +112,8 @@ def _split(coded: bytes, header: JpegHeader) -> list[bytes]:
     check_restarts(np.frombuffer(b"".join(_RESTARTS.findall(coded)), np.uint8), header)
     pieces = []
     for piece in _RESTARTS.split(coded)[::2]:
-        data = piece.rstrip(b"\0\xff")
-        # A byte 0xff of the coded data is followed by a zero.
-        pieces.append(data + b"\xff\0" if piece[len(data) :].startswith(b"\xff\0") else data)
+        length = len(piece.rstrip(b"\0\xff"))
+        pieces.append(piece[: length + _MOST_REAL_ZEROS].rstrip(b"\xff"))
     return pieces
 
 

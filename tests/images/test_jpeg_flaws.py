@@ -67,6 +67,22 @@ def test_flaw_that_loses_no_pixel_is_read(flaw: str) -> None:
         np.testing.assert_array_equal(grey[part], pixels[part])
 
 
+def test_zeros_at_the_end_of_coded_data_are_no_filler() -> None:
+    """The coded colours of grey blocks are zeros, up to the end of the data."""
+    rng = np.random.default_rng(2)
+    for _ in range(40):
+        grey = np.repeat(rng.integers(0, 256, (60, 80, 1), np.uint8), 3, axis=2)
+        grey[32:] = 128
+        for interval in (0, 5):
+            data = packed(grey, "4:2:0", interval)
+            surplus = before_restarts(data, b"\x12\x34\x56")
+            for flawed in (data[:-2], data[:-2] + bytes(9), surplus):
+                frame = CompressedImage(0, "red", flawed, "jpeg")
+                np.testing.assert_array_equal(
+                    decode_grey(frame), simplejpeg.decode_jpeg(data, colorspace="GRAY")[..., 0]
+                )
+
+
 DAMAGED: dict[str, Callable[[], bytes]] = {
     "half": lambda: PLAIN[: len(PLAIN) // 2],
     "half_with_end_marker": lambda: PLAIN[: len(PLAIN) // 2] + PLAIN[-2:],
@@ -91,7 +107,7 @@ def test_damage_that_loses_pixels_is_an_error(damage: str) -> None:
 
 @pytest.mark.parametrize("interval", first_fast(1, [20, 0]))
 def test_few_bit_flips_pass_as_a_flaw(interval: int) -> None:
-    """Of 200 flips that a decoder warns of, at most 5 pass; the limits for surplus bytes hold this bound."""
+    """At most 5 of 200 flips pass that a decoder warns of: the limits for surplus bytes hold this bound."""
     data, rng = packed(colourful(320, 240, 1), "4:2:2", interval), np.random.default_rng(1)
     warned = passed = 0
     while warned < 200:

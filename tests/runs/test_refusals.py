@@ -292,7 +292,7 @@ RAISES: dict[str, tuple[str, ...] | str] = {
     "images.decode._raw_pixels": _FRAME,
     "images.decode.check_pixel_count": _FRAME,
     "images.decode.decode_colour": "only exports of pictures call it",
-    "images.jpeg._check_restarts": _FRAME,
+    "images.jpeg.check_restarts": _FRAME,
     "images.video.Video.__init__": _FRAME,
     "images.video.Video._decode": _FRAME,
     "images.video.Video._next": _FRAME,

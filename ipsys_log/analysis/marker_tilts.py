@@ -21,9 +21,10 @@ _LEVEL_RAD = np.radians(6.0)
 # Cameras that look down have a smaller tilt, which the models correct.
 _CAMERA_RAD = np.radians(15.0)
 _MOST_SIGMAS = 5.0
-# The first frames are all used, then every eighth one: a fit takes 1 ms.
-_FIRST_FRAMES, _EVERY_FRAME = 20, 8
+# The first frames are all used, then one of sixteen: a fit takes 1 ms.
+_FIRST_FRAMES, _EVERY_FRAME = 20, 16
 _NORMALS, _LEAST_NORMALS, _LEAST_TILTED = 200, 10, 5
+_CANDIDATES = 20
 # A pose with a larger chi2 than the other one is not that of the marker.
 _OTHER_POSE_CHI2 = 25.0
 # Errors of the lens model, in px.
@@ -112,7 +113,8 @@ class MarkerTilts:
         normals = np.array([one.normals for one in self._normals])
         slack_rad = _MOST_SIGMAS * np.array([one.sigma_rad for one in self._normals])
         down = np.array([[0.0, 0.0, -1.0]])
-        candidates = np.concatenate([down, normals.reshape(-1, 3)])
+        few = normals[:: max(1, len(normals) // _CANDIDATES)]
+        candidates = np.concatenate([down, few.reshape(-1, 3)])
         angles = np.arccos(np.clip(np.einsum("nkd,cd->cnk", normals, candidates), -1, 1)).min(axis=2)
         best = int((angles - slack_rad <= _LEVEL_RAD).sum(axis=1).argmax())
         for own_rad, most_rad in ((angles[best], _LEVEL_RAD), (angles[0], _CAMERA_RAD)):

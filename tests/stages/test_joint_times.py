@@ -6,7 +6,7 @@ from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.payload import joint_payload
-from ipsys_log.messages import Markers, Measurement
+from ipsys_log.messages import Markers, Measurement, Positions
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
@@ -27,7 +27,7 @@ def test_positions_have_the_time_of_the_reference_camera() -> None:
     list(locate(next(message for message in messages if message.topic == "/rig")))
     offsets_ns: dict[str, int] = {}
     for message in seen:
-        for payload in locate(message):
+        for payload in (one for one in locate(message) if isinstance(one, Positions)):
             offsets_ns |= {str(message.camera): p.time_offset_ns or 0 for p in payload.positions}
     late_ns = lab.clock_offsets_ns
     reference = min(offsets_ns, key=lambda camera: abs(offsets_ns[camera]))

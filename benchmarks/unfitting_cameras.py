@@ -105,7 +105,7 @@ def _import(
     frames = sighted(FISHEYE, random, lengths_m=(0.2, length_m, 0.2))
     _yaml(trial.folder / "red.yaml", change(calibrated_with_errors(FISHEYE, random)))
     (trial.folder / "lab.toml").write_text(
-        '[lab]\nname = "lab"\ndictionary = "DICT_4X4_50"\nmarker_length_m = 0.2\nmarker_height_m = 0.1\n\n'
+        'name = "lab"\ndictionary = "DICT_4X4_50"\nmarker_length_m = 0.2\nmarker_height_m = 0.1\n\n'
         + "".join(f'[[markers]]\nid = {n}\nrobot = "robot_{n}"\n\n' for n in range(3))
         + '[[cameras]]\nname = "red"\n'
     )

@@ -80,7 +80,7 @@ def _errors(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         truth = session.payloads(session.topics(TRUTH))
         times_ns = np.array([tracks.timestamp for tracks in truth])
         rig = session.payloads(session.topics(RIG))[0]
-        for positions in session.payloads(session.topics(POSITIONS)):
+        for positions in session.payloads(session.topics(POSITIONS, "rigid")):
             n = int(np.abs(times_ns - positions.timestamp).argmin())
             if abs(int(times_ns[n]) - positions.timestamp) > _SAME_INSTANT_NS:
                 continue

@@ -17,7 +17,8 @@ from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.messages.channels import POSITIONS
+from ipsys_log.messages.channels import POSITIONS, RUN_EVENTS
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
 from ipsys_log.plain_text import plain_text
 from ipsys_log.runs.frame_times import channel_times
 from ipsys_log.runs.provenance import newest_run
@@ -116,7 +117,15 @@ def contents_json(session: Session) -> dict[str, Any]:
         "channels": {topic: _channel(session, topic) for topic in topics},
         "overlap": overlap_json(session),
         "runs": runs_json(session),
+        "contradictions": _contradictions(session),
     }
+
+
+def _contradictions(session: Session) -> list[str]:
+    """Return the texts of the contradictions between cameras and their calibrations, in all runs."""
+    topics = [topic for run in sorted(session.run_names()) for topic in session.topics(RUN_EVENTS, run)]
+    events = [event for event in session.payloads(topics) if event.kind == CALIBRATION_CONTRADICTED]
+    return [*dict.fromkeys(event.text for event in events)]
 
 
 def overlap_json(session: Session) -> list[dict[str, Any]]:
@@ -210,6 +219,11 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     files.caption_justify = "left"
     tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
     tables += [_overlap_table(found["overlap"])] if found["overlap"] else []
+    if found["contradictions"]:
+        contradictions = _table("Contradictions", "markers against calibrations")
+        for text in found["contradictions"]:
+            contradictions.add_row(Text(plain_text(text), style="yellow"))
+        tables.append(contradictions)
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 
 

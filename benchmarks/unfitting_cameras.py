@@ -80,7 +80,7 @@ def _errors(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         truth = session.payloads(session.topics(TRUTH))
         times_ns = np.array([tracks.timestamp for tracks in truth])
         rig = session.payloads(session.topics(RIG))[0]
-        for positions in session.payloads(session.topics(POSITIONS)):
+        for positions in session.payloads(session.topics(POSITIONS, "rigid")):
             n = int(np.abs(times_ns - positions.timestamp).argmin())
             if abs(int(times_ns[n]) - positions.timestamp) > _SAME_INSTANT_NS:
                 continue
@@ -105,7 +105,7 @@ def _import(
     frames = sighted(FISHEYE, random, lengths_m=(0.2, length_m, 0.2))
     _yaml(trial.folder / "red.yaml", change(calibrated_with_errors(FISHEYE, random)))
     (trial.folder / "lab.toml").write_text(
-        '[lab]\nname = "lab"\ndictionary = "DICT_4X4_50"\nmarker_length_m = 0.2\nmarker_height_m = 0.1\n\n'
+        'name = "lab"\ndictionary = "DICT_4X4_50"\nmarker_length_m = 0.2\nmarker_height_m = 0.1\n\n'
         + "".join(f'[[markers]]\nid = {n}\nrobot = "robot_{n}"\n\n' for n in range(3))
         + '[[cameras]]\nname = "red"\n'
     )

@@ -102,9 +102,13 @@ class MarkerTracker:
 
     @property
     def squares(self) -> list[Candidate]:
-        """Return the new markers of the last frame with their raw corners, measured or not."""
+        """Return the new markers of the last frame, measured or rejected, or not square, with raw corners."""
         ids = {track[0].pose.id for track in self._tracks} | {rejection.id for rejection in self._rejections}
-        return [candidate for candidate in self._candidates if candidate.id in ids]
+        return [
+            candidate
+            for candidate in self._candidates
+            if candidate.id in ids or not _is_square(undistort(candidate.corners_px, self._lens))
+        ]
 
     @property
     def rejections(self) -> list[Rejection]:
@@ -305,7 +309,7 @@ class MarkerTracker:
             return [], []
         corners_px = np.array([candidate.corners_px for candidate in candidates])
         uv = undistort(corners_px.reshape(-1, 2), self._lens).reshape(-1, 4, 2)
-        usable = [n for n, corners in enumerate(uv) if np.isfinite(corners).all() and is_convex(corners)]
+        usable = [n for n, corners in enumerate(uv) if _is_square(corners)]
         if not usable:
             return [], []
         rotations, centres = solve_squares(uv[usable], np.ones(len(usable)))
@@ -356,6 +360,11 @@ def _jumped(outlines_px: Sequence[Array], fits: Sequence[MarkerFit | None]) -> b
         fit is not None and np.abs(fit.corners_px - outline_px).max() > _JUMP_PX
         for outline_px, fit in zip(outlines_px, fits, strict=True)
     )
+
+
+def _is_square(uv: Array) -> bool:
+    """Return whether corners (4, 2) can be those of a marker seen from in front."""
+    return bool(np.isfinite(uv).all()) and is_convex(uv)
 
 
 def _rows(outlines_px: Sequence[Array], changed: tuple[slice, slice] | None) -> list[slice]:

@@ -103,7 +103,7 @@ MODEL_PARTS = {
     "kriging-regression": ModelPart(lambda: _kriging(noisy=True), version=1, min_pairs=6),
     "rayplane": ModelPart(_ray_plane, version=2, min_pairs=5, reads_height=True),
     "best": ModelPart(_ray_depth, version=1, min_pairs=5),
-    "joint": ModelPart(None, version=5, min_pairs=0, reads_height=True),
+    "joint": ModelPart(None, version=6, min_pairs=0, reads_height=True),
 }
 
 # First the models of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR.

@@ -20,8 +20,8 @@ from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observ
 from ipsys_log.analysis.tape import expected_tape_covariances
 from ipsys_log.analysis.taped_points import TapedPoint, choose_points
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.diagnosis import Finding, find_faults
-from ipsys_log.joint.fit import JointFit
+from ipsys_log.joint.diagnosis import find_faults
+from ipsys_log.joint.fit import Finding, JointFit
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.log.dataset import Session
@@ -43,7 +43,7 @@ _MOST_POINTS = 4
 # A gap is worth a drive if its mean expected error exceeds the goal, and this multiple of the camera's mean.
 _WORSE = 1.1
 # Kinds of faults after which the covariance of the fit is not true. The robust loss removes the others.
-_CAUSES = ("camera", "length", "robot_height")
+_CAUSES = ("doubt", "camera", "row_time", "length", "robot_height")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,6 +276,8 @@ def _places(fit: JointFit, models: Mapping[str, JointModel]) -> list[Array]:
     places = []
     bodies, points = fit.observations.bodies, fit.observations.points
     for camera, sightings in zip(fit.observations.cameras, fit.observations.sightings, strict=True):
+        if camera.is_former:
+            continue
         heights_m = [
             (points[point].height_m if point >= 0 else bodies[body].height_m) or 0.0
             for body, point in zip(sightings.body.tolist(), sightings.point.tolist(), strict=True)

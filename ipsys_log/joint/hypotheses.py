@@ -90,6 +90,9 @@ def _fit_readings(observations: Observations, settings: JointSettings, progress:
     if fit is not None and not _is_contradicted(fit):
         return fit
     explanations = _explain_tape(observations, settings, progress)
+    if explanations and not explanations[0].changes:
+        # The readings as they are need no other explanation.
+        explanations = explanations[:1]
     if explanations and (fit is None or len(explanations) > 1 or _left_out(explanations[0])):
         return _fit_explained(observations, explanations, settings, progress)
     if fit is None and error is not None:

@@ -59,6 +59,7 @@ class CameraResult:
     places_m : (k, 2), positions of the markers that it saw.
     clock_s : the clock offset of the stored model, in s: 0 if it is not significant; None without drives.
     nominal : the intrinsics were nominal.
+    row_time_s : the estimated time between two rows, in s; None if the rig has it.
     """
 
     expected: ExpectedErrors
@@ -69,6 +70,7 @@ class CameraResult:
     places_m: Array
     clock_s: float | None
     nominal: bool
+    row_time_s: float | None = None
 
     @property
     def camera(self) -> str:
@@ -335,7 +337,16 @@ def _describe_camera(
         places_m,
         clock_s if moving else None,
         nominal,
+        _row_time_s(fit, number) if moving else None,
     )
+
+
+def _row_time_s(fit: JointFit, camera: int) -> float | None:
+    """Return the row time of a camera if the fit estimates it."""
+    column = fit.problem.layout.cameras[camera].edge + 2
+    if not fit.problem.layout.free[column]:
+        return None
+    return fit.observations.cameras[camera].known_row_s + float(fit.state.values[column])
 
 
 def _rmse_px(fit: JointFit, camera: int) -> float:

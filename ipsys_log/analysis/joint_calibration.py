@@ -12,8 +12,9 @@ from ipsys_log.analysis.calibration_points import find_pairs, measured
 from ipsys_log.analysis.pairs import active_baselines
 from ipsys_log.errors import FitError
 from ipsys_log.joint.diagnosis import find_faults
-from ipsys_log.joint.fit import JointFit, fit_jointly
+from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.from_messages import gather_observations
+from ipsys_log.joint.hypotheses import fit_hypotheses
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.selection import seeing_cameras, without_points
@@ -64,7 +65,7 @@ def fit_without(
         if _same(known, wanted):
             return fit
     # The number of steps is not known before; each brings the fit nearer to its end.
-    fit = fit_jointly(wanted, progress=lambda step, cost: progress(step, step + 1))
+    fit = fit_hypotheses(wanted, progress=lambda step, cost: progress(step, step + 1))
     _LAST_FIT[:] = [(wanted, fit)]
     return fit
 
@@ -101,11 +102,11 @@ def fit_joint_model(
     left_out = {point.measurement.id for point in points} - set(train)
     observations = observe(view)
     fit = fit_without(observations, left_out, progress)
-    fitted = {camera.name for camera in fit.observations.cameras}
+    seeing = {camera.name for camera in seeing_cameras(observations).cameras}
     notes.extend(
         f"camera {camera.name} saw no calibration point and no robot: it has no model"
         for camera in observations.cameras
-        if camera.name not in fitted
+        if camera.name not in seeing
     )
     faults = [fault.text for fault in find_faults(fit)]
     notes.extend(faults[:_MOST_FAULTS])

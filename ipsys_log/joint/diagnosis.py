@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.moved_cameras import find_moved_cameras
+from ipsys_log.joint.fit import Finding, JointFit
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.tape_scale import tape_contradiction
 from ipsys_log.joint.trajectories import Kind
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Finding", "Reading", "find_faults", "point_covariances", "standardise_readings"]
+__all__ = ["Reading", "find_faults", "point_covariances", "standardise_readings"]
 
 Array = NDArray[np.float64]
 
@@ -22,6 +21,8 @@ Array = NDArray[np.float64]
 _WRONG = 4.5
 # The same for the scale of the tape. A lab has one, so a smaller limit rarely gives a false alarm.
 _WRONG_TAPE = 3.5
+# Nothing tests a reading if the others determine its value with less than this share of its information.
+_LEAST_KEPT = 0.01
 # A tape reading that fits the place of another point this well was swapped with it.
 _SAME_PLACE_M = 0.03
 
@@ -39,22 +40,6 @@ class Reading:
     detail: int
     residual_m: float
     score: float
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """A probable fault.
-
-    ``kind`` is ``distance``, ``height``, ``place``, ``swapped``, ``length``, ``robot_height``, ``sighting``,
-    ``tape`` or ``camera``; ``subject`` is the point, marker, tape or camera. ``score`` is in standard
-    deviations. ``moving`` is True for a sighting of a moving marker.
-    """
-
-    kind: str
-    subject: str
-    score: float
-    text: str
-    moving: bool = False
 
 
 def standardise_readings(fit: JointFit) -> list[Reading]:
@@ -97,10 +82,15 @@ def standardise_readings(fit: JointFit) -> list[Reading]:
 
 
 def _left_out(residual_m: float, sigma_m: float, variance: float) -> tuple[float, float]:
-    """Return the residual of a reading that is left out of the fit, and its score."""
+    """Return the residual of a reading that is left out of the fit, and its score.
+
+    Both are 0 if nothing but the reading determines the value.
+    """
     limit = float(limit_of(1.0))
     weight = float(robust_loss(np.array([(residual_m / sigma_m) ** 2]), limit)[1][0])
-    kept = max(1 - weight * variance / sigma_m**2, 1e-6)
+    kept = 1 - weight * variance / sigma_m**2
+    if kept < _LEAST_KEPT:
+        return 0.0, 0.0
     alone_m = residual_m / kept
     return alone_m, abs(alone_m) / float(np.sqrt(sigma_m**2 + variance / kept))
 
@@ -157,12 +147,12 @@ def find_faults(fit: JointFit) -> list[Finding]:
     """Return probable faults: causes of other faults first, then by their scores."""
     findings = [
         *_wrong_tape(fit),
+        *fit.known,
         *_wrong_readings(fit),
         *_wrong_bodies(fit),
         *_wrong_sightings(fit),
-        *_moved_cameras(fit),
     ]
-    first = ("camera", "length", "robot_height", "tape")
+    first = ("doubt", "camera", "row_time", "length", "robot_height", "tape")
     return sorted(findings, key=lambda one: (one.kind not in first, -one.score, one.kind, one.subject))
 
 
@@ -247,18 +237,6 @@ def _wrong_bodies(fit: JointFit) -> list[Finding]:
                 f"{body.height_m * CM_PER_M:.1f} cm; correct the rig, or exchange the markers of two robots"
             )
             findings.append(Finding("robot_height", body.name, score, text))
-    return findings
-
-
-def _moved_cameras(fit: JointFit) -> list[Finding]:
-    findings = []
-    for motion in find_moved_cameras(fit):
-        shift_cm = float(np.linalg.norm(motion.shift_m)) * CM_PER_M
-        text = (
-            f"camera {motion.camera}: it was moved after about {motion.time_s:.0f} s, by {shift_cm:.1f} cm "
-            f"and {np.degrees(motion.turn_rad):.2f} degrees; calibrate with the observations before or after"
-        )
-        findings.append(Finding("camera", motion.camera, float(np.sqrt(motion.chi2)), text))
     return findings
 
 

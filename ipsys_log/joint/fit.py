@@ -12,19 +12,19 @@ from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
 from ipsys_log.joint.floor_unevenness import most_likely_scale
 from ipsys_log.joint.observations import Observations
-from ipsys_log.joint.parameters import State, make_layout
+from ipsys_log.joint.parameters import Layout, State, make_layout
 from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
 from ipsys_log.joint.problem import Problem, find_blocks
-from ipsys_log.joint.refusals import check_observations, check_spread, explain
+from ipsys_log.joint.refusals import check_observations, explain
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import SHORT, ConvergenceError, Solution, solve
-from ipsys_log.joint.start import PlacedCamera, place_cameras
+from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
 from ipsys_log.joint.tape_scale import widen_tape
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
-__all__ = ["JointFit", "fit_jointly"]
+__all__ = ["Finding", "JointFit", "fit_jointly", "fit_shape"]
 
 Array = NDArray[np.float64]
 
@@ -38,11 +38,32 @@ _ROUGH = 0.3
 _NEAR = 0.03
 
 
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A probable fault.
+
+    ``kind`` is ``distance``, ``height``, ``place``, ``swapped``, ``side``, ``doubt``, ``length``,
+    ``robot_height``, ``sighting``, ``tape``, ``row_time``, ``left_out`` or ``camera``; ``subject`` is the
+    point, marker, tape or camera. ``score`` is in standard deviations. ``moving`` is True for a sighting of a
+    moving marker.
+    ``place_m`` is the true place of a point that is not in the fit.
+    """
+
+    kind: str
+    subject: str
+    score: float
+    text: str
+    moving: bool = False
+    place_m: tuple[float, float] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JointFit:
     """The result of a joint calibration.
 
-    ``covariance`` (g, g) is that of the global unknowns, in the order of ``problem.layout``.
+    ``covariance`` (g, g) is that of the global unknowns, in the order of ``problem.layout``. ``known`` are
+    faults whose observations are not in the fit, or have their own unknowns. ``is_certain`` is False
+    if another explanation of the readings is as probable: then the covariance does not contain the errors.
     """
 
     observations: Observations
@@ -50,6 +71,8 @@ class JointFit:
     problem: Problem
     solution: Solution
     covariance: Array
+    known: tuple[Finding, ...] = ()
+    is_certain: bool = True
 
     @property
     def state(self) -> State:
@@ -61,6 +84,7 @@ def fit_jointly(
     observations: Observations,
     settings: JointSettings | None = None,
     progress: Callable[[int, float], None] = lambda step, cost: None,
+    placed: list[PlacedCamera] | None = None,
 ) -> JointFit:
     """Estimate all cameras of a lab, the floor and the places of the markers together.
 
@@ -69,6 +93,7 @@ def fit_jointly(
     observations : cameras, markers, calibration points, and sightings.
     settings : prior standard deviations; None: the defaults.
     progress : called with the number of steps and the cost after each step.
+    placed : rough poses of the cameras; None: those of :func:`place_cameras`.
 
     Raises
     ------
@@ -78,17 +103,67 @@ def fit_jointly(
     check_observations(observations)
     observations = _without_unseen(observations)
     try:
-        return _fit(observations, settings or JointSettings(), progress)
+        placed = place_cameras(observations) if placed is None else placed
+        return _fit(observations, settings or JointSettings(), placed, progress)
     except ConvergenceError as error:
         raise explain(error, observations) from error
 
 
-def _fit(
-    observations: Observations, settings: JointSettings, progress: Callable[[int, float], None]
+def fit_shape(
+    observations: Observations,
+    settings: JointSettings,
+    placed: list[PlacedCamera],
+    progress: Callable[[int, float], None] = lambda step, cost: None,
 ) -> JointFit:
-    placed = place_cameras(observations)
-    check_spread(observations, placed)
+    """Estimate all cameras to each other, without the tape: one camera keeps its place and its heading.
+
+    Parameters
+    ----------
+    observations, settings, progress : as for :func:`fit_jointly`; readings of the tape have no effect.
+    placed : rough poses of the cameras to each other.
+
+    Raises
+    ------
+    FitError
+        The method does not converge, or the observations do not determine the cameras.
+    """
+    points = tuple(
+        replace(
+            point,
+            references_m=np.zeros((0, 2)),
+            distances_m=np.zeros(0),
+            distance_sigmas_m=np.zeros(0),
+            point_m=None,
+            covariance_m2=None,
+        )
+        for point in observations.points
+    )
+    untaped = _without_unseen(replace(observations, points=points))
+    # One estimate of the floor is enough for a shape.
+    settings = replace(settings, floor_sigma_spread=0.0)
+    held = max(range(len(placed)), key=lambda camera: len(observations.sightings[camera]))
+    return _fit(untaped, settings, placed, progress, held)
+
+
+def _hold(layout: Layout, held: int, camera_from_world: Array) -> Layout:
+    """Return a layout in which the place of a camera over the floor, and its heading, are constant."""
+    start, sigma = layout.cameras[held].start, layout.sigma.copy()
+    # A small turn about this axis of the camera changes its heading most.
+    sigma[start + int(np.abs(camera_from_world[:, 2]).argmax())] = 0.0
+    sigma[start + 3 : start + 5] = 0.0
+    return replace(layout, sigma=sigma)
+
+
+def _fit(
+    observations: Observations,
+    settings: JointSettings,
+    placed: list[PlacedCamera],
+    progress: Callable[[int, float], None],
+    held: int | None = None,
+) -> JointFit:
     problem, state = _build(observations, settings, placed)
+    if held is not None:
+        problem = replace(problem, layout=_hold(problem.layout, held, placed[held].camera_from_world))
     if len(problem.trajectories.paths):
         # The wobble of a robot acts on its corners by the poses, so that these come first.
         tilts = settings.wobble_sigma_rad, settings.wobble_time_s
@@ -155,7 +230,14 @@ def _build(
                 own = sightings.select(rows), trajectory[rows], kind
                 # Only an average over many frames has less noise than the errors of print and lens.
                 floor_px = settings.corner_floor_px if kind is Kind.STATIONARY else 0.0
-                factors.append(make_sighting_factors(camera, *own, observations.bodies, floor_px))
+                made = make_sighting_factors(camera, *own, observations.bodies, floor_px)
+                if observations.cameras[camera].known_row_s:
+                    # With a row time, whether right or wrong, detection gives the corners of one instant.
+                    rows_px = made.rows.mean(axis=1, keepdims=True)
+                    made = replace(made, rows=np.broadcast_to(rows_px, made.rows.shape))
+                factors.append(made)
+    if lost := sorted(set(range(len(placed))) - {own.camera for own in factors}):
+        raise UnplacedError(observations, lost)
     trajectories = Trajectories(
         len(observations.points), paths, settings.acceleration_sigma, settings.turn_sigma
     )
@@ -165,7 +247,7 @@ def _build(
         values[block.start + 3 : block.start + 6] = camera_pose.origin_m
         values[block.lens][4:] = camera_pose.lens.D
     turns = np.stack([camera_pose.camera_from_world for camera_pose in placed])
-    positions_m, headings_rad = _point_starts(observations, placed)
+    positions_m, headings_rad = rough_points(observations, placed)
     state = State(values, turns, positions_m, level_turns(headings_rad), knots)
     blocks = find_blocks(layout, trajectories, factors) if observations.in_hall else ()
     return Problem(layout, trajectories, tuple(factors), points, blocks), state
@@ -180,21 +262,3 @@ def _floor(placed: list[PlacedCamera], settings: JointSettings) -> FloorField:
     least_m = float(np.sqrt(np.prod(high_m - low_m) / _MOST_LENGTHS))
     length_m = max(settings.floor_length_m, least_m)
     return make_floor_field(low_m, high_m, settings.floor_sigma_m, length_m)
-
-
-def _point_starts(observations: Observations, placed: list[PlacedCamera]) -> tuple[Array, Array]:
-    """Return positions (t, 3) and headings (t,) of the calibration points, as the cameras see them."""
-    count = len(observations.points)
-    sums, turns, seen = np.zeros((count, 3)), np.zeros(count, dtype=complex), np.zeros(count)
-    for camera, sightings in zip(placed, observations.sightings, strict=True):
-        for row in np.flatnonzero(sightings.point >= 0).tolist():
-            point = observations.points[int(sightings.point[row])]
-            place_m = camera.points_m[row]
-            if point.height_m is not None:
-                along = (point.height_m - camera.origin_m[2]) / camera.rays[row, 2]
-                place_m = camera.origin_m + along * camera.rays[row]
-            if np.isfinite(place_m).all():
-                sums[sightings.point[row]] += place_m
-                turns[sightings.point[row]] += np.exp(1j * camera.headings_rad[row])
-                seen[sightings.point[row]] += 1
-    return sums / np.maximum(seen, 1)[:, None], np.angle(turns)

@@ -126,7 +126,7 @@ def gather_observations(
             rows += _moving(own, valid, ids, rig, epoch_ns)
         sightings.append(_table(rows))
     cameras = tuple(
-        CameraPrior(camera, calibrations[camera], camera in nominal, _row_time(rig, camera))
+        CameraPrior(camera, calibrations[camera], camera in nominal, *_row_times(rig, camera))
         for camera in tracks
     )
     return Observations(cameras, bodies, points, tuple(sightings), _tape(rig, baselines))
@@ -159,10 +159,11 @@ def _tape(rig: Rig, baselines: Sequence[Measurement]) -> Tape:
     )
 
 
-def _row_time(rig: Rig, camera: str) -> float | None:
+def _row_times(rig: Rig, camera: str) -> tuple[float | None, float]:
+    """Return the row time that the fit adds (None: it estimates it), and that of the detections."""
     row_time_ns = rig.camera(camera).row_time_ns
     # Detections of a camera with a known row time are those of one instant.
-    return None if row_time_ns is None else 0.0
+    return (None, 0.0) if row_time_ns is None else (0.0, row_time_ns / NS_PER_S)
 
 
 def _gather_tracks(messages: Iterable[Markers]) -> dict[int, _Track]:

@@ -47,6 +47,7 @@ class JointModel:
     floor_modes : (f, k), by the amplitudes of the floor, with k <= m. They do not depend on the other m - k
         numbers.
     corner_floor_px : repeatable part of the error of a corner.
+    is_certain : False if another explanation of the tape readings places the cameras elsewhere.
     """
 
     lens_model: LensModel
@@ -62,6 +63,7 @@ class JointModel:
     modes: Array
     floor_modes: Array
     corner_floor_px: float
+    is_certain: bool = True
 
     @property
     def calibration(self) -> CameraCalibration:
@@ -102,6 +104,7 @@ class JointModel:
             "floor_amplitudes": self.amplitudes,
             "floor_modes": self.floor_modes,
             "modes": self.modes,
+            **({} if self.is_certain else {"uncertain": np.ones(1)}),
         }
 
     @classmethod
@@ -135,6 +138,7 @@ class JointModel:
             own,
             floor_modes,
             float(arrays["corner_floor_px"][0]),
+            "uncertain" not in arrays,
         )
 
 
@@ -146,6 +150,8 @@ def build_models(fit: JointFit) -> dict[str, JointModel]:
     floor_modes = modes[layout.modes, : layout.floor.count].copy()
     models = {}
     for number, (camera, block) in enumerate(zip(fit.observations.cameras, layout.cameras, strict=True)):
+        if camera.is_former:
+            continue
         edge_px = float(state.values[block.edge])
         clock_s, row_s = (_significant(fit, column) for column in range(block.edge + 1, block.stop))
         own = [modes[block.start : block.stop], modes[layout.scales].mean(axis=0)[None]]
@@ -163,6 +169,7 @@ def build_models(fit: JointFit) -> dict[str, JointModel]:
             np.concatenate(own),
             floor_modes,
             fit.settings.corner_floor_px,
+            fit.is_certain,
         )
     return models
 

@@ -1,7 +1,8 @@
-"""Cameras that were moved during a session, from the observations before and after a time."""
+"""Evidence of moved cameras and of wrong row times, by one step of least squares from a fit without them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,8 +10,10 @@ from numpy.typing import NDArray
 
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.normal import NormalEquations
+from ipsys_log.joint.sighting_factors import SightingFactors, WeightedRows
+from ipsys_log.joint.trajectories import Kind
 
-__all__ = ["CameraMotion", "find_moved_cameras"]
+__all__ = ["CameraMotion", "find_moved_cameras", "find_row_times"]
 
 Array = NDArray[np.float64]
 
@@ -19,8 +22,13 @@ _CANDIDATES = 12
 _LEAST_SIGHTINGS = 3
 # A camera without motion exceeds this chi2, with six degrees of freedom, once in a million sessions.
 _MOVED = 60.0
+# A row time that is right exceeds this chi2, with one degree of freedom, once in ten million sessions.
+_WRONG_ROWS = 30.0
 # Unknowns of a pose: a turn and a shift.
 _POSE = 6
+
+# Derivatives (n, 2 p, k) of the residuals of sightings by k additional unknowns.
+_Slopes = Callable[[SightingFactors, WeightedRows], Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,44 +53,80 @@ def find_moved_cameras(fit: JointFit) -> list[CameraMotion]:
     One step of the least-squares fit shows by how much the cost falls.
     """
     motions = []
-    for camera in range(len(fit.observations.cameras)):
-        times_s = _candidates(fit, camera)
-        if not len(times_s):
+    for camera, prior in enumerate(fit.observations.cameras):
+        times_s = _sighting_times(fit, camera)
+        cuts = _cuts(_LEAST_SIGHTINGS, len(times_s) - _LEAST_SIGHTINGS)
+        if prior.is_former or not len(cuts):
             continue
-        best = max(_motions(fit, camera, times_s), key=lambda motion: motion.chi2)
+        best = _best_motion(fit, camera, times_s, cuts)[1]
         if best.chi2 > _MOVED:
-            motions.append(best)
+            motions.append(_best_motion(fit, camera, times_s, _near(times_s, cuts, best.time_s))[1])
     return motions
 
 
-def _candidates(fit: JointFit, camera: int) -> Array:
-    times_s = np.sort(
+def find_row_times(fit: JointFit) -> list[str]:
+    """Return the names of the cameras whose row time, which the fit does not estimate, explains residuals."""
+    layout, wrong = fit.problem.layout, []
+    for camera, (prior, block) in enumerate(zip(fit.observations.cameras, layout.cameras, strict=True)):
+        moving = any(one.camera == camera and one.kind is Kind.FLOOR for one in fit.problem.sightings)
+        if not moving or layout.free[block.edge + 2]:
+            continue
+        column = block.edge + 2 - block.start
+
+        def slopes(_: SightingFactors, rows: WeightedRows, column: int = column) -> Array:
+            return np.asarray(rows.by_global[:, :, column, None])
+
+        gradient, information = _add_unknowns(fit, camera, 1, slopes)
+        if information[0, 0] > 0 and gradient[0] ** 2 / information[0, 0] > _WRONG_ROWS:
+            wrong.append(prior.name)
+    return wrong
+
+
+def _sighting_times(fit: JointFit, camera: int) -> Array:
+    return np.sort(
         np.concatenate(
             [factors.sightings.times_s for factors in fit.problem.sightings if factors.camera == camera]
             or [np.zeros(0)]
         )
     )
-    first, last = _LEAST_SIGHTINGS, len(times_s) - _LEAST_SIGHTINGS
+
+
+def _cuts(first: int, last: int) -> NDArray[np.intp]:
+    """Return numbers of sightings before a motion, from ``first`` to ``last``."""
     if first > last:
-        return np.zeros(0)
-    cuts = np.unique(np.linspace(first, last, _CANDIDATES).astype(int))
-    return np.asarray((times_s[cuts - 1] + times_s[np.minimum(cuts, len(times_s) - 1)]) / 2)
+        return np.zeros(0, dtype=np.intp)
+    return np.unique(np.linspace(first, last, _CANDIDATES).astype(np.intp))
+
+
+def _near(times_s: Array, cuts: NDArray[np.intp], time_s: float) -> NDArray[np.intp]:
+    """Return finer cuts, between those beside a time."""
+    number = int(np.searchsorted(times_s[cuts - 1], time_s)) - 1
+    return _cuts(int(cuts[max(number - 1, 0)]), int(cuts[min(number + 1, len(cuts) - 1)]))
+
+
+def _best_motion(
+    fit: JointFit, camera: int, times_s: Array, cuts: NDArray[np.intp]
+) -> tuple[int, CameraMotion]:
+    """Return the number of the cut with the most evidence, and the motion of the camera there."""
+    between_s = (times_s[cuts - 1] + times_s[np.minimum(cuts, len(times_s) - 1)]) / 2
+    motions = _motions(fit, camera, between_s)
+    best = max(range(len(motions)), key=lambda number: motions[number].chi2)
+    return int(cuts[best]), motions[best]
 
 
 def _motions(fit: JointFit, camera: int, times_s: Array) -> list[CameraMotion]:
     """Return the motion of a camera at each of the times (k,)."""
-    extra, between = _add_motions(fit, camera, times_s)
-    factorisation = fit.solution.factorisation
-    mixed, pulled = factorisation.whiten(extra.coupling)
-    coupling = between[fit.problem.layout.free] - pulled
-    information = extra.dense - coupling.T @ factorisation.solve_reduced(coupling)
-    for own in mixed:
-        if own.shape[1]:
-            information -= own.T @ own
+
+    def slopes(factors: SightingFactors, rows: WeightedRows) -> Array:
+        after = factors.sightings.times_s[:, None] > times_s
+        by_motion = after[:, None, :, None] * rows.by_global[:, :, None, :_POSE]
+        return np.asarray(by_motion.reshape(*rows.residuals.shape, -1))
+
+    gradients, information = _add_unknowns(fit, camera, _POSE * len(times_s), slopes)
     motions = []
     for number, time_s in enumerate(times_s.tolist()):
         part = slice(_POSE * number, _POSE * (number + 1))
-        gradient = extra.global_gradient[part]
+        gradient = gradients[part]
         step: Array = -np.linalg.pinv(information[part, part], rcond=1e-9, hermitian=True) @ gradient
         turn_rad, chi2 = float(np.linalg.norm(step[:3])), float(-step @ gradient)
         name = fit.observations.cameras[camera].name
@@ -90,17 +134,17 @@ def _motions(fit: JointFit, camera: int, times_s: Array) -> list[CameraMotion]:
     return motions
 
 
-def _add_motions(fit: JointFit, camera: int, times_s: Array) -> tuple[NormalEquations, Array]:
-    """Return normal equations with six unknowns for each time, and their part with the global ones (g, 6 k).
+def _add_unknowns(fit: JointFit, camera: int, count: int, slopes: _Slopes) -> tuple[Array, Array]:
+    """Return the gradient (k,) and the information (k, k) of additional unknowns of a camera.
 
-    Only the blocks in which the camera has sightings have columns for these unknowns. In a hall, these are
-    few, so the time for all cameras grows with the sightings and not with their square.
+    The information is that after the elimination of all other unknowns. Only the blocks in which the camera
+    has sightings have columns for these unknowns. In a hall, these are few, so the time for all cameras grows
+    with the sightings and not with their square.
     """
-    problem, layout = fit.problem, fit.problem.layout
-    count = _POSE * len(times_s)
+    problem, layout, factorisation = fit.problem, fit.problem.layout, fit.solution.factorisation
     blocks = tuple(
         replace(block, columns=np.arange(count if seen else 0))
-        for block, seen in zip(fit.solution.factorisation.blocks, _blocks_with(fit, camera), strict=True)
+        for block, seen in zip(factorisation.blocks, _blocks_with(fit, camera), strict=True)
     )
     trajectories = problem.trajectories
     extra = NormalEquations(trajectories.local_count, count, trajectories.bandwidth, blocks)
@@ -109,17 +153,21 @@ def _add_motions(fit: JointFit, camera: int, times_s: Array) -> tuple[NormalEqua
         if factors.camera != camera:
             continue
         rows = factors.weighted_rows(fit.state, layout, trajectories)
-        after = factors.sightings.times_s[:, None] > times_s
-        by_motion = after[:, None, :, None] * rows.by_global[:, :, None, :_POSE]
-        by_motion = by_motion.reshape(*rows.residuals.shape, count)
-        extra.add_mixed(rows.starts, rows.by_local, slice(0, count), by_motion)
-        extra.add_global(np.arange(count), by_motion, rows.residuals)
-        flat = by_motion.reshape(-1, count)
+        own = slopes(factors, rows)
+        extra.add_mixed(rows.starts, rows.by_local, slice(0, count), own)
+        extra.add_global(np.arange(count), own, rows.residuals)
+        flat = own.reshape(-1, count)
         between[factors.columns(layout)] += rows.by_global.reshape(len(flat), -1).T @ flat
         if rows.modes is not None and layout.floor.count:
-            lifted = (by_motion * rows.by_height[:, :, None]).sum(axis=1)
+            lifted = (own * rows.by_height[:, :, None]).sum(axis=1)
             between[layout.modes] += rows.modes.T @ lifted
-    return extra, between
+    mixed, pulled = factorisation.whiten(extra.coupling)
+    coupling = between[layout.free] - pulled
+    information = extra.dense - coupling.T @ factorisation.solve_reduced(coupling)
+    for whitened in mixed:
+        if whitened.shape[1]:
+            information -= whitened.T @ whitened
+    return extra.global_gradient, information
 
 
 def _blocks_with(fit: JointFit, camera: int) -> list[bool]:

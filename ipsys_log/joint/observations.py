@@ -43,13 +43,16 @@ class CameraPrior:
     """A camera before the fit: its name and its intrinsics.
 
     ``nominal`` intrinsics come from a data sheet and not from a chessboard. ``row_time_s`` None: the time
-    between two rows is unknown, and the fit estimates it.
+    between two rows is unknown, and the fit estimates it. ``known_row_s`` is the part that the times of the
+    sightings contain. ``is_former`` marks the observations of a camera before it was moved.
     """
 
     name: str
     lens: CameraCalibration
     nominal: bool = False
     row_time_s: float | None = 0.0
+    known_row_s: float = 0.0
+    is_former: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.solver import ConvergenceError
-from ipsys_log.joint.start import PlacedCamera
 
-__all__ = ["check_observations", "check_spread", "explain"]
-
-Array = NDArray[np.float64]
-
-# Places are on one line if none is farther from it than this.
-_BESIDE_LINE_M = 0.1
+__all__ = ["check_observations", "explain"]
 
 
 def check_observations(observations: Observations) -> None:
@@ -42,30 +35,6 @@ def check_observations(observations: Observations) -> None:
         )
 
 
-def check_spread(observations: Observations, placed: list[PlacedCamera]) -> None:
-    """Check that no camera saw markers along one line alone.
-
-    Parameters
-    ----------
-    observations : all sightings.
-    placed : rough poses of the cameras.
-
-    Raises
-    ------
-    FitError
-        All places of a camera are on one line, so that its tilt across the line is unknown.
-    """
-    for camera, view, sightings in zip(observations.cameras, placed, observations.sightings, strict=True):
-        places_m = view.points_m[np.isfinite(view.points_m).all(axis=1), :2]
-        if len(places_m) < 3 or _beside_line_m(places_m) > _BESIDE_LINE_M:
-            continue
-        kind = "measured points" if (sightings.point >= 0).all() else "places of the markers"
-        raise FitError(
-            f"camera {camera.name}: all {kind} that it saw are on one line; measure points beside the line, "
-            "or drive a curve"
-        )
-
-
 def explain(error: ConvergenceError, observations: Observations) -> FitError:
     """Return the error of a fit that did not converge, with the cameras that nothing holds.
 
@@ -88,10 +57,3 @@ def explain(error: ConvergenceError, observations: Observations) -> FitError:
         f"the joint fit did not converge: no sighting of camera {', '.join(lost)} fits to the other "
         "cameras; drive a robot through its field of view, or leave the camera out"
     )
-
-
-def _beside_line_m(places_m: Array) -> float:
-    """Return the largest distance of places (n, 2) from their best line; the 95th percentile of many."""
-    centred_m = places_m - places_m.mean(axis=0)
-    across = np.linalg.svd(centred_m, full_matrices=False)[2][1]
-    return float(np.percentile(np.abs(centred_m @ across), 95))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ipsys_log.joint.observations import Observations
 
-__all__ = ["seeing_cameras", "without_points"]
+__all__ = ["divide_camera", "seeing_cameras", "without_cameras", "without_points"]
 
 
 def without_points(observations: Observations, names: Collection[str]) -> Observations:
@@ -27,11 +27,30 @@ def without_points(observations: Observations, names: Collection[str]) -> Observ
     return replace(observations, points=points, sightings=tuple(selected))
 
 
-def seeing_cameras(observations: Observations) -> Observations:
-    """Return the observations of the cameras that have sightings."""
-    seeing = [number for number, sightings in enumerate(observations.sightings) if len(sightings)]
+def without_cameras(observations: Observations, cameras: Collection[int]) -> Observations:
+    """Return the observations without some cameras, by their numbers."""
+    kept = [number for number in range(len(observations.cameras)) if number not in cameras]
     return replace(
         observations,
-        cameras=tuple(observations.cameras[number] for number in seeing),
-        sightings=tuple(observations.sightings[number] for number in seeing),
+        cameras=tuple(observations.cameras[number] for number in kept),
+        sightings=tuple(observations.sightings[number] for number in kept),
+    )
+
+
+def seeing_cameras(observations: Observations) -> Observations:
+    """Return the observations of the cameras that have sightings."""
+    blind = [number for number, sightings in enumerate(observations.sightings) if not len(sightings)]
+    return without_cameras(observations, blind)
+
+
+def divide_camera(observations: Observations, camera: int, time_s: float) -> Observations:
+    """Return observations in which a camera until a time is another one, after all others."""
+    prior, sightings = observations.cameras[camera], observations.sightings[camera]
+    before = sightings.times_s <= time_s
+    later = [*observations.sightings]
+    later[camera] = sightings.select(~before)
+    return replace(
+        observations,
+        cameras=(*observations.cameras, replace(prior, is_former=True)),
+        sightings=(*later, sightings.select(before)),
     )

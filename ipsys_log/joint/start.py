@@ -12,15 +12,17 @@ from ipsys_log.joint.marker_views import MarkerViews, guess_distortion, view_mar
 from ipsys_log.joint.observations import Observations
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["PlacedCamera", "place_cameras"]
+__all__ = ["PlacedCamera", "UnplacedError", "place_cameras", "place_freely", "rough_points"]
 
 Array = NDArray[np.float64]
 
 # Errors of a place above this get less weight: that of a depth from the size of a marker.
 _USUAL_M = 0.05
 _ROUNDS = 20
-# Two points nearer together than this do not define a direction.
+# Two points nearer together than this do not define a direction. Shared markers define a better one than two
+# points that are nearer together than the second limit.
 _NEAR_M = 0.3
+_WIDE_M = 1.0
 # A moving marker is interpolated between two sightings that are not farther apart than this.
 _GAP_S = 0.5
 
@@ -53,25 +55,102 @@ class _Matches:
     @property
     def sufficient(self) -> bool:
         """True if the matches determine position and direction of the camera."""
-        if np.isfinite(self.world_headings_rad).any():
-            return True
-        spread_m = np.linalg.norm(self.world_m[:, :2] - self.world_m[:1, :2], axis=1)
-        return bool(len(spread_m) > 1 and spread_m.max() > _NEAR_M)
+        return bool(np.isfinite(self.world_headings_rad).any()) or self.reach_m > _NEAR_M
+
+    @property
+    def reach_m(self) -> float:
+        """The largest distance of a place from the first one."""
+        apart_m = np.linalg.norm(self.world_m[:, :2] - self.world_m[:1, :2], axis=1)
+        return float(apart_m.max(initial=0.0))
+
+
+class UnplacedError(FitError):
+    """Cameras that no point and no marker connects with the others; ``cameras`` are their indices."""
+
+    def __init__(self, observations: Observations, cameras: list[int]) -> None:
+        names = ", ".join(observations.cameras[camera].name for camera in cameras)
+        super().__init__(
+            f"camera {names}: it sees fewer than two measured points, and no marker at the same time as the "
+            "other cameras; measure points in its field of view, or drive a robot through the overlap"
+        )
+        self.cameras = cameras
 
 
 def place_cameras(observations: Observations) -> list[PlacedCamera]:
     """Return a rough pose of each camera.
 
-    A camera that sees two or more measured points is placed by them. Other cameras follow from markers that
-    they share with a placed camera. If no camera sees two measured points, the first camera defines the
-    frame, and the measured points that all cameras see place the whole group.
+    A camera that sees measured points far from each other is placed by them. Other cameras follow from their
+    points, and from markers that they share with a placed camera. If no camera sees two measured points, the
+    first camera defines the frame, and the measured points that all cameras see place the whole group.
 
     Raises
     ------
-    FitError
+    UnplacedError
         A camera has no measured points and shares no marker with a placed camera.
+    FitError
+        The cameras see fewer than two measured points.
     """
-    views = [
+    views = _view(observations)
+    known = _measured_places(observations)
+    taped = [_tape_matches(observations, camera, view, known) for camera, view in enumerate(views)]
+    least_m = min(_WIDE_M, max(matches.reach_m for matches in taped))
+    placed = {
+        camera: _place(views[camera], matches)
+        for camera, matches in enumerate(taped)
+        if matches.sufficient and matches.reach_m >= least_m
+    }
+    if not placed:
+        return _anchor(observations, place_freely(observations, views), known)
+    return _chain(observations, views, taped, placed)
+
+
+def place_freely(observations: Observations, views: list[MarkerViews] | None = None) -> list[PlacedCamera]:
+    """Return rough poses of the cameras to each other, without the tape: one of them is above the origin.
+
+    Raises
+    ------
+    UnplacedError
+        A camera shares no marker with the others.
+    """
+    views = _view(observations) if views is None else views
+    root = max(range(len(views)), key=lambda camera: len(observations.sightings[camera]))
+    shift_m = np.array([0.0, 0.0, _camera_height_m(observations, root, views[root])])
+    placed = {root: _moved(views[root], shift_m, 0.0)}
+    return _chain(observations, views, [], placed)
+
+
+def _camera_height_m(observations: Observations, camera: int, view: MarkerViews) -> float:
+    """Return the height of a camera above the floor by the markers of known height; 0 without one."""
+    sightings, bodies, points = observations.sightings[camera], observations.bodies, observations.points
+    known = [
+        points[point].height_m if point >= 0 else bodies[body].height_m
+        for body, point in zip(sightings.body.tolist(), sightings.point.tolist(), strict=True)
+    ]
+    heights_m = np.array(known, dtype=np.float64) - view.points_m[:, 2]
+    heights_m = heights_m[np.isfinite(heights_m)]
+    return float(np.median(heights_m)) if len(heights_m) else 0.0
+
+
+def rough_points(observations: Observations, placed: list[PlacedCamera]) -> tuple[Array, Array]:
+    """Return positions (t, 3) and headings (t,) of the calibration points, as the cameras see them."""
+    count = len(observations.points)
+    sums, turns, seen = np.zeros((count, 3)), np.zeros(count, dtype=complex), np.zeros(count)
+    for camera, sightings in zip(placed, observations.sightings, strict=True):
+        for row in np.flatnonzero(sightings.point >= 0).tolist():
+            point = observations.points[int(sightings.point[row])]
+            place_m = camera.points_m[row]
+            if point.height_m is not None:
+                along = (point.height_m - camera.origin_m[2]) / camera.rays[row, 2]
+                place_m = camera.origin_m + along * camera.rays[row]
+            if np.isfinite(place_m).all():
+                sums[sightings.point[row]] += place_m
+                turns[sightings.point[row]] += np.exp(1j * camera.headings_rad[row])
+                seen[sightings.point[row]] += 1
+    return sums / np.maximum(seen, 1)[:, None], np.angle(turns)
+
+
+def _view(observations: Observations) -> list[MarkerViews]:
+    return [
         view_markers(
             sightings,
             observations.bodies,
@@ -79,43 +158,33 @@ def place_cameras(observations: Observations) -> list[PlacedCamera]:
         )
         for sightings, camera in zip(observations.sightings, observations.cameras, strict=True)
     ]
-    known = _measured_places(observations)
-    placed: dict[int, PlacedCamera] = {}
-    for camera, view in enumerate(views):
-        matches = _tape_matches(observations, camera, view, known)
-        if matches.sufficient:
-            placed[camera] = _place(view, matches)
-    free = not placed
-    if free:
-        root = max(range(len(views)), key=lambda camera: len(observations.sightings[camera]))
-        placed[root] = _moved(views[root], np.zeros(3), 0.0)
-    _chain(observations, views, placed)
-    cameras = [placed[camera] for camera in range(len(views))]
-    return _anchor(observations, cameras, known) if free else cameras
 
 
-def _chain(observations: Observations, views: list[MarkerViews], placed: dict[int, PlacedCamera]) -> None:
+def _chain(
+    observations: Observations,
+    views: list[MarkerViews],
+    taped: list[_Matches],
+    placed: dict[int, PlacedCamera],
+) -> list[PlacedCamera]:
     """Place all other cameras, the one with the most shared markers first."""
-    shared: dict[int, list[_Matches]] = {camera: [] for camera in range(len(views)) if camera not in placed}
+    shared = {camera: taped[camera : camera + 1] for camera in range(len(views)) if camera not in placed}
     fresh = list(placed)
     while shared:
         for camera, parts in shared.items():
             for other in fresh:
                 parts.extend(_shared_matches(observations, camera, views[camera], other, placed[other]))
         camera = max(shared, key=lambda one: sum(len(part.points_m) for part in shared[one]))
-        matches = _join(shared.pop(camera))
-        if not len(matches.points_m):
-            raise FitError(_lonely(observations, sorted([camera, *shared])))
+        matches = _join(shared[camera])
+        if not matches.sufficient:
+            # The most matches may be measured points near together.
+            ready = [one for one, parts in shared.items() if _join(parts).sufficient]
+            if not ready:
+                raise UnplacedError(observations, sorted(shared))
+            camera, matches = ready[0], _join(shared[ready[0]])
+        del shared[camera]
         placed[camera] = _place(views[camera], matches)
         fresh = [camera]
-
-
-def _lonely(observations: Observations, cameras: list[int]) -> str:
-    names = ", ".join(observations.cameras[camera].name for camera in cameras)
-    return (
-        f"camera {names}: it sees fewer than two measured points, and no marker at the same time as the "
-        "other cameras; measure points in its field of view, or drive a robot through the overlap"
-    )
+    return [placed[camera] for camera in range(len(views))]
 
 
 def _measured_places(observations: Observations) -> Array:

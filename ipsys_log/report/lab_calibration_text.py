@@ -45,7 +45,7 @@ def lab_table(lab: LabCalibration) -> Table:
     title = f"Expected 2D error over the floor, {lab.height_m * CM_PER_M:g} cm above it, by run {lab.run}"
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     table.add_column("camera", overflow="fold")
-    for name in ("mean mm", "p95 mm", "covered", "points", "drive", "residual px", "clock ms"):
+    for name in ("mean mm", "p95 mm", "covered", "points", "drive", "residual px", "clock ms", "row us"):
         table.add_column(name, justify="right", no_wrap=True)
     for camera in lab.cameras:
         seen = len(camera.expected.errors_m)
@@ -55,6 +55,7 @@ def lab_table(lab: LabCalibration) -> Table:
             *((_mm(camera.mean_m), _mm(camera.p95_m), f"{camera.covered:.0%}") if seen else ("-", "-", "-")),
             str(points), str(moving), f"{camera.rmse_px:.3f}",
             "-" if camera.clock_s is None else f"{camera.clock_s * 1000:+.2f}",
+            "-" if camera.row_time_s is None else f"{camera.row_time_s * 1e6:.1f}",
         )  # fmt: skip
     table.add_row("all", _mm(lab.mean_m), _mm(lab.p95_m), "", str(len(lab.points_m)))
     return table
@@ -127,6 +128,7 @@ def _camera_json(camera: CameraResult) -> dict[str, Any]:
         "moving": camera.sightings[1],
         "residual_px": _finite(camera.rmse_px),
         "clock_ms": None if camera.clock_s is None else camera.clock_s * 1000,
+        "row_time_us": None if camera.row_time_s is None else camera.row_time_s * 1e6,
         "nominal": camera.nominal,
         "gaps": [_gap_json(gap) for gap in camera.gaps],
     }

@@ -20,8 +20,8 @@ from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observ
 from ipsys_log.analysis.tape import expected_tape_covariances
 from ipsys_log.analysis.taped_points import TapedPoint, choose_points
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.diagnosis import Finding, find_faults
-from ipsys_log.joint.fit import JointFit
+from ipsys_log.joint.diagnosis import find_faults
+from ipsys_log.joint.fit import Finding, JointFit
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.log.dataset import Session
@@ -45,7 +45,7 @@ _WORSE = 1.1
 # The scale of the tape is worth a reading if it gives this share of the expected error.
 _LARGE_SHARE = 0.4
 # Kinds of faults after which the covariance of the fit is not true. The robust loss removes the others.
-_CAUSES = ("camera", "length", "robot_height", "tape")
+_CAUSES = ("doubt", "camera", "row_time", "length", "robot_height", "tape")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +61,7 @@ class CameraResult:
     places_m : (k, 2), positions of the markers that it saw.
     clock_s : the clock offset of the stored model, in s: 0 if it is not significant; None without drives.
     nominal : the intrinsics were nominal.
+    row_time_s : the estimated time between two rows, in s; None if the rig has it.
     """
 
     expected: ExpectedErrors
@@ -71,6 +72,7 @@ class CameraResult:
     places_m: Array
     clock_s: float | None
     nominal: bool
+    row_time_s: float | None = None
 
     @property
     def camera(self) -> str:
@@ -300,6 +302,8 @@ def _places(fit: JointFit, models: Mapping[str, JointModel]) -> list[Array]:
     places = []
     bodies, points = fit.observations.bodies, fit.observations.points
     for camera, sightings in zip(fit.observations.cameras, fit.observations.sightings, strict=True):
+        if camera.is_former:
+            continue
         heights_m = [
             (points[point].height_m if point >= 0 else bodies[body].height_m) or 0.0
             for body, point in zip(sightings.body.tolist(), sightings.point.tolist(), strict=True)
@@ -357,7 +361,16 @@ def _describe_camera(
         places_m,
         clock_s if moving else None,
         nominal,
+        _row_time_s(fit, number) if moving else None,
     )
+
+
+def _row_time_s(fit: JointFit, camera: int) -> float | None:
+    """Return the row time of a camera if the fit estimates it."""
+    column = fit.problem.layout.cameras[camera].edge + 2
+    if not fit.problem.layout.free[column]:
+        return None
+    return fit.observations.cameras[camera].known_row_s + float(fit.state.values[column])
 
 
 def _rmse_px(fit: JointFit, camera: int) -> float:

@@ -15,7 +15,7 @@ import pytest
 
 from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
 from ipsys_log.exchange.calibration_files import read_intrinsics
-from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.hypotheses import fit_hypotheses
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
@@ -210,9 +210,9 @@ def test_the_fit_of_calibrate_lab_runs_once(
 
     def count(*arguments: Any, **options: Any) -> Any:
         fits.append(1)
-        return fit_jointly(*arguments, **options)
+        return fit_hypotheses(*arguments, **options)
 
-    monkeypatch.setattr("ipsys_log.analysis.joint_calibration.fit_jointly", count)
+    monkeypatch.setattr("ipsys_log.analysis.joint_calibration.fit_hypotheses", count)
     monkeypatch.setattr("ipsys_log.analysis.joint_calibration._LAST_FIT", [])
     log = Path(shutil.copy(session_log, tmp_path / "lab.mcap"))
     assert ipsys("calibrate-lab", log, "--goal-mm", "20").code == 0

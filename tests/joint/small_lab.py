@@ -48,8 +48,9 @@ def make_lab(
     ruler_sigma_m: float = 0.001,
     tilt_deg: float = 2.0,
     lens_error: bool = True,
+    places_m: Array | None = None,
 ) -> tuple[Observations, Truth]:
-    """Return observations of stationary markers at random points, and the truth."""
+    """Return observations of stationary markers at random points or at ``places_m`` (n, 4), and the truth."""
     rng = np.random.default_rng([seed, 77])
     ys = 2.4 + 1.6 * (np.arange(cameras) - (cameras - 1) / 2)
     lenses, poses = [], []
@@ -62,6 +63,7 @@ def make_lab(
     places = np.column_stack(
         [rng.uniform(low, high, (points, 2)), rng.choice([0.0, 0.1, 0.2], points), rng.uniform(-3, 3, points)]
     )
+    places = places if places_m is None else places_m
     taped, rows = [], [[] for _ in lenses]  # type: list[CalibrationPoint], list[list[tuple[int, Array]]]
     for number, (x, y, z, heading) in enumerate(places):
         ranges = np.hypot(x - REFERENCES_M[:, 0], y - REFERENCES_M[:, 1])

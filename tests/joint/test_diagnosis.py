@@ -10,8 +10,9 @@ import pytest
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
-from ipsys_log.joint.diagnosis import Finding, find_faults, standardise_readings
-from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.diagnosis import find_faults, standardise_readings
+from ipsys_log.joint.fit import Finding, fit_jointly
+from ipsys_log.joint.hypotheses import fit_hypotheses
 from ipsys_log.joint.moved_cameras import find_moved_cameras
 from ipsys_log.joint.observations import CalibrationPoint, Observations, marker_body
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
@@ -31,7 +32,7 @@ def exchange(observations: Observations, points: dict[int, CalibrationPoint]) ->
 
 
 def first_fault(observations: Observations) -> Finding:
-    return find_faults(fit_jointly(observations))[0]
+    return find_faults(fit_hypotheses(observations))[0]
 
 
 def turn_camera(observations: Observations, truth: Truth, camera: int, turn_rad: float) -> Observations:
@@ -90,6 +91,11 @@ def test_wrong_side_of_markers_is_estimated(lab: tuple[Observations, Truth]) -> 
     # The scale of the tape, and so that of the side, is known to 0.1 %.
     assert abs(float(fault.text.split("its side is ")[1].split()[0]) - 20.0) < 0.05
     assert "cm, not 18.00 cm" in fault.text
+
+
+def test_moved_camera_alone_is_accused(lab: tuple[Observations, Truth]) -> None:
+    faults = find_faults(fit_hypotheses(turn_camera(*lab, camera=1, turn_rad=np.radians(0.3))))
+    assert [(fault.kind, fault.subject) for fault in faults] == [("camera", "c1")]
 
 
 def test_moved_camera_is_named(lab: tuple[Observations, Truth]) -> None:

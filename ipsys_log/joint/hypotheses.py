@@ -1,0 +1,338 @@
+"""The joint fit under the hypothesis that explains most with least: wrong sides, moved cameras, row times.
+
+A plain fit believes its inputs. If its readings or its sightings contradict it, hypotheses about the inputs
+are compared before anything is called an outlier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ipsys_log.errors import FitError
+from ipsys_log.joint.diagnosis import point_covariances, standardise_readings
+from ipsys_log.joint.fit import Finding, JointFit, fit_jointly, fit_shape
+from ipsys_log.joint.moved_cameras import CameraMotion, find_moved_cameras, find_row_times
+from ipsys_log.joint.observations import CalibrationPoint, Observations
+from ipsys_log.joint.robust import robust_loss
+from ipsys_log.joint.selection import divide_camera, without_cameras, without_points
+from ipsys_log.joint.settings import JointSettings
+from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, place_freely, rough_points
+from ipsys_log.joint.tape_explanations import (
+    Explanation,
+    PointShape,
+    explain_readings,
+    side_contradicts,
+)
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["fit_hypotheses"]
+
+Progress = Callable[[int, float], None]
+
+# A reading contradicts the fit above this many standard deviations.
+_WRONG = 4.5
+# A rough place of a point that is farther than this from its tape readings shows a wrong start.
+_ROUGH_M, _ROUGH_SHARE = 0.1, 0.03
+# With more sightings that do not fit, the fit is not to be believed.
+_MOST_OUTLIERS = 0.2
+# A hypothesis about cameras must decrease twice the cost by this much: once in a million sessions by chance.
+_LEAST_GAIN = 60.0
+_MOST_HYPOTHESES = 3
+# The first time of a motion is rough; the poses before and after it give a better one.
+_MOST_TIMES = 3
+_US_PER_S = 1e6
+# Mistakes whose points are not used. A wrong distance has little weight by the robust loss.
+_LEFT_OUT = ("side", "exchanged", "side and exchanged", "swapped")
+
+
+def fit_hypotheses(
+    observations: Observations,
+    settings: JointSettings | None = None,
+    progress: Progress = lambda step, cost: None,
+) -> JointFit:
+    """Fit a lab, and correct inputs that contradict the rest; the fit names them in ``known``.
+
+    Cameras that nothing connects with the others are left out: more sightings never prevent a fit.
+
+    Raises
+    ------
+    FitError
+        The observations do not determine the cameras.
+    """
+    settings = settings or JointSettings()
+    try:
+        fit = _fit_readings(observations, settings, progress)
+    except UnplacedError as error:
+        rest = without_cameras(observations, error.cameras)
+        if not rest.cameras:
+            raise
+        fit = fit_hypotheses(rest, settings, progress)
+        left_out = [observations.cameras[camera].name for camera in error.cameras]
+        known = [Finding("left_out", name, 0.0, f"{error}; it is left out") for name in left_out[:1]]
+        return replace(fit, known=(*known, *fit.known))
+    return _explain_cameras(fit, settings, progress)
+
+
+def _fit_readings(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit:
+    """Return the fit to the readings that agree; it names the others."""
+    fit, error = None, None
+    try:
+        placed = place_cameras(observations)
+        if _agrees_roughly(observations, placed):
+            fit = fit_jointly(observations, settings, progress, placed)
+    except UnplacedError:
+        raise
+    except FitError as caught:
+        error = caught
+    if fit is not None and not _is_contradicted(fit):
+        return fit
+    explanations = _explain_tape(observations, settings, progress)
+    if explanations and not explanations[0].changes:
+        # The readings as they are need no other explanation.
+        explanations = explanations[:1]
+    if explanations and (fit is None or len(explanations) > 1 or _left_out(explanations[0])):
+        return _fit_explained(observations, explanations, settings, progress)
+    if fit is None and error is not None:
+        raise error
+    return fit_jointly(observations, settings, progress) if fit is None else fit
+
+
+def _agrees_roughly(observations: Observations, placed: Sequence[PlacedCamera]) -> bool:
+    """Return whether all points are about where their readings place them."""
+    places_m = rough_points(observations, list(placed))[0][:, :2]
+    seen = np.zeros(len(observations.points), dtype=np.bool_)
+    for sightings in observations.sightings:
+        seen[sightings.point[sightings.point >= 0]] = True
+    for point, place_m, is_seen in zip(observations.points, places_m, seen.tolist(), strict=True):
+        if not is_seen or point.start_m is None:
+            continue
+        reach_m = float(max(point.distances_m, default=0.0))
+        if np.linalg.norm(place_m - point.start_m) > _ROUGH_M + _ROUGH_SHARE * reach_m:
+            return False
+    return True
+
+
+def _is_contradicted(fit: JointFit) -> bool:
+    """Return whether readings or many sightings do not fit."""
+    if any(one.score > _WRONG and one.kind != "height" for one in standardise_readings(fit)):
+        return True
+    places_m, covariances_m2 = fit.state.positions_m[:, :2], point_covariances(fit)[:, :2, :2]
+    rows = zip(fit.observations.points, places_m, covariances_m2, strict=True)
+    return any(side_contradicts(*row) for row in rows) or _outlier_share(fit) > _MOST_OUTLIERS
+
+
+def _outlier_share(fit: JointFit) -> float:
+    count = outliers = 0
+    for factors in fit.problem.sightings:
+        chi2 = (factors.residuals(fit.state, fit.problem.layout, fit.problem.trajectories) ** 2).sum(axis=1)
+        count, outliers = count + len(chi2), outliers + int((chi2 > factors.limit).sum())
+    return outliers / max(count, 1)
+
+
+def _explain_tape(
+    observations: Observations, settings: JointSettings, progress: Progress
+) -> list[Explanation]:
+    """Return the explanations of the tape by the shape of the points; none if the cameras give no shape."""
+    try:
+        placed = place_freely(observations)
+        fit = fit_shape(observations, settings, placed, progress)
+    except (FitError, np.linalg.LinAlgError):
+        return []
+    numbers = {point.name: number for number, point in enumerate(observations.points)}
+    points = [observations.points[numbers[point.name]] for point in fit.observations.points]
+    return explain_readings(points, _shape(fit))
+
+
+def _shape(fit: JointFit) -> PointShape:
+    count = len(fit.observations.points)
+    slopes, own = fit.solution.factorisation.local_from_global(0, 6 * count)
+    rows = (6 * np.arange(count)[:, None] + np.arange(2)).ravel()
+    covariance = own[np.ix_(rows, rows)] + slopes[rows] @ fit.covariance @ slopes[rows].T
+    return PointShape(fit.state.positions_m[:, :2], covariance)
+
+
+def _left_out(explanation: Explanation) -> set[str]:
+    return {change.point for change in explanation.changes if change.kind in _LEFT_OUT}
+
+
+def _fit_explained(
+    observations: Observations,
+    explanations: Sequence[Explanation],
+    settings: JointSettings,
+    progress: Progress,
+) -> JointFit:
+    """Return the fit without the points of wrong sides, or with all of them if too few remain."""
+    best = explanations[0]
+    places = dict(zip(best.names, best.places_m, strict=True))
+    left_out = _left_out(best)
+    kept = [point for point in observations.points if point.name in places and point.name not in left_out]
+    is_alone = sum(len(point.distances_m) > 1 or point.point_m is not None for point in kept) < 2
+    rest = observations if is_alone else without_points(observations, left_out)
+    started = replace(
+        rest,
+        points=tuple(
+            replace(point, start_m=places.get(point.name, point.start_m)) if len(point.distances_m) else point
+            for point in rest.points
+        ),
+    )
+    fit = fit_jointly(started, settings, progress)
+    known = _name_changes(best, observations, is_alone)
+    if len(explanations) > 1:
+        known = [_name_doubt(explanations)]
+    return replace(fit, known=tuple(known), is_certain=len(explanations) == 1)
+
+
+_MISTAKES = {
+    "side": "it fits on the other side of AB; correct its side",
+    "exchanged": "it fits with its distances exchanged; correct them",
+    "side and exchanged": "it fits on the other side of AB with its distances exchanged; correct both",
+    "swapped": "its tape readings fit the place of point {other}; were they swapped? Correct them",
+    "distance": "its distances do not fit; measure it again",
+    "place": "it does not fit at its place; measure it again",
+}
+
+
+def _name_changes(explanation: Explanation, observations: Observations, is_alone: bool) -> list[Finding]:
+    places = dict(zip(explanation.names, explanation.places_m.tolist(), strict=True))
+    points = {point.name: point for point in observations.points}
+    use = "the result corrects it" if is_alone else "the result is without this point"
+    return [
+        Finding(
+            "side" if "side" in change.kind or change.kind == "exchanged" else change.kind,
+            change.point,
+            _score(points[change.point], places[change.point]),
+            f"point {change.point}: {_MISTAKES[change.kind].format(other=change.other)}; {use}",
+            place_m=tuple(places[change.point]),
+        )
+        for change in explanation.changes
+        if change.kind in _LEFT_OUT
+    ]
+
+
+def _score(point: CalibrationPoint, place_m: Sequence[float]) -> float:
+    """Return how far a point is from its readings, in standard deviations of a distance."""
+    if point.start_m is None:
+        return _WRONG
+    return float(np.linalg.norm(point.start_m - place_m) / point.distance_sigmas_m.max())
+
+
+def _name_doubt(explanations: Sequence[Explanation]) -> Finding:
+    options = [
+        " and ".join(
+            f"{change.point}: {_MISTAKES[change.kind].format(other=change.other).split(';')[0].split('?')[0]}"
+            for change in one.changes
+        )
+        or "all readings are right"
+        for one in explanations
+    ]
+    names = sorted({change.point for one in explanations for change in one.changes})
+    text = (
+        f"the readings of {', '.join(names)} have more than one explanation ({'; or '.join(options)}): no "
+        "position is certain; check these readings, or measure another point"
+    )
+    return Finding("doubt", names[0], 0.0, text)
+
+
+def _explain_cameras(fit: JointFit, settings: JointSettings, progress: Progress) -> JointFit:
+    """Return the fit with the moved cameras and wrong row times that explain most, one after the other."""
+    for _ in range(_MOST_HYPOTHESES):
+        motion = max(find_moved_cameras(fit), key=lambda one: one.chi2, default=None)
+        best = _try_row_times(fit, settings, progress)
+        if motion is not None and _gain(fit, best) < motion.chi2:
+            moved = _try_motion(fit, motion, settings, progress)
+            best = moved if _gain(fit, moved) > _gain(fit, best) else best
+        if best is None or _gain(fit, best) < _LEAST_GAIN:
+            break
+        fit = replace(best, is_certain=fit.is_certain)
+    return fit
+
+
+def _gain(fit: JointFit, trial: JointFit | None) -> float:
+    """Return by how much twice the cost of a fit is more than that of a trial."""
+    return 0.0 if trial is None else 2 * (fit.solution.cost - trial.solution.cost)
+
+
+def _try_row_times(fit: JointFit, settings: JointSettings, progress: Progress) -> JointFit | None:
+    """Return the fit with free row times of all cameras if the sightings contradict those of the rig."""
+    if not find_row_times(fit):
+        return None
+    cameras = tuple(replace(camera, row_time_s=None) for camera in fit.observations.cameras)
+    trial = _refit(replace(fit.observations, cameras=cameras), settings, progress)
+    if trial is None:
+        return None
+    found = []
+    for camera, block in zip(cameras, trial.problem.layout.cameras, strict=True):
+        row_s, sigma_s = (
+            trial.state.values[block.edge + 2],
+            trial.covariance[block.edge + 2, block.edge + 2] ** 0.5,
+        )
+        if abs(row_s) > _WRONG * sigma_s and not camera.is_former:
+            total_us, rig_us = _US_PER_S * (camera.known_row_s + row_s), _US_PER_S * camera.known_row_s
+            found.append((camera.name, f"{total_us:.1f} us, not {rig_us:.1f} us", abs(row_s) / sigma_s))
+    if not found:
+        return None
+    names = ", ".join(name for name, _, _ in found)
+    times = "; ".join(text for _, text, _ in found)
+    text = (
+        f"camera {names}: by the drives, the time between two rows is {times}; correct row_time_ns in the rig"
+    )
+    finding = Finding("row_time", found[0][0], max(score for _, _, score in found), text)
+    return replace(trial, known=(*fit.known, finding))
+
+
+def _try_motion(
+    fit: JointFit, motion: CameraMotion, settings: JointSettings, progress: Progress
+) -> JointFit | None:
+    """Return the fit in which a camera has another pose before a motion."""
+    camera = next(n for n, one in enumerate(fit.observations.cameras) if one.name == motion.camera)
+    trial, time_s = None, motion.time_s
+    for _ in range(_MOST_TIMES):
+        divided = _refit(divide_camera(fit.observations, camera, time_s), settings, progress)
+        if divided is None or _gain(fit, divided) <= _gain(fit, trial):
+            break
+        trial, before_s = divided, time_s
+        time_s = _time_of_motion(divided, camera)
+        if time_s == before_s:
+            break
+    if trial is None:
+        return None
+    # The two poses of the trial have their own intrinsics, which may take a part of the turn.
+    shift_cm = float(np.linalg.norm(motion.shift_m)) * CM_PER_M
+    text = (
+        f"camera {motion.camera}: it was moved after about {time_s:.0f} s, by {shift_cm:.1f} cm "
+        f"and {np.degrees(motion.turn_rad):.2f} degrees; "
+        "the result has its later pose; calibrate again with the observations before or after"
+    )
+    finding = Finding("camera", motion.camera, float(np.sqrt(motion.chi2)), text)
+    return replace(trial, known=(*fit.known, finding))
+
+
+def _time_of_motion(trial: JointFit, camera: int) -> float:
+    """Return the time of a motion by which the sightings of a divided camera fit best to its two poses."""
+    times_s, losses = [], []
+    problem, former = trial.problem, len(trial.observations.cameras) - 1
+    for factors in problem.sightings:
+        if factors.camera not in (camera, former):
+            continue
+        both = []
+        for number in (former, camera):
+            own = replace(factors, camera=number)
+            chi2 = (own.residuals(trial.state, problem.layout, problem.trajectories) ** 2).sum(axis=1)
+            both.append(robust_loss(chi2, factors.limit)[0])
+        times_s.append(factors.sightings.times_s)
+        losses.append(both[0] - both[1])
+    order = np.argsort(np.concatenate(times_s), kind="stable")
+    sorted_s = np.concatenate(times_s)[order]
+    number = int(np.argmin(np.cumsum(np.concatenate(losses)[order])[:-1]))
+    return float(sorted_s[number] + sorted_s[number + 1]) / 2
+
+
+def _refit(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit | None:
+    """Return the fit of changed observations; None if they determine nothing."""
+    try:
+        return fit_jointly(observations, settings, progress)
+    except FitError:
+        return None

@@ -1,0 +1,155 @@
+"""Wrong inputs of a joint calibration are named, others are not, and more data never prevent a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ipsys_log.joint.diagnosis import find_faults
+from ipsys_log.joint.fit import JointFit
+from ipsys_log.joint.hypotheses import fit_hypotheses
+from ipsys_log.joint.locate_step import LocateCorners
+from ipsys_log.joint.model import build_models
+from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.payload import joint_payload, restore_joint
+from ipsys_log.joint.selection import seeing_cameras, without_points
+from ipsys_log.messages import Marker, Markers, Message, Rig, RigMarker
+from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
+from ipsys_log.simulation.settings import LabSettings
+from tests.joint.small_lab import REFERENCES_M, Array, make_lab
+from tests.joint.test_drives import COARSE, observe
+
+ROW_NS = 31_000
+
+
+def make_drive(points: int, seed: int = 3) -> GeometricLab:
+    lab = LabSettings(
+        seed=seed, rate_hz=10.0, drive_s=30.0, markers=1, cameras=("red", "white"), row_time_ns=ROW_NS
+    )
+    return build_lab(GeometricSettings(lab=lab, points=points))
+
+
+def flip(observations: Observations, number: int) -> Observations:
+    """Return the observations with a point on the other side of AB."""
+    point = observations.points[number]
+    assert point.start_m is not None
+    line_y_m = point.references_m[0, 1]
+    assert point.references_m[1, 1] == line_y_m
+    mirrored = np.array([point.start_m[0], 2 * line_y_m - point.start_m[1]])
+    points = list(observations.points)
+    points[number] = replace(point, start_m=mirrored)
+    return replace(observations, points=tuple(points))
+
+
+def kinds(fit: JointFit) -> list[tuple[str, str]]:
+    return [(fault.kind, fault.subject) for fault in find_faults(fit) if not fault.moving]
+
+
+def origin_errors_m(fit: JointFit, lab: GeometricLab) -> list[float]:
+    errors_m = []
+    for name, model in build_models(fit).items():
+        pose = lab.camera(name).camera_from_world
+        errors_m.append(float(np.linalg.norm(model.origin_m + pose[:3, :3].T @ pose[:3, 3])))
+    return errors_m
+
+
+def test_wrong_side_of_one_of_four_points_is_named_and_left_out() -> None:
+    lab = make_drive(4)
+    observations = observe(lab)
+    far = max(range(4), key=lambda n: abs(observations.points[n].start_m[1] - 2.4384))  # type: ignore[index]
+    fit = fit_hypotheses(flip(observations, far), COARSE)
+    name = observations.points[far].name
+    assert kinds(fit) == [("side", name)]
+    assert f"point {name}: it fits on the other side of AB" in find_faults(fit)[0].text
+    assert name not in {point.name for point in fit.observations.points}
+    assert fit.is_certain
+    assert max(origin_errors_m(fit, lab)) < 0.02
+
+
+def test_two_possible_sides_leave_no_certainty() -> None:
+    observations = observe(make_drive(2))
+    fit = fit_hypotheses(flip(observations, 0), COARSE)
+    assert kinds(fit)[0][0] == "doubt"
+    assert not fit.is_certain
+    payload = joint_payload(fit, {}, 0)
+    assert not restore_joint(payload)["red"].is_certain
+    locate = LocateCorners(payload)
+    rig = Rig("lab", "DICT_4X4_100", 0.2, markers=(RigMarker(0, height_m=0.1),))
+    list(locate(Message("/rig", 0, 0, rig)))
+    sightings = fit.observations.sightings[0]
+    marker = Marker(0, sightings.pixels[-1], sightings.covariances_px2[-1])
+    message = Message("/m", 1, 1, Markers(1, (marker,), 1920, 1080), "red")
+    (positions,) = locate(message)
+    assert positions.positions[0].inside is False
+
+
+def test_certain_models_store_no_doubt() -> None:
+    fit = fit_hypotheses(observe(make_drive(4)), COARSE)
+    assert kinds(fit) == []
+    assert all("uncertain" not in model.to_arrays() for model in build_models(fit).values())
+
+
+def test_wrong_row_time_is_estimated_and_no_camera_accused() -> None:
+    lab = make_drive(6)
+    observations = observe(lab)
+    wrong_s = 15e-6
+    sightings = tuple(
+        replace(one, times_s=one.times_s - one.pixels[:, :, 1].mean(axis=1) * (1e-9 * ROW_NS - wrong_s))
+        for one in observations.sightings
+    )
+    cameras = tuple(replace(camera, known_row_s=wrong_s) for camera in observations.cameras)
+    fit = fit_hypotheses(replace(observations, cameras=cameras, sightings=sightings), COARSE)
+    assert [kind for kind, _ in kinds(fit)] == ["row_time"]
+    assert "camera red, white: by the drives, the time between two rows is 3" in find_faults(fit)[0].text
+    assert max(origin_errors_m(fit, lab)) < 0.02
+
+
+def test_camera_that_nothing_connects_is_left_out() -> None:
+    """A few sightings of one more camera do not remove the calibration of the others."""
+    observations, _ = make_lab(1, points=16)
+    first, second = (set(one.point.tolist()) for one in observations.sightings)
+    alone = [number for number in observations.sightings[1].point.tolist() if number not in first][:1]
+    own = observations.sightings[1].select(np.isin(observations.sightings[1].point, alone))
+    assert second - first
+    fit = fit_hypotheses(replace(observations, sightings=(observations.sightings[0], own)))
+    assert kinds(fit) == [("left_out", "c1")]
+    assert list(build_models(fit)) == ["c0"]
+
+
+def add_places(kind: str, rng: np.random.Generator) -> Array:
+    """Return places (6, 4) of points in a bad geometry: x, y, z, heading."""
+    x, y = rng.uniform(0.6, 4.2), rng.uniform(0.6, 4.2)
+    places_m = np.zeros((6, 4))
+    places_m[:, 3] = rng.uniform(-3, 3, 6)
+    if kind == "line":
+        places_m[:, 0], places_m[:, 1] = np.linspace(0.6, 4.2, 6), y
+    elif kind == "line across":
+        places_m[:, 0], places_m[:, 1] = x, np.linspace(0.6, 4.2, 6)
+    elif kind == "one place":
+        places_m[:, 0], places_m[:, 1] = x + rng.normal(0, 0.005, 6), y + rng.normal(0, 0.005, 6)
+    else:
+        places_m[:, 0], places_m[:, 1] = rng.uniform(0.6, 4.2, 6), REFERENCES_M[0, 1] + rng.normal(0, 0.01, 6)
+    return places_m
+
+
+def first_points(observations: Observations, count: int) -> Observations:
+    names: Collection[str] = {point.name for point in observations.points[count:]}
+    return seeing_cameras(without_points(observations, names))
+
+
+@pytest.mark.parametrize("kind", ["line", "line across", "one place", "near AB"])
+@pytest.mark.parametrize("seed", range(2))
+def test_added_points_in_bad_geometry_never_prevent_a_fit(kind: str, seed: int) -> None:
+    """Five spread points determine the cameras that see two of them; all others have their own markers."""
+    rng = np.random.default_rng([seed, 5])
+    spread = np.column_stack([rng.uniform(0.8, 4.0, (5, 2)), np.zeros(5), rng.uniform(-3, 3, 5)])
+    places_m = np.concatenate([spread, add_places(kind, rng)])
+    observations, _ = make_lab(seed, points=len(places_m), cameras=2, places_m=places_m)
+    before: set[str] = set()
+    for count in range(5, len(places_m) + 1, 2):
+        models = set(build_models(fit_hypotheses(first_points(observations, count), COARSE)))
+        assert models >= before
+        before = models

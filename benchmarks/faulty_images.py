@@ -66,13 +66,16 @@ def _page(rng: np.random.Generator, size: int) -> NDArray[np.uint8]:
         row, column = divmod(n, _COLUMNS)
         cells = np.pad(rng.random((size, size)) < 0.5, 1)
         image = np.where(cells, 205, 35).astype(np.float32).repeat(20, axis=0).repeat(20, axis=1)
-        angle, middle = rng.uniform(-0.2, 0.2), np.array([80 + 160 * column, 90 + 180 * row])
+        angle, middle = rng.uniform(-0.2, 0.2), np.array([80, 90])
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_px / 2
         to_px = ((square @ turn.T + middle + rng.uniform(-0.5, 0.5, 2)) * _FINER).astype(np.float32)
         from_px = (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * len(image) - 0.5).astype(np.float32)
         matrix = cv2.getPerspectiveTransform(from_px, to_px)
-        cv2.warpPerspective(image, matrix, page.shape[::-1], page, borderMode=cv2.BORDER_TRANSPARENT)
+        tile = page[180 * row * _FINER :, 160 * column * _FINER :][: 180 * _FINER, : 160 * _FINER]
+        tile[:] = cv2.warpPerspective(
+            image, matrix, (tile.shape[1], tile.shape[0]), None, cv2.INTER_LINEAR, cv2.BORDER_CONSTANT, 200
+        )
     blurred = cv2.GaussianBlur(page, (0, 0), 0.7 * _FINER)
     small = cv2.resize(blurred, (1280, 720), interpolation=cv2.INTER_AREA)
     noisy = small + rng.normal(0, 2, small.shape)

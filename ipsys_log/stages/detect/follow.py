@@ -22,6 +22,7 @@ from ipsys_log.stages.detect.search import (
     Candidate,
     sample,
     search,
+    search_squares,
     search_thoroughly,
     search_unexplained_areas,
 )
@@ -149,7 +150,11 @@ class MarkerTracker:
         region = WHOLE if lost or due else self._changed
         samples = sample(grey) if fresh else None
         if region is not None:
-            fits = self._add(grey, fits, search(grey, self._dictionary, region, samples))
+            if region is WHOLE:
+                candidates, squares_px = search_squares(grey, self._dictionary, samples)
+            else:
+                candidates = search(grey, self._dictionary, region)
+            fits = self._add(grey, fits, candidates)
         if samples is not None:
             # No marker is known yet, and later frames may not show the markers that are missed now.
             known_px = [fit.corners_px for fit in fits]
@@ -162,7 +167,8 @@ class MarkerTracker:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
         self.misprints = None
         if due:
-            self.misprints = self._inspect(grey, self._dictionary, [fit.corners_px for fit in fits])
+            known_px = [fit.corners_px for fit in fits]
+            self.misprints = self._inspect(grey, self._dictionary, known_px, squares_px)
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]

@@ -60,22 +60,29 @@ class Inspection:
     def __init__(self) -> None:
         self._images = 0
 
-    def __call__(self, grey: Grey, dictionary: str, markers_px: Sequence[Array]) -> Misprints | None:
+    def __call__(
+        self, grey: Grey, dictionary: str, markers_px: Sequence[Array], squares_px: Array | None = None
+    ) -> Misprints | None:
         """Return the misprints among the squares in an image that are none of the measured markers.
 
         Parameters
         ----------
         markers_px : corners (4, 2) of the measured markers.
+        squares_px : corners (n, 4, 2) of all squares, if they are known.
         """
         self._images += 1
         if self._images & (self._images - 1):
             return None
-        return find_misprints(grey, dictionary, markers_px)
+        return find_misprints(grey, dictionary, markers_px, squares_px)
 
 
-def find_misprints(grey: Grey, dictionary: str, markers_px: Sequence[Array]) -> Misprints | None:
-    """Return the explanation of most squares without a marker, or None, for an image (height, width)."""
-    squares_px = _unexplained(find_squares(grey, dictionary), markers_px)
+def find_misprints(
+    grey: Grey, dictionary: str, markers_px: Sequence[Array], squares_px: Array | None = None
+) -> Misprints | None:
+    """Return the explanation of most squares without a marker, or None; as :class:`Inspection`."""
+    if squares_px is None:
+        squares_px = find_squares(grey, dictionary)
+    squares_px = _unexplained(squares_px, markers_px)
     seen = set(_explain(grey, squares_px, dictionary))
     if not seen and not len(markers_px):
         inverse = 255 - grey

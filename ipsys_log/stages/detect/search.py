@@ -27,6 +27,7 @@ __all__ = [
     "read_cells",
     "sample",
     "search",
+    "search_squares",
     "search_thoroughly",
     "search_unexplained_areas",
 ]
@@ -88,7 +89,15 @@ def search(
     samples : reduced image of the region, if it is known.
     """
     part = np.ascontiguousarray(grey[region])
-    return _placed(_search(part, sample(part) if samples is None else samples, dictionary), region)
+    return _placed(search_squares(part, dictionary, samples)[0], region)
+
+
+def search_squares(grey: Grey, dictionary: str, samples: Grey | None = None) -> tuple[list[Candidate], Array]:
+    """Return the markers in a whole image, and the corners (n, 4, 2) of all its squares, as search()."""
+    small = sample(grey) if samples is None else samples
+    corners_px, ids = _read_squares(grey, small, dictionary)
+    others = _read(grey, corners_px[len(ids) :], dictionary)
+    return _candidates(corners_px[: len(ids)], ids) + others, corners_px
 
 
 def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candidate]:
@@ -96,11 +105,6 @@ def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candida
         return found
     origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
     return [candidate._replace(corners_px=candidate.corners_px + origin) for candidate in found]
-
-
-def _search(grey: Grey, small: Grey, dictionary: str) -> list[Candidate]:
-    corners_px, ids = _read_squares(grey, small, dictionary)
-    return _candidates(corners_px[: len(ids)], ids) + _read(grey, corners_px[len(ids) :], dictionary)
 
 
 def find_squares(grey: Grey, dictionary: str) -> Array:

@@ -109,6 +109,7 @@ def error_sources(fit: JointFit, session: Session) -> dict[str, float]:
     sigma = layout.sigma
     scales = np.where(np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1.0), 0.0)
     by_prior = ((pulls * scales) ** 2).sum(axis=0)
+    parts["tape scale"] = float(by_prior[layout.tape].sum())
     parts["floor"] = float(by_prior[layout.modes].sum())
     parts["intrinsics"] = float(sum(by_prior[block.lens].sum() for block in layout.cameras))
     parts = {name: part / len(pulls) for name, part in parts.items()}
@@ -128,17 +129,17 @@ def _by_unknowns(model: JointModel, layout: Layout, block: CameraBlock) -> Joint
 
 def _tape_pulls(fit: JointFit, pulls: Array) -> Array:
     """Return the effects (n, d) of d tape distances, from those of the global unknowns (n, g)."""
-    points, state = fit.problem.points, fit.state
-    offsets_m = state.positions_m[points.distance_points, :2] - points.references_m
-    scales = points.distance_sigmas_m * np.linalg.norm(offsets_m, axis=1)
+    points, layout = fit.problem.points, fit.problem.layout
+    by_point, by_tape = points.distance_slopes(fit.state, layout)
     columns = 6 * points.distance_points[:, None] + np.arange(2)
-    by_local = np.zeros((fit.problem.trajectories.local_count, len(offsets_m)))
-    np.put_along_axis(by_local.T, columns, offsets_m / scales[:, None], axis=1)
+    by_local = np.zeros((fit.problem.trajectories.local_count, len(by_point)))
+    np.put_along_axis(by_local.T, columns, by_point / points.distance_sigmas_m[:, None], axis=1)
     # The local unknowns follow the global ones by -inv(local) mixed.
     factorisation = fit.solution.factorisation
     whitened = factorisation.forward(by_local)
     free = factorisation.free
-    return np.asarray(pulls[:, free] @ factorisation.pull(whitened))
+    by_scales = pulls[:, layout.tape] @ (by_tape / points.distance_sigmas_m[:, None]).T
+    return np.asarray(pulls[:, free] @ factorisation.pull(whitened) + by_scales)
 
 
 def _clock_errors(fit: JointFit, lab: GeometricLab) -> list[tuple[float, float]]:

@@ -80,7 +80,8 @@ def test_no_calibration_for_a_camera(ipsys: Ipsys, lab: Path) -> None:
 def test_a_calibration_of_another_size(ipsys: Ipsys, lab: Path, corners: str) -> None:
     def wider(message: Message) -> Message:
         if message.topic == "/cameras/red/calibration":
-            return replace(message, payload=replace(message.payload, width=1920, height=1080))
+            wide = replace(message.payload, width=1920, height=1080, K=np.diag([2, 2, 1]) @ message.payload.K)
+            return replace(message, payload=wide)
         return message
 
     log = rewrite(lab, wider)
@@ -317,7 +318,7 @@ def test_impossible_names_and_options_are_refused(ipsys: Ipsys, lab: Path, tmp_p
 def yaml(folder: Path) -> Path:
     path = folder / "lens.yaml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("camera_matrix", np.diag([500.0, 500.0, 1.0]))
+    storage.write("camera_matrix", np.array([[500.0, 0, 480], [0, 500, 270], [0, 0, 1]]))
     storage.write("distortion_coefficients", np.zeros((4, 1)))
     storage.write("image_width", 960)
     storage.write("image_height", 540)

@@ -55,7 +55,9 @@ def imported_distributions() -> dict[str, set[str]]:
     """Return the possible distributions of each third-party module of the package."""
     providers = packages_distributions()
     own = {*sys.stdlib_module_names, "ipsys_log"}
-    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "ipsys_log").rglob("*.py")]
+    # The example is a program of its own, for robots.
+    files = [path for path in (ROOT / "ipsys_log").rglob("*.py") if path.parent.name != "example_robot"]
+    sources = [path.read_text(encoding="utf-8") for path in files]
     modules = {name for source in sources for name in imported_modules(source)} - own
     return {name: {normalize(one) for one in providers[name]} for name in sorted(modules)}
 

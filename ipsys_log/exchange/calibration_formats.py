@@ -351,7 +351,11 @@ def _with_model(entry: _Entry, D: NDArray[np.float64], stated: str) -> tuple[str
             )
     elif model not in DISTORTION_MODELS:
         known = "equidistant (fisheye), plumb_bob, rational_polynomial"
-        raise entry.fault(f"distortion model {stated!r} is not known; known are {known}", entry.key(_MODEL))
+        raise entry.fault(
+            f"distortion model {stated!r} is not known; known are {known}: "
+            "convert the file, or use ipsys calibrate",
+            entry.key(_MODEL),
+        )
     elif model == "plumb_bob" and D.size in (8, 12, 14) and _plain(stated) == "pinhole":
         model = "rational_polynomial"
     if model == "plumb_bob" and D.size == 4:

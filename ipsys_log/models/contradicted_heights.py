@@ -45,7 +45,7 @@ class HeightSighting:
     sigma_m: float
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Evidence:
     """Sightings of a marker that agree: heights, places (2,), the length of the path, and the last place."""
 

@@ -27,6 +27,7 @@ from ipsys_log.messages.channels import (
     Channel,
 )
 from ipsys_log.messages.stage import Stage
+from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.file import check_rig
 from ipsys_log.runs.execute import has_given_name, record_of
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, method_of, plan_stage, stage_named
@@ -289,5 +290,5 @@ def describe_changed_images(session: Session) -> Iterator[str]:
         yield (
             f"{reader.path}: the CRC of the chunk at byte {offset}{more} is wrong: images of {cameras} from "
             f"{format_time(start_ns)} on have changed since the recording, and are used as they are; copy "
-            f"the log again from its origin. To find all damage: ipsys check {reader.path}"
+            f"the log again from its origin. To find all damage: ipsys check {shell_words(reader.path)}"
         )

@@ -6,6 +6,7 @@ import errno
 import threading
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ from ipsys_log.capture import multiplexer
 from ipsys_log.capture.disk import SYNC_EVERY_S, Syncer
 from ipsys_log.capture.frames import Clock, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.recorder import Recording, open_recording, write_each
+from ipsys_log.capture.recorder import _QUIET_TICKS, Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, Storage
@@ -69,7 +70,7 @@ def test_slow_sync_holds_up_no_frame_and_no_order(tmp_path: Path) -> None:
         assert disk.syncing.wait(LIMIT_S)
         for number in range(1, 301):
             yield frame(number)
-        yield None  # no message comes: all data are flushed
+        yield from repeat(None, _QUIET_TICKS)  # no message comes: all data are flushed
         size = path.stat().st_size
         yield frame(301)
         assert size > 300 * 60, "frames wait for the disk"

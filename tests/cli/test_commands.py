@@ -147,7 +147,12 @@ CAMERAS = ("red", "white", "black")
 
 def test_runs_list_their_inputs(ipsys: Ipsys, replayed_lab: Path) -> None:
     runs = {run["stage"]: run for run in json.loads(ipsys("runs", replayed_lab, "--json").out)}
-    assert runs["detect"]["parameters"] == {"corners": "edges", "reset_s": "30", "detect": "2"}
+    assert runs["detect"]["parameters"] == {
+        "corners": "edges",
+        "reset_s": "30",
+        "detect": "3",
+        "edges": "2",
+    }
     assert {row["topic"] for row in runs["detect"]["inputs"]} == {
         "/rig",
         *(f"/cameras/{camera}/{what}" for camera in CAMERAS for what in ("image", "calibration")),

@@ -26,7 +26,7 @@ calibration = "red.yaml"
 def rig(tmp_path: Path) -> Path:
     from tests.test_record import lens_yaml
 
-    (tmp_path / "red.yaml").write_text(lens_yaml(640, 480))
+    (tmp_path / "red.yaml").write_text(lens_yaml(640, 480) + "distortion_model: equidistant\n")
     path = tmp_path / "lab.toml"
     path.write_text(RIG)
     return path

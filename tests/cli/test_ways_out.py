@@ -89,7 +89,7 @@ def test_unknown_distortion_model_of_a_file_names_the_way_out(ipsys: Ipsys, lab:
     path = lens_file(lab)
     path.write_text(path.read_text().replace("equidistant", "double_sphere"))
     line = refused(ipsys, lab, "detect", lab, "--calibration", f"red={path}")
-    assert "red.yaml: distortion model 'double_sphere' is not known" in line
+    assert "red.yaml, line 3: OpenCV: distortion model 'double_sphere' is not known" in line
     assert "ipsys calibrate" in line
 
 

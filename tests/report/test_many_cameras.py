@@ -54,6 +54,7 @@ def contents(names: tuple[str, ...]) -> dict[str, Any]:
         "duration_s": 30.0,
         "cameras": {},
         "channels": dict(sorted(channels.items())),
+        "calibration_remarks": [],
         "contradictions": [],
         "overlap": overlap,
         "runs": [],

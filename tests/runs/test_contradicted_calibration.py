@@ -59,7 +59,7 @@ def test_import_info_and_check_name_the_camera(ipsys: Ipsys, tmp_path: Path) -> 
     done = ipsys("import", "detections", tmp_path / "markers.csv", "-o", log, *options)
     assert done.code == 0
     assert _TEXT in " ".join(done.err.split())
-    (text,) = json.loads(ipsys("info", log, "--json").out)["contradictions"]
-    assert text.startswith(_TEXT)
+    (row,) = json.loads(ipsys("info", log, "--json").out)["contradictions"]
+    assert row["text"].startswith(_TEXT)
     assert _TEXT in " ".join(ipsys("info", log).out.split())
     assert "calibration_contradicted" in ipsys("check", log).out

@@ -168,12 +168,12 @@ def test_run_of_newer_software_is_never_replaced(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as newer:
-        newer.setitem(VERSIONS, "detect", 3)
+        newer.setitem(VERSIONS, "detect", 4)
         made(ipsys, log)
     before = log.read_bytes()
     done = ipsys("replay", log)
     assert done.code == 1
-    assert "run edges_2, stage detect: made by detect 3, this is detect 2: update ipsys" in done.err
+    assert "run edges_2, stage detect: made by detect 4, this is detect 3: update ipsys" in done.err
     assert log.read_bytes() == before
     assert states(ipsys, log)["edges_2", "detect"]["out_of_date"] is False
 
@@ -181,11 +181,11 @@ def test_run_of_newer_software_is_never_replaced(
 def test_verify_names_results_of_other_versions(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(VERSIONS, "detect", 3)
+    monkeypatch.setitem(VERSIONS, "detect", 4)
     done = ipsys("verify", log)
     assert done.code == 0, done.out
     assert (
-        "run edges: detect is out of date: made by detect 2, this is detect 3; it is not verified" in done.err
+        "run edges: detect is out of date: made by detect 3, this is detect 4; it is not verified" in done.err
     )
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
     for name in (stage.name for stage in STAGES):

@@ -139,7 +139,7 @@ def _tape_pulls(fit: JointFit, pulls: Array) -> Array:
     whitened = factorisation.forward(by_local)
     free = factorisation.free
     by_scales = pulls[:, layout.tape] @ (by_tape / points.distance_sigmas_m[:, None]).T
-    return np.asarray(pulls[:, free] @ factorisation.pull(whitened) + by_scales)
+    return np.asarray(by_scales - pulls[:, free] @ factorisation.pull(whitened))
 
 
 def _clock_errors(fit: JointFit, lab: GeometricLab) -> list[tuple[float, float]]:

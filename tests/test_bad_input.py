@@ -322,6 +322,7 @@ def yaml(folder: Path) -> Path:
     storage.write("distortion_coefficients", np.zeros((4, 1)))
     storage.write("image_width", 960)
     storage.write("image_height", 540)
+    storage.write("distortion_model", "equidistant")
     storage.release()
     return path
 

@@ -176,7 +176,7 @@ def _sigmas(markers: Sequence[StationaryMarker], down: Array) -> Array:
     noise_m2 = np.array([down @ marker.covariance_m2 @ down for marker in markers])
     depths_m = np.array([marker.point_m[2] for marker in markers])
     # The covariance of one frame has the error of the lens; the mean of many frames still has it.
-    return np.sqrt(np.maximum(noise_m2, (_USUAL_DEPTH * depths_m) ** 2))
+    return np.asarray(np.sqrt(np.maximum(noise_m2, (_USUAL_DEPTH * depths_m) ** 2)))
 
 
 def _fit_plane(markers: Sequence[StationaryMarker]) -> _Plane:

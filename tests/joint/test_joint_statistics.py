@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from ipsys_log.geometry.poses import pose_facing_up, transform
 from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
+from ipsys_log.joint.observations import Observations
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
 
 GRID = [(x, y, 0.1, 0.0) for x in np.arange(1.2, 3.7, 0.3) for y in np.arange(1.6, 3.3, 0.3)]
@@ -31,13 +34,29 @@ def locate_grid(models: dict[str, JointModel], truth: Truth) -> tuple[Array, Arr
     return np.concatenate(errors), np.concatenate(covariances)
 
 
+def with_scales(observations: Observations, seed: int) -> Observations:
+    """Draw the scales of the tape and of the reference points in the rig."""
+    tape = observations.tape
+    scale, size = 1 + np.random.default_rng(seed).normal(0, (tape.scale_sigma, tape.references_sigma))
+    points = tuple(
+        replace(
+            point,
+            distances_m=scale * point.distances_m,
+            references_m=tape.middle_m + (point.references_m - tape.middle_m) / size,
+        )
+        for point in observations.points
+    )
+    return replace(observations, points=points)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [16, 40])
 def test_covariance_is_that_of_the_errors_over_labs(points: int) -> None:
     shares = []
     for seed in range(60):
         observations, truth = make_lab(1000 + seed, points=points)
-        errors = locate_grid(build_models(fit_jointly(observations)), truth)
+        fit = fit_jointly(with_scales(observations, seed))
+        errors = locate_grid(build_models(fit), truth)
         shares.append(region_shares(*errors))
     # One lab gives one draw: its standard deviation is about 0.25.
     assert 0.60 < np.mean([one.inside_68 for one in shares]) < 0.80

@@ -67,7 +67,7 @@ def test_free_disk_time_is_printed_before_the_recording(
     assert done.code == 0, done.err
     said = re.search(r"about ([\d.]+) MB in 2 s; [\d.]+ [GT]B free in \S+: enough for", done.err)
     assert said is not None, done.err
-    assert said.start() < done.err.index("written:")
+    assert said.start() < done.err.index("the cameras are open")
     assert math.isclose(float(said[1]) * 1e6, 2 * 5 * first_bytes(lab), abs_tol=0.06e6)
 
 

@@ -298,8 +298,9 @@ def test_marker_without_a_height_gets_its_full_pose(ipsys: Ipsys, fitted: Path, 
     heights_m = np.array([p.z_m for p in positions])
     sigmas_m = np.sqrt([p.covariance_m2[2, 2] for p in positions if p.covariance_m2 is not None])
     assert abs(float(np.median(heights_m)) - 0.1) < 0.005
-    # The covariance of a full pose is true: heights differ from 0.1 m by as much as it says.
-    assert 0.5 < float(np.median(np.abs(heights_m - 0.1) / sigmas_m)) / 0.6745 < 2
+    # The covariance has an error of the print of 0.1 %, 2 mm from a camera at 2.1 m. These prints are exact.
+    assert 0.0018 < float(np.median(sigmas_m)) < 0.0025
+    assert float(np.median(np.abs(heights_m - 0.1) / sigmas_m)) / 0.6745 < 2
     assert np.mean([bool(p.inside) for p in positions]) > 0.99
 
 

@@ -303,7 +303,7 @@ def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: 
     done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
     assert done.code == 1
     assert "the RMS reprojection error is 3.5 px" in done.err
-    assert "use --lens fisheye, with an error of 0.22 px; or use --force" in done.err
+    assert "use --lens fisheye, with an error of 0.21 px; or use --force" in done.err
     assert list(tmp_path.iterdir()) == []
 
 

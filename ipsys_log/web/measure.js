@@ -114,7 +114,7 @@ function show(answer) {
   const wrong = answer.faults.filter((fault) => !empty(fault.field));
   const missing = answer.faults.filter((fault) => empty(fault.field)).map((fault) => fault.text.split("?")[0]);
   const any = Object.values(now.distances).some(Boolean) || now.height;
-  for (const part of document.querySelectorAll(".field")) {
+  for (const part of document.querySelectorAll("#form .field")) {
     const place = part.querySelector(".fault"), field = place.id.slice("fault-".length);
     place.textContent = wrong.find((fault) => fault.field === field)?.text ?? "";
     part.classList.toggle("bad", Boolean(place.textContent));

@@ -141,7 +141,7 @@ def test_newer_stages_change_the_states_in_a_catalogue(
 
     update_catalogue(folder, tmp_path / "catalogue.parquet")
     # The golden log is of an earlier version.
-    assert outdated()[0] == ["best", "poly", "rigid"]
+    assert outdated()[0] == ["best", "edges", "poly", "rigid"]
     assert "this is rigid 99" not in outdated()[1]
     monkeypatch.setitem(VERSIONS, "rigid", 99)
     assert update_catalogue(folder, tmp_path / "catalogue.parquet").read == 3

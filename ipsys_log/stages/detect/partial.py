@@ -301,6 +301,8 @@ class _PartialFit:
             spread_px = float(np.sqrt(solved.variance_px2(n)))
             offset_px = float(solved.unknowns[n, 6])
             return MarkerFit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+        if self._near:
+            return Rejection(self._id, reason)  # the search gives a better start
         has_sides = (solved.clear[n] @ view.prints.by_side[0]).mean() > _CLEAR_SIDES
         if agreement.clear and has_sides and has_clear_cells(samples, self._dictionary, self._id):
             return self._fit_corners(pose, corners_px[0], solved, n) or Rejection(self._id, reason)

@@ -52,7 +52,7 @@ class Trial:
     seed: int
     package: Path
 
-    def ipsys(self, *arguments: object) -> str:
+    def ipsys(self, *arguments: object, timeout_s: float = _TIMEOUT_S) -> str:
         """Run ``ipsys ARGUMENTS`` of the package under test; return its output and errors as one text."""
         answer = subprocess.run(
             [sys.executable, "-m", "ipsys_log", *map(str, arguments)],
@@ -62,7 +62,7 @@ class Trial:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=_TIMEOUT_S,
+            timeout=timeout_s,
             check=False,
         )
         return answer.stdout

@@ -33,7 +33,7 @@ _LAB = LabSettings(
 _FLIPS = 6
 _RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 # The growth of memory is that between these times after the start, in s: caches fill before.
-_SETTLED_S, _ENDED_S = 300, 900
+_SETTLED_S, _ENDED_S = 300, 2100
 
 
 def _changed_log(trial: Trial, name: str, change: Callable[[bytes], bytes]) -> Path:
@@ -186,8 +186,8 @@ def _memory_of_live(trial: Trial) -> Outcome:
 
     watcher = threading.Thread(target=watch)
     watcher.start()
-    seconds = _ENDED_S + 60
-    trial.ipsys("live", "--rig", rig, "--model-from", model, "-o", log, "--seconds", seconds)
+    live = ("live", "--rig", rig, "--model-from", model, "-o", log, "--seconds", _ENDED_S + 60)
+    trial.ipsys(*live, timeout_s=2 * _ENDED_S)
     ended.set()
     watcher.join()
     minutes, settled = np.array([*sizes_mb]) / 60, next(iter(sizes_mb)) + _SETTLED_S

@@ -90,7 +90,7 @@ def load_lenses(
 
 def tape_sheet_path(path: Path) -> Path:
     """Return the path of the sheet of tape measurements beside the rig file of a simulated lab."""
-    return path.with_name(f"{path.stem}_tape.csv")
+    return path.parent / f"{path.stem}_tape.csv"
 
 
 def simulated_lab_texts(path: Path) -> dict[Path, str]:

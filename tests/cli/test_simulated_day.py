@@ -88,6 +88,7 @@ def test_simulated_lab_gives_its_rig_and_its_tape(
             assert abs(np.hypot(where.x_m - a.x_m, where.y_m - a.y_m) - tape.distance_m) < 0.001
     before = (tmp_path / "lab_tape.csv").read_bytes()
     assert "lab.toml: exists already" in ipsys("init", "--simulated").err
+    assert ".: exists already" in ipsys("init", ".", "--simulated").err
     # Both files are there, or none.
     (tmp_path / "lab.toml").unlink()
     done = ipsys("init", "lab.toml", "--simulated")

@@ -80,6 +80,14 @@ def _case(name: str, words: Sequence[str]) -> Callable[[Trial], Outcome]:
     return try_once
 
 
+def _fits_with_more_points(trial: Trial) -> Outcome:
+    """Fit a stored lab, which can be fitted without the two points that were added on a line."""
+    log = shutil.copy(cases_folder() / "joint" / "points_on_a_line_after_2_more.mcap", trial.folder)
+    answer = trial.ipsys("calibrate-lab", log)
+    is_refused = "ipsys:" in answer
+    return Outcome(not is_refused, figure="refused" if is_refused else "fitted")
+
+
 def _random(points: int, fault: _Fault) -> Callable[[Trial], Outcome]:
     """Return the trial of a random lab with a fault.
 
@@ -267,6 +275,7 @@ def _positions(log: Path) -> Iterator[tuple[str, tuple[int, Position]]]:
 
 FAULTS: Sequence[Fault] = (
     Fault("side wrong, 4 points (case)", _case("side_wrong_4_points", ["p1: it fits on the other side"])),
+    Fault("two more points on a line (case)", _fits_with_more_points),
     Fault(
         "camera turned midway (case)", _case("camera_c1_turned_0.3_deg_midway", ["camera c1: it was moved"])
     ),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -124,10 +125,32 @@ def _drawn(trial: Trial, same_tape: bool) -> Outcome:
     return _random(trial, scale, same_tape)
 
 
+def _evaluated(model: str) -> Callable[[Trial], Outcome]:
+    """Return a trial of 30 points: the stated interval of the error after that of the tape has the truth."""
+
+    def try_once(trial: Trial) -> Outcome:
+        lab = build_lab(
+            GeometricSettings(lab=LabSettings(rate_hz=10.0, drive_s=0.0, seed=trial.seed), points=30)
+        )
+        write_log(trial.folder / "lab.mcap", simulate_session(lab))
+        text = trial.ipsys("evaluate", "lab.mcap", "--model", model, "--json")
+        answer, _ = json.JSONDecoder().raw_decode(text, text.index("{"))
+        stated, errors = answer["answer"], answer["models"][model]["pooled"]["cross_validation"]
+        true_cm = errors["truth"]["3d"]["mean_cm"]
+        low_cm, high_cm = (
+            stated.get(f"remaining_{end}_cm", errors["3d"][f"mean_{end}_cm"]) for end in ("low", "high")
+        )
+        return Outcome(bool(low_cm <= true_cm <= high_cm), 10 * true_cm)
+
+    return try_once
+
+
 FAULTS: Sequence[Fault] = (
     Fault("tape 0.3 % too long, case", _case),
     Fault("tape 0.3 % too long", lambda trial: _random(trial, 1.003), is_random=True),
     Fault("tape 1 % too short", lambda trial: _random(trial, 0.99), is_random=True),
     Fault("tape of 0.1 % (honest)", lambda trial: _drawn(trial, False), is_random=True),
     Fault("tape of 0.1 %, also for A and B (honest)", lambda trial: _drawn(trial, True), is_random=True),
+    Fault("evaluate: interval has the true error, best", _evaluated("best"), is_random=True),
+    Fault("evaluate: interval has the true error, joint", _evaluated("joint"), is_random=True),
 )

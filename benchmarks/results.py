@@ -34,6 +34,7 @@ BENCHMARKS = {
     "remote": "requests and bytes for a log in an S3 server, beside mcap through s3fs",
     "node_clock": "error of the clocks of nodes, in simulated exchanges",
     "node_cost": "processor time of a node and of its centre, beside a plain recording",
+    "checkouts": "speed of this checkout, compared with another one",
     "startup": "ipsys --help and ipsys info",
     "robot_run": "control error and true error of robots at waypoints, without and with faults",
     "joint": "error over the floor of calibrations, in simulated labs",

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.images.decode import Grey
+from ipsys_log.messages.events import MIRRORED, OTHER_PRINTS
 from ipsys_log.stages.detect.search import find_squares, read_cells
 
-__all__ = ["MIRRORED", "OTHER_PRINTS", "Inspection", "Misprints", "find_misprints"]
+__all__ = ["Inspection", "Misprints", "find_misprints"]
 
 Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
 
-# Kinds of events, and of misprints.
-MIRRORED, OTHER_PRINTS = "mirrored_camera", "other_prints"
+# Kinds of misprints, besides mirrored ones.
 _NEGATIVE, _WIDE, _FOREIGN = "negative", "wide border", "dictionary"
 
 # Least difference of black and white, in grey levels, and largest distance of a cell from both as a share of
@@ -87,18 +87,18 @@ class Inspection:
         images = self._images[has_rejections]
         if images & (images - 1):
             return None
-        return find_misprints(grey, dictionary, markers_px, squares_px)
+        if squares_px is None:
+            squares_px = find_squares(grey, dictionary)
+        unexplained_px = _unexplained(squares_px, markers_px)
+        return find_misprints(grey, dictionary, unexplained_px, has_markers=bool(markers_px))
 
 
 def find_misprints(
-    grey: Grey, dictionary: str, markers_px: Sequence[Array], squares_px: Array | None = None
+    grey: Grey, dictionary: str, squares_px: Array, *, has_markers: bool = False
 ) -> Misprints | None:
-    """Return the explanation of most squares without a marker, or None; as :class:`Inspection`."""
-    if squares_px is None:
-        squares_px = find_squares(grey, dictionary)
-    squares_px = _unexplained(squares_px, markers_px)
+    """Return the explanation of most squares (n, 4, 2), or None; images with markers have no negatives."""
     found = [one for one in _explain(grey, squares_px, dictionary) if one.is_certain]
-    if not found and not len(markers_px):
+    if not found and not has_markers:
         inverse, size = 255 - grey, _size(dictionary)
         prints = _clear_prints(inverse, find_squares(inverse, dictionary), size, 1)
         negative = _Explanation.of(_NEGATIVE, dictionary, prints, _words(dictionary))
@@ -108,32 +108,33 @@ def find_misprints(
     # The first kind is the likeliest if counts are equal: one dictionary has all prints of a lab.
     order = (MIRRORED, _NEGATIVE, _WIDE, _FOREIGN)
     best = min(found, key=lambda one: (-len(one.ids), order.index(one.kind), one.name))
-    ids = tuple(sorted(set(best.ids)))
+    ids = tuple(sorted(best.ids))
     kind = MIRRORED if best.kind == MIRRORED else OTHER_PRINTS
     return Misprints(kind, ids, _advice(best.kind, best.name, ids, dictionary), _symmetric_ids(dictionary))
 
 
 class _Explanation(NamedTuple):
-    """An explanation of ``squares`` clear squares.
+    """An explanation of clear squares, of which ``patterns`` differ.
 
     ``ids`` are those of the squares that fit; ``share`` is that of random squares that fit.
     """
 
     kind: str
     name: str
-    ids: list[int]
-    squares: int
+    ids: set[int]
+    patterns: int
     share: float
 
     @classmethod
     def of(cls, kind: str, name: str, prints: Sequence[Bits], words: Mapping[bytes, int]) -> _Explanation:
-        ids = [words[bits.tobytes()] for bits in prints if bits.tobytes() in words]
-        return cls(kind, name, ids, len(prints), len(words) / 2.0 ** (_size(name) ** 2))
+        ids = {words[bits.tobytes()] for bits in prints if bits.tobytes() in words}
+        patterns = {min(np.rot90(bits, turn).tobytes() for turn in range(4)) for bits in prints}
+        return cls(kind, name, ids, len(patterns), len(words) / 2.0 ** (_size(name) ** 2))
 
     @property
     def is_certain(self) -> bool:
         """True if random squares hardly fit as often."""
-        fits, count, p = len(self.ids), self.squares, self.share
+        fits, count, p = len(self.ids), self.patterns, self.share
         chance = sum(comb(count, n) * p**n * (1 - p) ** (count - n) for n in range(fits, count + 1))
         return fits > 0 and chance < (_CHANCE_OF_ALL if fits == count else _CHANCE)
 

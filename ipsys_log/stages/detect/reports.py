@@ -13,8 +13,7 @@ from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import SizeError
 from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers, Rig
-from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
-from ipsys_log.stages.detect.misprints import MIRRORED, OTHER_PRINTS
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, MIRRORED, OTHER_PRINTS
 
 __all__ = [
     "NO_KEYFRAME",

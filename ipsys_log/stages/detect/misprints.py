@@ -101,7 +101,7 @@ def find_misprints(
     if not found and not has_markers:
         inverse, size = 255 - grey, _size(dictionary)
         prints = _clear_prints(inverse, find_squares(inverse, dictionary), size, 1)
-        negative = _Explanation.of(_NEGATIVE, dictionary, prints, _words(dictionary))
+        negative = _Explanation.of(_NEGATIVE, dictionary, prints, _words(dictionary), _patterns(prints))
         found = [negative] if negative.is_certain else []
     if not found:
         return None
@@ -114,9 +114,10 @@ def find_misprints(
 
 
 class _Explanation(NamedTuple):
-    """An explanation of clear squares, of which ``patterns`` differ.
+    """An explanation of clear squares.
 
-    ``ids`` are those of the squares that fit; ``share`` is that of random squares that fit.
+    ``ids`` are those of the squares that fit; ``share`` is that of random squares that fit. ``patterns`` is
+    the number of different squares.
     """
 
     kind: str
@@ -126,10 +127,11 @@ class _Explanation(NamedTuple):
     share: float
 
     @classmethod
-    def of(cls, kind: str, name: str, prints: Sequence[Bits], words: Mapping[bytes, int]) -> _Explanation:
+    def of(
+        cls, kind: str, name: str, prints: Sequence[Bits], words: Mapping[bytes, int], patterns: int
+    ) -> _Explanation:
         ids = {words[bits.tobytes()] for bits in prints if bits.tobytes() in words}
-        patterns = {min(np.rot90(bits, turn).tobytes() for turn in range(4)) for bits in prints}
-        return cls(kind, name, ids, len(patterns), len(words) / 2.0 ** (_size(name) ** 2))
+        return cls(kind, name, ids, patterns, len(words) / 2.0 ** (_size(name) ** 2))
 
     @property
     def is_certain(self) -> bool:
@@ -159,14 +161,23 @@ def _unexplained(squares_px: Array, markers_px: Sequence[Array]) -> Array:
 def _explain(grey: Grey, squares_px: Array, dictionary: str) -> Iterator[_Explanation]:
     """Yield possible explanations of squares."""
     own = _words(dictionary)
+    prints = {
+        size: [bits for bits in _clear_prints(grey, squares_px, size, 1) if bits.tobytes() not in own]
+        for size in _CELLS
+    }
+    patterns = sum(map(_patterns, prints.values()))
+    turned = [np.ascontiguousarray(bits.T) for bits in prints[_size(dictionary)]]
+    yield _Explanation.of(MIRRORED, dictionary, turned, own, patterns)
     for size in _CELLS:
-        prints = [bits for bits in _clear_prints(grey, squares_px, size, 1) if bits.tobytes() not in own]
-        if size == _size(dictionary):
-            turned = [np.ascontiguousarray(bits.T) for bits in prints]
-            yield _Explanation.of(MIRRORED, dictionary, turned, own)
         for family in _families(size):
-            yield _Explanation.of(_FOREIGN, family, prints, _words(family))
-    yield _Explanation.of(_WIDE, dictionary, _clear_prints(grey, squares_px, _size(dictionary), 2), own)
+            yield _Explanation.of(_FOREIGN, family, prints[size], _words(family), patterns)
+    wide = _clear_prints(grey, squares_px, _size(dictionary), 2)
+    yield _Explanation.of(_WIDE, dictionary, wide, own, _patterns(wide))
+
+
+def _patterns(prints: Sequence[Bits]) -> int:
+    """Return the number of different patterns: one square can be found twice."""
+    return len({min(np.rot90(bits, turn).tobytes() for turn in range(4)) for bits in prints})
 
 
 def _clear_prints(grey: Grey, squares_px: Array, size: int, border: int) -> list[Bits]:

@@ -35,6 +35,7 @@ _SAMPLE = _ROOT / "sample_logs/small_lab.mcap"
 _CHI2_95 = 7.815  # of three coordinates
 _SAME_INSTANT_NS = 1_000_000
 _NAMED = "do not fit its calibration"
+_REFUSED = "calibrate at the size of the recorded images"
 
 
 def _yaml(path: Path, lens: CameraCalibration) -> None:
@@ -59,23 +60,26 @@ def _replay(
         _yaml(trial.folder / f"{camera}.yaml", lens)
         options += ["--calibration", f"{camera}={camera}.yaml"]
     output = trial.ipsys("replay", _SAMPLE, "-o", "out.mcap", "--model", "rigid", *options)
-    errors_m, inside = _errors(trial.folder / "out.mcap")
+    if _REFUSED in output:
+        return Outcome(True, figure="refused")
+    errors_m, inside, certain = _errors(trial.folder / "out.mcap")
     named = len(set(re.findall(rf"camera (\w+): markers {_NAMED}", output)))
     changed_lenses = sum(lens is not lenses[camera] for camera, lens in change(lenses).items())
     return Outcome(
         named == changed_lenses,
         1000 * float(np.median(errors_m)) if len(errors_m) else None,
         float(inside.mean()) if len(errors_m) else None,
-        f"{named} of {changed_lenses} cameras named",
+        f"{named} of {changed_lenses} cameras named; {certain:.0%} of the positions are inside",
     )
 
 
-def _errors(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the true errors of positions in m, and whether they are in the stated 95 % region."""
+def _errors(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+    """Return true errors in m, whether they are in the stated 95 % region, and the share of ``inside``."""
+    certain: list[bool] = []
     errors_m: list[float] = []
     inside: list[bool] = []
     if not path.exists():
-        return np.array(errors_m), np.array(inside, dtype=bool)
+        return np.array(errors_m), np.array(inside, dtype=bool), 0.0
     with Session([_SAMPLE, path]) as session:
         truth = session.payloads(session.topics(TRUTH))
         times_ns = np.array([tracks.timestamp for tracks in truth])
@@ -93,8 +97,10 @@ def _errors(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
                     [position.x_m - track.x_m, position.y_m - track.y_m, position.z_m - track.z_m]
                 )
                 errors_m.append(float(np.linalg.norm(off_m)))
+                certain.append(bool(position.inside))
                 inside.append(float(off_m @ np.linalg.solve(position.covariance_m2, off_m)) < _CHI2_95)
-    return np.array(errors_m), np.array(inside, dtype=bool)
+    share = float(np.mean(certain)) if certain else 0.0
+    return np.array(errors_m), np.array(inside, dtype=bool), share
 
 
 def _import(

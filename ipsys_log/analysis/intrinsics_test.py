@@ -12,7 +12,7 @@ nothing: their scatter makes the correction uncertain.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.square_pose import is_convex, reprojection_px, solve_squares
-from ipsys_log.messages import CameraCalibration, Marker, Rig
+from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Contradiction", "IntrinsicsTest"]
+__all__ = ["Contradiction", "IntrinsicsTest", "find_contradictions"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -110,6 +110,11 @@ class IntrinsicsTest:
             self._tested_at = _TESTED_AT[-1:]
             self._forget()
 
+    def finish(self) -> Iterator[Contradiction]:
+        """Test the last markers."""
+        if not self._is_contradicted:
+            yield from self._test()
+
     def add_squares(self, markers: Sequence[Marker]) -> Iterator[Contradiction]:
         """Add raw corners of markers whose edges are fitted, or cannot be fitted: fitted ones are square."""
         if self._is_contradicted:
@@ -118,6 +123,10 @@ class IntrinsicsTest:
             if _is_elsewhere(marker, self._fitted_places):
                 self._fit(marker)
                 yield from self._test_squares()
+
+    def is_contradicted(self, marker_id: int) -> bool:
+        """Return whether the intrinsics, or the length of a marker, are contradicted so far."""
+        return self._is_contradicted or marker_id in self._wrong_markers
 
     def _forget(self) -> None:
         for sightings in (self._ids, self._times_ns, self._corners_px, self._fits_px):
@@ -222,6 +231,18 @@ class IntrinsicsTest:
                 "length_m or its height in the rig",
                 marker_id,
             )
+
+
+def find_contradictions(
+    frames: Iterable[tuple[str, Markers]], lenses: Mapping[str, CameraCalibration], rig: Rig
+) -> Iterator[Contradiction]:
+    """Yield each contradiction of the frames of cameras to their intrinsics, which are not nominal ones."""
+    tests = {camera: IntrinsicsTest(camera, lens, rig) for camera, lens in lenses.items() if lens.D.any()}
+    for camera, frame in frames:
+        if camera in tests:
+            yield from tests[camera].add(frame.timestamp, frame.markers)
+    for test in tests.values():
+        yield from test.finish()
 
 
 def _is_elsewhere(marker: Marker, places_px: dict[int, list[tuple[float, float]]]) -> bool:

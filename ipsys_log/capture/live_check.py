@@ -15,7 +15,7 @@ from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.stages.detect.misprints import find_misprints
-from ipsys_log.stages.detect.search import count_wrong_cells, search
+from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
 
 __all__ = ["CameraMonitor", "FrameCheck"]
 
@@ -94,9 +94,8 @@ class CameraMonitor:
         except FrameError as error:
             return FrameCheck((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
         dictionary = self._rig.dictionary
-        seen = Counter(
-            n for n, px in search(grey, dictionary) if not count_wrong_cells(grey, n, px, dictionary)
-        )
+        candidates, squares_px = search_squares(grey, dictionary)
+        seen = Counter(n for n, px in candidates if not count_wrong_cells(grey, n, px, dictionary))
         counts = {n: count for n, count in seen.items() if self._rig.knows(n)}
         unknown = tuple(sorted(set(seen) - set(counts)))
         small = grey[::_SHRINK, ::_SHRINK]
@@ -109,8 +108,9 @@ class CameraMonitor:
             warnings.append("the image is dark or empty: check that the lens is not covered")
         elif sharpness < _BLURRED:
             warnings.append("the image is blurred: add light, or set a fixed exposure_s in lab.toml")
-        misprints = None if counts else find_misprints(grey, dictionary, [])
-        if misprints is not None:
+        misprints = find_misprints(grey, dictionary, squares_px, has_markers=bool(seen))
+        # Some other prints resemble markers of the rig, and a lab can have some beside its markers.
+        if misprints is not None and 2 * len(misprints.ids) > len(counts):
             warnings.append(misprints.advice)
         elif unknown:
             warnings.append(_unknown(unknown))

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import announce_assumed
 from ipsys_log.exchange.csv_rows import NamedRow, read_rows
@@ -31,11 +30,11 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.messages.channels import MARKERS, RIG, RUN_EVENTS
-from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
 from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.file import check_name
 from ipsys_log.runs.output import append_run, open_target
 from ipsys_log.runs.provenance import check_run_name, fingerprint, free_name
+from ipsys_log.stages.detect.reports import LensInUse, Reports
 
 __all__ = ["DetectionOptions", "ImportedDetections", "import_detections"]
 
@@ -115,8 +114,8 @@ def import_detections(
         run = _run_name(session, options.run)
         messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
         rig = options.rig or (session.payloads(session.topics(RIG))[-1] if session is not None else None)
-        contradictions = [*_contradictions(messages, lenses, rig, run)] if rig is not None else []
-        messages += contradictions
+        messages = [*_reported(messages, lenses, rig, run)] if rig is not None else messages
+        texts = [message.payload.text for message in messages if isinstance(message.payload, Event)]
         if session is None:
             messages = [*announce_assumed(_settings(options.rig, lenses, frames), assumed), *messages]
         last_ns = frames[-1].log_time_ns
@@ -129,7 +128,6 @@ def import_detections(
     counts = Counter(dict.fromkeys(sorted({frame.camera for frame in frames}), 0))
     for frame in frames:
         counts[frame.camera] += len(frame.markers)
-    texts = [message.payload.text for message in contradictions]
     return ImportedDetections(output or target, run, dict(counts), from_rig, assumed, texts)
 
 
@@ -216,17 +214,16 @@ def _lenses_of_rig(
     return lenses, assumed
 
 
-def _contradictions(
+def _reported(
     messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], rig: Rig, run: str
 ) -> Iterator[Message]:
-    """Yield an event, after the last frame, for each contradiction of markers and intrinsics."""
-    tests = {camera: IntrinsicsTest(camera, lens, rig) for camera, lens in lenses.items()}
-    topic, last_ns = RUN_EVENTS.topic_of(run), messages[-1].log_time_ns
+    """Yield frames, with an event before a frame whose markers contradict the intrinsics or their lengths."""
+    reports, topic = Reports(), RUN_EVENTS.topic_of(run)
     for message in messages:
-        camera, kind = str(message.camera), CALIBRATION_CONTRADICTED
-        for text, marker_id in tests[camera].add(message.publish_time_ns, message.payload.markers):
-            event = Event(message.publish_time_ns, kind, text, camera, marker_id)
-            yield Message(topic, last_ns, event.timestamp, event, camera)
+        used = LensInUse(lenses[str(message.camera)], rig)
+        for payload in reports(message.camera, [used, message.payload]):
+            at = topic if isinstance(payload, Event) else message.topic
+            yield replace(message, topic=at, payload=payload)
 
 
 def _run_name(session: Session | None, wanted: str | None) -> str:

@@ -161,7 +161,8 @@ def _contradictions(
 def _position(camera: JointModel, marker: Marker, located: _Located) -> Position:
     x_m, y_m, z_m = located.point_m.tolist()
     time_offset_ns = _time_offset_ns(camera, marker)
-    own = located.heading_rad, located.covariance_m2, located.fits and camera.is_certain
+    inside = located.fits and camera.is_certain and not marker.contradicted
+    own = located.heading_rad, located.covariance_m2, inside
     noise = located.noise_m2, located.heading_noise_rad
     return Position(marker.id, x_m, y_m, z_m, *own, time_offset_ns, *noise)
 

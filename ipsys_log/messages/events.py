@@ -14,10 +14,12 @@ __all__ = [
     "CONTRADICTIONS",
     "FRAME_SKIPPED",
     "MARK",
+    "MIRRORED",
     "NODE_ANSWERS",
     "NODE_AWAITED",
     "NODE_REFUSED",
     "OPERATOR_KINDS",
+    "OTHER_PRINTS",
     "SEGMENT_ENDED",
     "SEGMENT_STARTED",
     "STAMP_UNRELIABLE",
@@ -39,8 +41,12 @@ CAMERA_MOVED = "camera_moved"
 # The kinds of events for a marker whose corners contradict its height in the rig, and for a tilted marker
 # whose camera point assumes that it is parallel to the image.
 CONTRADICTED_HEIGHT, TILTED_MARKER = "contradicted_height", "tilted_marker"
+# The kinds of events for a camera whose images are mirrored, and for prints that are no markers of the rig.
+MIRRORED, OTHER_PRINTS = "mirrored_camera", "other_prints"
 # The kinds of events for inputs that the measurements of the log contradict.
-CONTRADICTIONS = frozenset((CALIBRATION_CONTRADICTED, CONTRADICTED_HEIGHT, TILTED_MARKER))
+CONTRADICTIONS = frozenset(
+    (CALIBRATION_CONTRADICTED, CONTRADICTED_HEIGHT, TILTED_MARKER, MIRRORED, OTHER_PRINTS)
+)
 # The kinds of events for the first answers of the node of a camera, and for a long wait for them.
 NODE_ANSWERS, NODE_AWAITED = "node_answers", "node_awaited"
 # The kind of an event for a node whose frames are not recorded: a second one, or one of another version.

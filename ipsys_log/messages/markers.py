@@ -16,7 +16,8 @@ class Marker:
     ``corners_px`` are in px of the raw image, clockwise from the marker's top left; (0, 0) is the centre of
     the first pixel. ``covariance_px2`` is that of x0 y0 .. x3 y3, in single precision. The marker was exposed
     ``time_offset_ns`` after the time of the frame. Its edges of black lie ``edge_offset_px`` too far inside
-    the black.
+    the black. ``contradicted`` is True from the frame on in which the markers of this camera contradict its
+    intrinsics, or this marker its length.
     """
 
     id: int
@@ -24,6 +25,7 @@ class Marker:
     covariance_px2: Mat88 | None = None
     time_offset_ns: int | None = None
     edge_offset_px: float | None = None
+    contradicted: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +64,7 @@ class CameraPoint:
     """The centre of a marker in camera coordinates: x right, y down, z forward.
 
     ``poses`` are the solutions for a planar square, the selected one first; empty for eq. (3).
+    ``contradicted`` is that of the marker.
     """
 
     id: int
@@ -72,6 +75,7 @@ class CameraPoint:
     time_offset_ns: int | None = None
     covariance_m2: Mat33 | None = None
     poses: tuple[MarkerPose, ...] = ()
+    contradicted: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ def lab_headline(lab: LabCalibration) -> Iterator[str]:
     worst = lab.worst
     if lab.causes:
         yield "Not enough: correct the faults of the observations first."
+        yield from lab.contradictions
     elif lab.missing:
         yield f"Not enough: camera {', '.join(lab.missing)} has no model."
     elif lab.is_enough:
@@ -101,6 +102,7 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
         "cameras": [_camera_json(camera) for camera in lab.cameras],
         "missing": list(lab.missing),
         "ignored_sightings": lab.ignored,
+        "contradictions": list(lab.contradictions),
         "faults": [
             {"kind": f.kind, "subject": f.subject, "score": f.score, "text": f.text} for f in lab.faults
         ],

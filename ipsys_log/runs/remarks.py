@@ -77,19 +77,15 @@ class Remarks:
         if corrupt and not self._frames:
             first = _said(self._first["corrupt_frame"])
             raise IpsysError(f"none of {corrupt} frames can be decoded, first: {first}")
-        for kind in ("mirrored_camera", "other_prints"):
-            if self._events[kind] and not self._markers:
-                raise IpsysError(
-                    f"no marker could be read in {self._frames} frames: {_said(self._first[kind])}"
-                )
+        if self._contradictions and not self._markers:
+            first = _said(self._contradictions[0])
+            raise IpsysError(f"no marker could be measured in {self._frames} frames: {first}")
         if self._unknown and not self._markers:
             raise IpsysError(
                 "no frame has a marker of the rig, but the frames have ids "
                 f"{', '.join(sorted(self._unknown))}: add them as [[markers]] to lab.toml, and give the "
                 "file with --rig"
             )
-        if self._contradictions and not self._markers:
-            raise IpsysError(f"no marker could be measured: {_said(self._contradictions[0])}")
         rejected = self._events["rejected_marker"]
         if rejected and not self._markers:
             raise IpsysError(

@@ -158,8 +158,8 @@ def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[Camera
     covariances_m2 = _perimeter_covariances(seen, uv, lengths_m, lens)
     points = []
     for n, ((marker, _, _), ((x_m, y_m, z_m), heading_rad)) in enumerate(zip(seen, places, strict=True)):
-        offset_ns, covariance_m2 = marker.time_offset_ns, covariances_m2.get(n)
-        points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2))
+        of_marker = heading_rad, marker.time_offset_ns, covariances_m2.get(n), (), marker.contradicted
+        points.append(CameraPoint(marker.id, x_m, y_m, z_m, *of_marker))
     return points
 
 
@@ -199,8 +199,8 @@ def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint
         right, down, _ = squares.rotations[n, 0, :, 1]
         heading_rad = float(np.arctan2(-down, right))
         covariance_m2 = None if marker.covariance_px2 is None else covariances_m2[n]
-        offset_ns = marker.time_offset_ns
-        points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2, poses))
+        of_marker = heading_rad, marker.time_offset_ns, covariance_m2, poses, marker.contradicted
+        points.append(CameraPoint(marker.id, x_m, y_m, z_m, *of_marker))
     return points
 
 

@@ -78,7 +78,8 @@ def _positions(
     """Return the positions of the markers, and the heights that contradict those of the rig.
 
     A marker whose ray does not meet its height has no position. A marker whose depth by eq. (3) contradicts
-    its height is not inside: its position is valid at that height only.
+    its height is not inside: its position is valid at that height only. Nor is a marker whose camera has
+    intrinsics that its markers contradict.
     """
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
     angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
@@ -110,7 +111,7 @@ def _positions(
             z_m,
             None if point.heading_rad is None else headings[n],
             None if covariances is None else covariances[n],
-            None if inside is None else bool(inside[n]),
+            False if point.contradicted else None if inside is None else bool(inside[n]),
             point.time_offset_ns,
         )
         for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))

@@ -16,6 +16,7 @@ from ipsys_log.analysis.expected_error import (
     expect_errors,
     find_gaps,
 )
+from ipsys_log.analysis.intrinsics_test import find_contradictions
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
 from ipsys_log.analysis.tape import expected_tape_covariances
 from ipsys_log.analysis.taped_points import TapedPoint, choose_points
@@ -110,6 +111,7 @@ class LabCalibration:
     ignored : number of sightings of moving markers that do not fit; they have little weight.
     missing : cameras of the log without a model, because they saw no marker of the fit.
     notes : remarks.
+    contradictions : what the markers contradict, of the intrinsics and the rig.
     tape_advice : how to find the scale of the tape, where this helps most; else empty.
     """
 
@@ -126,6 +128,7 @@ class LabCalibration:
     ignored: int
     missing: tuple[str, ...]
     notes: tuple[str, ...]
+    contradictions: tuple[str, ...] = ()
     tape_advice: str = ""
 
     @property
@@ -147,9 +150,9 @@ class LabCalibration:
         )
 
     @property
-    def causes(self) -> tuple[Finding, ...]:
-        """The faults that make all figures untrue: wrong sizes and heights of markers, and moved cameras."""
-        return tuple(fault for fault in self.faults if fault.kind in _CAUSES)
+    def causes(self) -> tuple[str, ...]:
+        """The faults that make all figures untrue: wrong intrinsics, sizes and heights, and moved cameras."""
+        return (*self.contradictions, *(fault.text for fault in self.faults if fault.kind in _CAUSES))
 
     @property
     def is_enough(self) -> bool:
@@ -193,7 +196,9 @@ def describe_lab(
     observations = observe(view)
     fit = fit_without(observations, {point.id for point in points} - used, progress)
     names = [camera.name for camera in observations.cameras]
-    return describe_fit(fit, names, run, rig, lenses, goal_m)
+    frames = ((str(message.camera), message.payload) for message in view.messages(MARKERS))
+    contradictions = [text for text, _ in find_contradictions(frames, lenses, rig)]
+    return describe_fit(fit, names, run, rig, lenses, goal_m, contradictions)
 
 
 def describe_fit(
@@ -203,6 +208,7 @@ def describe_fit(
     rig: Rig,
     lenses: Mapping[str, CameraCalibration],
     goal_m: float,
+    contradictions: Sequence[str],
 ) -> LabCalibration:
     """Describe a joint fit; ``names`` are all cameras with markers, see :func:`describe_lab`."""
     models = build_models(fit)
@@ -262,6 +268,7 @@ def describe_fit(
         ignored,
         missing,
         notes,
+        tuple(contradictions),
         _tape_advice(rig, fit, float(np.nanmean([camera.mean_m for camera in cameras]))),
     )
 

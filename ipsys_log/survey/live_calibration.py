@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.intrinsics_test import find_contradictions
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal
 from ipsys_log.analysis.pairs import active_baselines, active_measurements
 from ipsys_log.errors import IpsysError
@@ -115,7 +116,10 @@ class LiveCalibration:
             self._rig, self._lenses, markers, active, nominal, baselines=baselines
         )
         fit = fit_without(observations, ())
-        return describe_fit(fit, sorted(markers), "joint", self._rig, self._lenses, self._goal_m)
+        frames = ((camera, frame) for camera, seen in markers.items() for frame in seen)
+        contradictions = [text for text, _ in find_contradictions(frames, self._lenses, self._rig)]
+        names = sorted(markers)
+        return describe_fit(fit, names, "joint", self._rig, self._lenses, self._goal_m, contradictions)
 
 
 def _line(lab: LabCalibration) -> str:
@@ -123,7 +127,7 @@ def _line(lab: LabCalibration) -> str:
     errors = ", ".join(f"{one.camera} {one.mean_m * MM_PER_M:.1f}" for one in lab.cameras)
     text = f"expected mean error in mm: {errors}"
     if lab.causes:
-        return f"{text}; {lab.causes[0].text}"
+        return f"{text}; {lab.causes[0]}"
     if lab.is_enough:
         return f"{text}; enough: Ctrl-C ends the recording"
     if lab.missing:

@@ -132,6 +132,23 @@ def test_the_answer_is_first_and_fits_into_80_columns(
     assert "Tape" not in done.out
 
 
+def test_contradicted_intrinsics_are_never_enough(ipsys: Ipsys, lab: GeometricLab, tmp_path: Path) -> None:
+    def zoomed(message: Message) -> Message:
+        lens = message.payload
+        if not isinstance(lens, CameraCalibration) or message.camera != "red":
+            return message
+        return replace(message, payload=replace(lens, K=lens.K * [[1.1], [1.1], [1]]))
+
+    path = changed(lab, tmp_path / "zoomed.mcap", zoomed)
+    answer = described(ipsys, path, "--goal-mm", "1000")
+    assert not answer["enough"]
+    (text,) = answer["contradictions"]
+    assert text.startswith("camera red: markers do not fit its calibration (")
+    done = ipsys("calibrate-lab", path, "--goal-mm", "1000")
+    assert done.out.startswith("Not enough: ")
+    assert text in done.out
+
+
 def test_expected_error_agrees_with_the_ground_truth(ipsys: Ipsys, lab: GeometricLab, fitted: Path) -> None:
     answer = described(ipsys, fitted)
     mean_m, _ = true_error_m(lab, fitted)

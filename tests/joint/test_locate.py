@@ -193,6 +193,16 @@ def test_reference_marker_has_no_position(fit: JointFit, model: JointModel) -> N
     assert [position.id for position in found.positions] == [0, 1]
 
 
+def test_marker_that_contradicts_the_intrinsics_is_not_inside(fit: JointFit, model: JointModel) -> None:
+    step = LocateCorners(joint_payload(fit, {}, 0))
+    assert not list(step(Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", LENGTH_M, marker_height_m=0.1))))
+    corners_px = see(model, level_poses(model))
+    for contradicted in (None, True):
+        markers = [Marker(n, one, contradicted=contradicted) for n, one in enumerate(corners_px)]
+        (found,) = step(Message("/markers", 1, 1, Markers(1, tuple(markers), 1920, 1080), "c0"))
+        assert {position.inside for position in found.positions} == {not contradicted}
+
+
 def drive(model: Model, sighted: list[Array], height_m: float | None) -> tuple[list[Event], list[Position]]:
     """Return the events and positions of a marker that drives past a camera, by the step of its model."""
     step = LocateCorners(model)

@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.messages import Event, Markers, Message
+from ipsys_log.capture.live_check import CameraMonitor
+from ipsys_log.messages import Event, Markers, Message, Rig
 from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.detect.misprints import find_misprints
+from ipsys_log.stages.detect.search import find_squares
 from tests.conftest import ROOT, Ipsys
 from tests.stages.drawing import (
     VGA,
@@ -135,6 +137,55 @@ def test_other_prints_beside_a_marker_are_no_event() -> None:
     assert OTHER not in dict(events(made))
 
 
+def random_page(rng: np.random.Generator, cells: int) -> Picture:
+    """Return 24 sharp squares with a black border and random cells."""
+    picture = np.full((VGA.height, VGA.width), 205, dtype=np.uint8)
+    for n in range(24):
+        x, y, side = 20 + 102 * (n % 6), 20 + 115 * (n // 6), 9 * (cells + 2)
+        square = np.full((cells + 2, cells + 2), 35, dtype=np.uint8)
+        square[1:-1, 1:-1] = rng.choice([35, 205], (cells, cells))
+        picture[y : y + side, x : x + side] = square.repeat(9, axis=0).repeat(9, axis=1)
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.7), dtype=np.uint8)
+
+
+def test_random_squares_are_no_prints_of_a_dictionary() -> None:
+    """One of 16 random squares with 4x4 cells is an id of DICT_4X4_1000."""
+    rng = np.random.default_rng(0)
+    pages = [random_page(rng, cells) for cells in (4, 5, 6) for _ in range(25)]
+    assert [
+        page for page in pages if find_misprints(page, RIG_50, find_squares(page, RIG_50)) is not None
+    ] == []
+
+
+def test_prints_of_another_dictionary_among_random_squares_are_named() -> None:
+    page = random_page(np.random.default_rng(1), 4)
+    page[240:] = lab(3, 7, 20, 30, 31, 32, dictionary="DICT_5X5_50", cells=7)[240:]
+    misprints = find_misprints(page, RIG_50, find_squares(page, RIG_50))
+    assert misprints is not None
+    assert 'dictionary = "DICT_5X5_50"' in misprints.advice
+
+
+def test_rejections_of_other_prints_that_come_later_are_no_event() -> None:
+    """An unreadable print resembles an id of the rig; it comes between two inspections of whole images."""
+    floor = np.full((VGA.height, VGA.width), 150, dtype=np.uint8)
+    other = lab(22, 1, 30, 25, 37, 38, dictionary="DICT_6X6_50", cells=8)
+    assert [kind for kind, _ in events(payloads([floor] * 25 + [other] * 10))] == [OTHER]
+
+
+@pytest.mark.parametrize("own", [1, 5])
+def test_live_check_names_other_prints_if_they_are_more(own: int) -> None:
+    """A single print of another dictionary can have the cells of a marker of the rig."""
+    picture = lab(*range(own), dictionary=RIG_50)
+    others = lab(*range(10, 16), dictionary="DICT_5X5_50", cells=7)
+    x_px = 215 if own == 1 else 425
+    picture[:, x_px:] = others[:, x_px:]
+    if own == 1:
+        picture[240:] = others[240:]
+    check = CameraMonitor(Rig("lab", RIG_50, 0.2))._check("red", frame(jpeg(picture), 1).payload)
+    assert check.markers
+    assert any("DICT_5X5_50" in text for text in check.warnings) == (own == 1)
+
+
 def test_squares_without_a_pattern_are_no_prints() -> None:
     rng = np.random.default_rng(0)
     pictures: list[Picture] = [
@@ -146,7 +197,7 @@ def test_squares_without_a_pattern_are_no_prints() -> None:
         x, y, side = rng.integers(0, 560), rng.integers(0, 420), rng.integers(20, 80)
         boxes[y : y + side, x : x + side] = rng.integers(0, 255)
     for picture in [*pictures, boxes]:
-        assert find_misprints(picture, RIG_50, []) is None
+        assert find_misprints(picture, RIG_50, find_squares(picture, RIG_50)) is None
     assert events(payloads(pictures)) == []
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
 
-from ipsys_log.messages import Markers, Measurement, Message, Rig
+from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
 from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
@@ -17,9 +18,14 @@ from ipsys_log.survey.live_calibration import LiveCalibration
 LAB = build_lab(GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=12.0, seed=3), points=6))
 
 
-def lines_of(messages: list[Message], rig: Rig, goal_m: float = 0.05) -> tuple[list[str], LiveCalibration]:
+def lines_of(
+    messages: list[Message],
+    rig: Rig,
+    goal_m: float = 0.05,
+    lenses: Mapping[str, CameraCalibration] = LAB.calibrations,
+) -> tuple[list[str], LiveCalibration]:
     lines: list[str] = []
-    live = LiveCalibration(rig, LAB.calibrations, goal_m, lines.append, every_s=4.0)
+    live = LiveCalibration(rig, lenses, goal_m, lines.append, every_s=4.0)
     for message in messages:
         live(message)
         if live._fitting is not None:
@@ -37,6 +43,15 @@ def test_lines_show_coverage_and_then_the_expected_error() -> None:
     assert lines[-1].startswith("expected mean error in mm: black ")
     assert lines[-1].endswith("; enough: Ctrl-C ends the recording")
     assert live.lab.mean_m < 0.004
+
+
+def test_contradicted_intrinsics_are_the_line_instead_of_enough() -> None:
+    red = LAB.calibrations["red"]
+    lenses = {**LAB.calibrations, "red": replace(red, K=red.K * [[1.1], [1.1], [1]])}
+    lines, live = lines_of(list(simulate_session(LAB)), geometric_rig(LAB), 1.0, lenses)
+    assert live.lab is not None
+    assert not live.lab.is_enough
+    assert "; camera red: markers do not fit its calibration (" in lines[-1]
 
 
 def test_no_measured_point_gives_coverage_only() -> None:

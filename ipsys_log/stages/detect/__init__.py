@@ -418,7 +418,8 @@ def _why_stock(camera: str) -> str:
 def _rig_part(rig: Rig, _method: str) -> object:
     shutters = {(camera.name, camera.row_time_ns, camera.edge_offset_px) for camera in rig.cameras}
     ids = {m.id for m in rig.markers}, {m.id for m in rig.reference_markers if rig.markers}
-    return rig.dictionary, ids, {shutter for shutter in shutters if any(shutter[1:])}
+    sizes = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
+    return rig.dictionary, ids, sizes, rig.marker_length_m, {s for s in shutters if any(s[1:])}
 
 
 def _stateless(parameters: Mapping[str, str], view: StageView) -> Collection[Channel]:

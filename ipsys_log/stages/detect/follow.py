@@ -148,7 +148,7 @@ class MarkerTracker:
             grey, rows, [fit.corners_px for fit in fits], self._breadth_px
         )
         region = WHOLE if lost or due else self._changed
-        samples = sample(grey) if fresh else None
+        samples, squares_px = sample(grey) if fresh else None, None
         if region is not None:
             if region is WHOLE:
                 candidates, squares_px = search_squares(grey, self._dictionary, samples)
@@ -166,9 +166,11 @@ class MarkerTracker:
             # A new object without a detected marker may be a marker in shadow.
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
         self.misprints = None
-        if due:
-            known_px = [fit.corners_px for fit in fits]
-            self.misprints = self._inspect(grey, self._dictionary, known_px, squares_px)
+        if due or self._rejections:
+            known_px, is_odd = [fit.corners_px for fit in fits], bool(self._rejections)
+            self.misprints = self._inspect(
+                grey, self._dictionary, known_px, squares_px, has_rejections=is_odd
+            )
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]

@@ -1,14 +1,14 @@
 """Prints that are no markers of the rig: mirrored, negative, of another dictionary, or with a wider border.
 
 Squares that no marker explains are read again with other grids and patterns. Only exact patterns with clear
-cells count, so that other squares in the image are not taken for prints.
+cells count, and more of them than random cells give, so that other squares are not taken for prints.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from math import comb
 from typing import NamedTuple
 
 import cv2
@@ -16,20 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.images.decode import Grey
+from ipsys_log.messages.events import MIRRORED, OTHER_PRINTS
 from ipsys_log.stages.detect.search import find_squares, read_cells
 
-__all__ = ["MIRRORED", "OTHER_PRINTS", "Inspection", "Misprints", "find_misprints"]
+__all__ = ["Inspection", "Misprints", "find_misprints"]
 
 Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
 
-# Kinds of events, and of misprints.
-MIRRORED, OTHER_PRINTS = "mirrored_camera", "other_prints"
+# Kinds of misprints, besides mirrored ones.
 _NEGATIVE, _WIDE, _FOREIGN = "negative", "wide border", "dictionary"
 
 # Least difference of black and white, in grey levels, and largest distance of a cell from both as a share of
 # it. Squares of other objects have cells between both (test_squares_without_a_pattern_are_no_prints).
 _CONTRAST, _CLEAR = 25.0, 0.25
+# Chance that random squares fit an explanation as well: 6 % of them are ids of DICT_4X4_1000. The second
+# bound holds if all squares fit, as in a lab with few prints.
+_CHANCE, _CHANCE_OF_ALL = 0.001, 0.01
 # Cells of a side without the border.
 _CELLS = (4, 5, 6, 7)
 # Dictionaries of square prints: the largest of each family, and the sizes of its parts.
@@ -55,13 +58,22 @@ class Misprints(NamedTuple):
 
 
 class Inspection:
-    """The search of one camera for misprints: in few of its images, ever fewer."""
+    """The search of one camera for misprints: in few of its images, ever fewer.
+
+    Images with a marker that cannot be measured are counted apart: the marker may be another print.
+    """
 
     def __init__(self) -> None:
-        self._images = 0
+        self._images = {False: 0, True: 0}
 
     def __call__(
-        self, grey: Grey, dictionary: str, markers_px: Sequence[Array], squares_px: Array | None = None
+        self,
+        grey: Grey,
+        dictionary: str,
+        markers_px: Sequence[Array],
+        squares_px: Array | None = None,
+        *,
+        has_rejections: bool = False,
     ) -> Misprints | None:
         """Return the misprints among the squares in an image that are none of the measured markers.
 
@@ -69,36 +81,64 @@ class Inspection:
         ----------
         markers_px : corners (4, 2) of the measured markers.
         squares_px : corners (n, 4, 2) of all squares, if they are known.
+        has_rejections : the image has a marker that cannot be measured.
         """
-        self._images += 1
-        if self._images & (self._images - 1):
+        self._images[has_rejections] += 1
+        images = self._images[has_rejections]
+        if images & (images - 1):
             return None
-        return find_misprints(grey, dictionary, markers_px, squares_px)
+        if squares_px is None:
+            squares_px = find_squares(grey, dictionary)
+        unexplained_px = _unexplained(squares_px, markers_px)
+        return find_misprints(grey, dictionary, unexplained_px, has_markers=bool(markers_px))
 
 
 def find_misprints(
-    grey: Grey, dictionary: str, markers_px: Sequence[Array], squares_px: Array | None = None
+    grey: Grey, dictionary: str, squares_px: Array, *, has_markers: bool = False
 ) -> Misprints | None:
-    """Return the explanation of most squares without a marker, or None; as :class:`Inspection`."""
-    if squares_px is None:
-        squares_px = find_squares(grey, dictionary)
-    squares_px = _unexplained(squares_px, markers_px)
-    seen = set(_explain(grey, squares_px, dictionary))
-    if not seen and not len(markers_px):
-        inverse = 255 - grey
-        squares_px = find_squares(inverse, dictionary)
-        for bits in _clear_prints(inverse, squares_px, _size(dictionary), 1).values():
-            if (marker_id := _words(dictionary).get(bits.tobytes())) is not None:
-                seen.add((_NEGATIVE, dictionary, marker_id))
-    counts = Counter((kind, name) for kind, name, _ in seen)
-    if not counts:
+    """Return the explanation of most squares (n, 4, 2), or None; images with markers have no negatives."""
+    found = [one for one in _explain(grey, squares_px, dictionary) if one.is_certain]
+    if not found and not has_markers:
+        inverse, size = 255 - grey, _size(dictionary)
+        prints = _clear_prints(inverse, find_squares(inverse, dictionary), size, 1)
+        negative = _Explanation.of(_NEGATIVE, dictionary, prints, _words(dictionary), _patterns(prints))
+        found = [negative] if negative.is_certain else []
+    if not found:
         return None
     # The first kind is the likeliest if counts are equal: one dictionary has all prints of a lab.
     order = (MIRRORED, _NEGATIVE, _WIDE, _FOREIGN)
-    best = min(counts, key=lambda key: (-counts[key], order.index(key[0]), key[1]))
-    ids = tuple(sorted(marker_id for kind, name, marker_id in seen if (kind, name) == best))
-    kind = MIRRORED if best[0] == MIRRORED else OTHER_PRINTS
-    return Misprints(kind, ids, _advice(*best, ids, dictionary), _symmetric_ids(dictionary))
+    best = min(found, key=lambda one: (-len(one.ids), order.index(one.kind), one.name))
+    ids = tuple(sorted(best.ids))
+    kind = MIRRORED if best.kind == MIRRORED else OTHER_PRINTS
+    return Misprints(kind, ids, _advice(best.kind, best.name, ids, dictionary), _symmetric_ids(dictionary))
+
+
+class _Explanation(NamedTuple):
+    """An explanation of clear squares.
+
+    ``ids`` are those of the squares that fit; ``share`` is that of random squares that fit. ``patterns`` is
+    the number of different squares.
+    """
+
+    kind: str
+    name: str
+    ids: set[int]
+    patterns: int
+    share: float
+
+    @classmethod
+    def of(
+        cls, kind: str, name: str, prints: Sequence[Bits], words: Mapping[bytes, int], patterns: int
+    ) -> _Explanation:
+        ids = {words[bits.tobytes()] for bits in prints if bits.tobytes() in words}
+        return cls(kind, name, ids, patterns, len(words) / 2.0 ** (_size(name) ** 2))
+
+    @property
+    def is_certain(self) -> bool:
+        """True if random squares hardly fit as often."""
+        fits, count, p = len(self.ids), self.patterns, self.share
+        chance = sum(comb(count, n) * p**n * (1 - p) ** (count - n) for n in range(fits, count + 1))
+        return fits > 0 and chance < (_CHANCE_OF_ALL if fits == count else _CHANCE)
 
 
 @cache
@@ -118,27 +158,32 @@ def _unexplained(squares_px: Array, markers_px: Sequence[Array]) -> Array:
     return squares_px[left]
 
 
-def _explain(grey: Grey, squares_px: Array, dictionary: str) -> Iterator[tuple[str, str, int]]:
-    """Yield the kind, the dictionary and the id of each explanation of a square."""
+def _explain(grey: Grey, squares_px: Array, dictionary: str) -> Iterator[_Explanation]:
+    """Yield possible explanations of squares."""
     own = _words(dictionary)
+    prints = {
+        size: [bits for bits in _clear_prints(grey, squares_px, size, 1) if bits.tobytes() not in own]
+        for size in _CELLS
+    }
+    patterns = sum(map(_patterns, prints.values()))
+    turned = [np.ascontiguousarray(bits.T) for bits in prints[_size(dictionary)]]
+    yield _Explanation.of(MIRRORED, dictionary, turned, own, patterns)
     for size in _CELLS:
-        for bits in _clear_prints(grey, squares_px, size, 1).values():
-            if bits.tobytes() in own:
-                continue
-            if (marker_id := own.get(bits.T.tobytes())) is not None:
-                yield MIRRORED, dictionary, marker_id
-            for family in _families(size):
-                if (marker_id := _words(family).get(bits.tobytes())) is not None:
-                    yield _FOREIGN, family, marker_id
-    for bits in _clear_prints(grey, squares_px, _size(dictionary), 2).values():
-        if (marker_id := own.get(bits.tobytes())) is not None:
-            yield _WIDE, dictionary, marker_id
+        for family in _families(size):
+            yield _Explanation.of(_FOREIGN, family, prints[size], _words(family), patterns)
+    wide = _clear_prints(grey, squares_px, _size(dictionary), 2)
+    yield _Explanation.of(_WIDE, dictionary, wide, own, _patterns(wide))
 
 
-def _clear_prints(grey: Grey, squares_px: Array, size: int, border: int) -> dict[int, Bits]:
+def _patterns(prints: Sequence[Bits]) -> int:
+    """Return the number of different patterns: one square can be found twice."""
+    return len({min(np.rot90(bits, turn).tobytes() for turn in range(4)) for bits in prints})
+
+
+def _clear_prints(grey: Grey, squares_px: Array, size: int, border: int) -> list[Bits]:
     """Return the inner cells (size, size), 1 for white, of squares with clear cells and a black border."""
     if not len(squares_px):
-        return {}
+        return []
     levels = read_cells(grey, squares_px, size + 2 * border)
     low, high = levels.min(axis=1, keepdims=True), levels.max(axis=1, keepdims=True)
     white = levels > (low + high) / 2
@@ -147,7 +192,7 @@ def _clear_prints(grey: Grey, squares_px: Array, size: int, border: int) -> dict
     inner = cells[:, border:-border, border:-border]
     black_border = white.sum(axis=1) == inner.sum(axis=(1, 2))
     clear = (off.max(axis=1) < _CLEAR) & (high - low > _CONTRAST)[:, 0] & black_border
-    return {int(n): np.ascontiguousarray(inner[n], dtype=np.uint8) for n in np.flatnonzero(clear)}
+    return [np.ascontiguousarray(cells, dtype=np.uint8) for cells in inner[clear]]
 
 
 def _advice(kind: str, name: str, ids: Sequence[int], dictionary: str) -> str:

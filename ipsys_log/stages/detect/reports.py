@@ -13,8 +13,7 @@ from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import SizeError
 from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers, Rig
-from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
-from ipsys_log.stages.detect.misprints import MIRRORED, OTHER_PRINTS
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, MIRRORED, OTHER_PRINTS
 
 __all__ = [
     "NO_KEYFRAME",
@@ -144,7 +143,8 @@ class Reports:
                 self._fitted.add((camera, (payload.width, payload.height)))
                 self._prints[camera].own.update(marker.id for marker in payload.markers)
                 yield from self._test(camera, payload, squares)
-            if not isinstance(payload, Event):
+                yield self._without_mirrored(camera, self._marked(camera, payload))
+            elif not isinstance(payload, Event):
                 yield self._without_mirrored(camera, payload)
             elif self._is_new(payload):
                 yield payload
@@ -162,6 +162,18 @@ class Reports:
         contradictions = [] if squares is None else [*test.add_squares(squares.markers())]
         for text, marker_id in (*contradictions, *test.add(frame.timestamp, frame.markers)):
             yield Event(frame.timestamp, CALIBRATION_CONTRADICTED, text, camera, marker_id)
+
+    def _marked(self, camera: str | None, frame: Markers) -> Markers:
+        """Return a frame with a mark on the markers that contradict the intrinsics or their length."""
+        test = self._tests.get(camera)
+        # Models do not rely on nominal intrinsics: joint estimates them.
+        if test is None or not test.lens.D.any():
+            return frame
+        wrong = {marker.id for marker in frame.markers if test.is_contradicted(marker.id)}
+        if not wrong:
+            return frame
+        markers = (replace(m, contradicted=True) if m.id in wrong else m for m in frame.markers)
+        return replace(frame, markers=tuple(markers))
 
     def _explains(self, camera: str | None, event: Event) -> bool:
         """Return whether other prints explain why a camera sees no markers."""

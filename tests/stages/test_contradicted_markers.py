@@ -1,4 +1,4 @@
-"""Positions from markers that contradict the intrinsics of their camera, and sizes that contradict the rig."""
+"""Markers that contradict the intrinsics of their camera, and sizes that contradict the rig."""
 
 from __future__ import annotations
 

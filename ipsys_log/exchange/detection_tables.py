@@ -113,8 +113,7 @@ def import_detections(
         lenses, assumed = {**known, **from_rig}, {**options.assumed, **assumed}
         run = _run_name(session, options.run)
         messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
-        rig = options.rig or (session.payloads(session.topics(RIG))[-1] if session is not None else None)
-        messages = [*_reported(messages, lenses, rig, run)] if rig is not None else messages
+        messages = [*_reported(messages, lenses, run)]
         texts = [message.payload.text for message in messages if isinstance(message.payload, Event)]
         if session is None:
             messages = [*announce_assumed(_settings(options.rig, lenses, frames), assumed), *messages]
@@ -215,12 +214,12 @@ def _lenses_of_rig(
 
 
 def _reported(
-    messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], rig: Rig, run: str
+    messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], run: str
 ) -> Iterator[Message]:
-    """Yield frames, with an event before a frame whose markers contradict the intrinsics or their lengths."""
+    """Yield frames, with an event before a frame whose markers contradict the intrinsics."""
     reports, topic = Reports(), RUN_EVENTS.topic_of(run)
     for message in messages:
-        used = LensInUse(lenses[str(message.camera)], rig)
+        used = LensInUse(lenses[str(message.camera)])
         for payload in reports(message.camera, [used, message.payload]):
             at = topic if isinstance(payload, Event) else message.topic
             yield replace(message, topic=at, payload=payload)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.marker_sizes import SizeTest
 from ipsys_log.analysis.marker_tilts import MarkerTilts, SeenMarkers
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
@@ -33,7 +34,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
-from ipsys_log.messages.events import TILTED_MARKER
+from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView
 
 __all__ = ["METHODS", "PERIMETER", "STAGE", "CameraFrame", "check_method", "points_run"]
@@ -53,7 +54,7 @@ class CameraFrame:
     ----------
     method : ``perimeter``, eq. (3) to (5), exact for a marker that is parallel to the image plane; or
         ``pose``, exact for a marker with any tilt. With ``perimeter``, an event names a tilted marker, one
-        for each camera.
+        for each camera. Further events name markers whose sizes contradict the rig.
     """
 
     def __init__(self, method: str = PERIMETER) -> None:
@@ -62,12 +63,15 @@ class CameraFrame:
         self._lenses: dict[str | None, CameraCalibration] = {}
         self._knows_tilts = method != PERIMETER
         self._tilts: dict[str | None, MarkerTilts] = {}
+        self._sizes: dict[str, SizeTest] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
         if isinstance(payload, Rig):
             self._rig = payload
+            self._sizes.clear()
         elif isinstance(payload, CameraCalibration):
+            self._sizes.pop(str(message.camera), None)
             self._lenses[message.camera] = check_calibration(payload, f"calibration of {message.camera}")
         else:
             yield from self._frame(payload, message)
@@ -87,10 +91,19 @@ class CameraFrame:
                 else:
                     yield Event(message.publish_time_ns, *fault, camera, sighting.marker.id)
             points = self._method.place(seen, lens) if seen else []
+            yield from self._wrong_sizes(frame, str(camera))
             # With nominal intrinsics, which have no distortion, level markers seem to lie on a bowl.
             if seen and not self._knows_tilts and lens.D.any():
                 yield from self._tilt(seen, lens, frame.height, message)
         yield CameraPoints(message.publish_time_ns, tuple(points))
+
+    def _wrong_sizes(self, frame: Markers, camera: str) -> Iterator[Event]:
+        """Yield an event for each marker whose size contradicts its length and height in the rig."""
+        rig, lens = self._settings(camera)
+        if camera not in self._sizes:
+            self._sizes[camera] = SizeTest(camera, lens, rig)
+        for text, marker_id in self._sizes[camera].add(frame.timestamp, frame.markers):
+            yield Event(frame.timestamp, CALIBRATION_CONTRADICTED, text, camera, marker_id)
 
     def _tilt(
         self, seen: Sequence[_Seen], lens: CameraCalibration, rows: int, message: Message
@@ -283,8 +296,8 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
 
 def _rig_part(rig: Rig, _method: str) -> object:
-    lengths = {(marker.id, rig.length_of(marker.id)) for marker in rig.markers}
-    return rig.marker_length_m, lengths, {marker.id for marker in rig.reference_markers}
+    sizes = {(marker.id, rig.length_of(marker.id), rig.height_of(marker.id)) for marker in rig.markers}
+    return rig.marker_length_m, sizes, {marker.id for marker in rig.reference_markers}
 
 
 STAGE = Stage(
@@ -295,8 +308,6 @@ STAGE = Stage(
     plan=_plan,
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("method", PERIMETER),
-    # An event names a tilted marker once.
-    stateless=lambda parameters, view: (
-        (CAMERA_POINTS, RUN_EVENTS) if parameters.get("method", PERIMETER) != PERIMETER else (CAMERA_POINTS,)
-    ),
+    # An event names a marker once.
+    stateless=lambda parameters, view: (CAMERA_POINTS,),
 )

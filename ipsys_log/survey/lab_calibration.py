@@ -197,7 +197,7 @@ def describe_lab(
     fit = fit_without(observations, {point.id for point in points} - used, progress)
     names = [camera.name for camera in observations.cameras]
     frames = ((str(message.camera), message.payload) for message in view.messages(MARKERS))
-    contradictions = [text for text, _ in find_contradictions(frames, lenses, rig)]
+    contradictions = [*find_contradictions(frames, lenses, rig)]
     return describe_fit(fit, names, run, rig, lenses, goal_m, contradictions)
 
 

@@ -117,7 +117,7 @@ class LiveCalibration:
         )
         fit = fit_without(observations, ())
         frames = ((camera, frame) for camera, seen in markers.items() for frame in seen)
-        contradictions = [text for text, _ in find_contradictions(frames, self._lenses, self._rig)]
+        contradictions = [*find_contradictions(frames, self._lenses, self._rig)]
         names = sorted(markers)
         return describe_fit(fit, names, "joint", self._rig, self._lenses, self._goal_m, contradictions)
 

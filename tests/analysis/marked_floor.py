@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
+from ipsys_log.analysis.intrinsics_test import find_contradictions
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.messages import CameraCalibration, Marker, Rig, RigMarker
+from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig, RigMarker
 
 FISHEYE = CameraCalibration(
     0,
@@ -85,12 +84,7 @@ def sighted(
     return seen
 
 
-def contradictions(
-    frames: list[list[Marker]],
-    lens: CameraCalibration,
-    rig: Rig = RIG,
-    test: Callable[..., IntrinsicsTest] = IntrinsicsTest,
-) -> list[str]:
+def contradictions(frames: list[list[Marker]], lens: CameraCalibration, rig: Rig = RIG) -> list[str]:
     """Return the contradictions of a camera with these intrinsics and markers."""
-    trial = test("red", lens, rig)
-    return [text for n, markers in enumerate(frames) for text, _ in trial.add(n * NS, markers)]
+    seen = [Markers(n * NS, tuple(markers), lens.width, lens.height) for n, markers in enumerate(frames)]
+    return [*find_contradictions((("red", frame) for frame in seen), {"red": lens}, rig)]

@@ -1,4 +1,4 @@
-"""Certainty of positions from markers that contradict the intrinsics of their camera, or their own length."""
+"""Markers that contradict the intrinsics of their camera, and sizes that contradict the rig."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import pytest
 from ipsys_log.messages import CameraCalibration, CameraPoints, Event, Marker, Markers, Message, Pair
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
-from ipsys_log.stages.detect import STAGE
+from ipsys_log.stages.camera_frame import STAGE as CAMERA_FRAME
+from ipsys_log.stages.detect import STAGE as DETECT
 from ipsys_log.stages.detect.reports import LensInUse, Reports
 from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.locate import Locate
 from tests.analysis.marked_floor import FISHEYE, RIG, changed, sighted
 
 
-def reported(lens: CameraCalibration, lengths_m: tuple[float, ...] = (0.2, 0.2, 0.2)) -> list[Any]:
+def reported(lens: CameraCalibration) -> list[Any]:
     """Return what detection reports of 60 frames of a camera with these intrinsics."""
     reports = Reports()
-    list(reports("red", [LensInUse(lens, RIG)]))
-    frames = sighted(FISHEYE, np.random.default_rng(1), lengths_m=lengths_m)
+    list(reports("red", [LensInUse(lens)]))
+    frames = sighted(FISHEYE, np.random.default_rng(1))
     payloads = [Markers(n * 10**9, tuple(seen), 1920, 1080) for n, seen in enumerate(frames)]
     return [payload for frame in payloads for payload in reports("red", [frame])]
 
@@ -39,9 +40,14 @@ def test_markers_are_marked_from_the_event_on() -> None:
     assert all(marked(payloads[first:]))
 
 
-def test_wrong_length_marks_only_its_marker() -> None:
-    payloads = reported(FISHEYE, (0.2, 0.18, 0.2))
-    assert {m.id for p in payloads if isinstance(p, Markers) for m in p.markers if m.contradicted} == {1}
+def test_wrong_length_is_named_with_its_marker() -> None:
+    frame = CameraFrame("perimeter")
+    for setting in (RIG, FISHEYE):
+        list(frame(Message("t", 0, 0, setting, "red")))
+    sightings = sighted(FISHEYE, np.random.default_rng(1), lengths_m=(0.2, 0.18, 0.2))
+    frames = [Markers(n * 10**9, tuple(seen), 1920, 1080) for n, seen in enumerate(sightings)]
+    payloads = [payload for seen in frames for payload in frame(Message("t", 1, 1, seen, "red"))]
+    assert [p.marker_id for p in payloads if isinstance(p, Event)] == [1]
 
 
 def test_honest_and_nominal_intrinsics_mark_nothing() -> None:
@@ -70,8 +76,9 @@ def test_positions_of_marked_markers_are_not_inside(method: str) -> None:
         assert {position.inside for position in positions.positions} == {not contradicted}
 
 
-def test_detection_depends_on_lengths_and_heights() -> None:
+def test_detection_does_not_depend_on_lengths_and_heights() -> None:
     longer = replace(RIG, markers=(replace(RIG.markers[0], length_m=0.21), *RIG.markers[1:]))
     higher = replace(RIG, markers=(replace(RIG.markers[0], height_m=0.2), *RIG.markers[1:]))
-    parts = [STAGE.rig_part(rig, "edges") for rig in (RIG, longer, higher)]
-    assert parts[0] not in parts[1:]
+    for stage, changes in ((DETECT, False), (CAMERA_FRAME, True)):
+        parts = [stage.rig_part(rig, "") for rig in (RIG, longer, higher)]
+        assert [part != parts[0] for part in parts[1:]] == [changes] * 2

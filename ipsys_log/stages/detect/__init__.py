@@ -227,12 +227,10 @@ class FrameDetector:
         )
 
     def _new_lens(self, message: Message) -> Iterator[LensInUse]:
-        """Yield the intrinsics and the rig of a frame, if they are new since the last reset."""
+        """Yield the intrinsics of a frame, if they are new since the last reset."""
         lens, used = self._lenses.get(message.camera), self._lenses_in_use.get(message.camera)
-        if lens is None or self._rig is None:
-            return
-        if used is None or used.lens is not lens or used.rig is not self._rig:
-            self._lenses_in_use[message.camera] = LensInUse(lens, self._rig)
+        if lens is not None and (used is None or used.lens is not lens):
+            self._lenses_in_use[message.camera] = LensInUse(lens)
             yield self._lenses_in_use[message.camera]
 
     def _squares(self, message: Message, rig: Rig) -> Iterator[SeenSquares]:
@@ -418,8 +416,7 @@ def _why_stock(camera: str) -> str:
 def _rig_part(rig: Rig, _method: str) -> object:
     shutters = {(camera.name, camera.row_time_ns, camera.edge_offset_px) for camera in rig.cameras}
     ids = {m.id for m in rig.markers}, {m.id for m in rig.reference_markers if rig.markers}
-    sizes = {(m.id, rig.length_of(m.id), rig.height_of(m.id)) for m in rig.markers}
-    return rig.dictionary, ids, sizes, rig.marker_length_m, {s for s in shutters if any(s[1:])}
+    return rig.dictionary, ids, {shutter for shutter in shutters if any(shutter[1:])}
 
 
 def _stateless(parameters: Mapping[str, str], view: StageView) -> Collection[Channel]:

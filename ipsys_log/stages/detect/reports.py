@@ -12,7 +12,7 @@ import numpy as np
 from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import SizeError
 from ipsys_log.geometry.lenses import same_intrinsics
-from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers, Rig
+from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, MIRRORED, OTHER_PRINTS
 
 __all__ = [
@@ -43,10 +43,9 @@ class OtherSize:
 
 @dataclass(frozen=True, slots=True)
 class LensInUse:
-    """The intrinsics and the rig that hold from a frame of a camera on."""
+    """The intrinsics that hold from a frame of a camera on."""
 
     lens: CameraCalibration
-    rig: Rig
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +150,8 @@ class Reports:
 
     def _begin_test(self, camera: str, used: LensInUse) -> None:
         test = self._tests.get(camera)
-        if test is None or not same_intrinsics(test.lens, used.lens) or test.rig != used.rig:
-            self._tests[camera] = IntrinsicsTest(camera, used.lens, used.rig)
+        if test is None or not same_intrinsics(test.lens, used.lens):
+            self._tests[camera] = IntrinsicsTest(camera, used.lens)
 
     def _test(self, camera: str | None, frame: Markers, squares: SeenSquares | None) -> Iterator[Event]:
         """Yield an event for each contradiction between the intrinsics of a camera and its markers."""
@@ -160,20 +159,16 @@ class Reports:
         if test is None or self._prints[camera].is_mirrored:
             return
         contradictions = [] if squares is None else [*test.add_squares(squares.markers())]
-        for text, marker_id in (*contradictions, *test.add(frame.timestamp, frame.markers)):
-            yield Event(frame.timestamp, CALIBRATION_CONTRADICTED, text, camera, marker_id)
+        for text in (*contradictions, *test.add(frame.timestamp, frame.markers)):
+            yield Event(frame.timestamp, CALIBRATION_CONTRADICTED, text, camera)
 
     def _marked(self, camera: str | None, frame: Markers) -> Markers:
-        """Return a frame with a mark on the markers that contradict the intrinsics or their length."""
+        """Return a frame whose markers have a mark if they contradict the intrinsics."""
         test = self._tests.get(camera)
         # Models do not rely on nominal intrinsics: joint estimates them.
-        if test is None or not test.lens.D.any():
+        if test is None or not test.is_contradicted or not test.lens.D.any():
             return frame
-        wrong = {marker.id for marker in frame.markers if test.is_contradicted(marker.id)}
-        if not wrong:
-            return frame
-        markers = (replace(m, contradicted=True) if m.id in wrong else m for m in frame.markers)
-        return replace(frame, markers=tuple(markers))
+        return replace(frame, markers=tuple(replace(m, contradicted=True) for m in frame.markers))
 
     def _explains(self, camera: str | None, event: Event) -> bool:
         """Return whether other prints explain why a camera sees no markers."""

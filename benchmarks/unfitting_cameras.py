@@ -106,7 +106,7 @@ def _errors(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
 def _import(
     trial: Trial, change: Callable[[CameraCalibration], CameraCalibration], length_m: float = 0.2
 ) -> str:
-    """Import markers that another camera has seen; return the output."""
+    """Import markers that another camera has seen, and compute their camera points; return the output."""
     random = np.random.default_rng(trial.seed)
     frames = sighted(FISHEYE, random, lengths_m=(0.2, length_m, 0.2))
     _yaml(trial.folder / "red.yaml", change(calibrated_with_errors(FISHEYE, random)))
@@ -122,10 +122,11 @@ def _import(
         for marker in markers
     ]
     (trial.folder / "markers.csv").write_text("\n".join([f"time,camera,marker_id,{names}", *rows]) + "\n")
-    return trial.ipsys(
+    imported = trial.ipsys(
         *("import", "detections", "markers.csv", "-o", "log.mcap", "--rig", "lab.toml"),
         *("--calibration", "red=red.yaml"),
     )
+    return imported + trial.ipsys("camera-frame", "log.mcap")
 
 
 def _seen(change: Callable[[CameraCalibration], CameraCalibration], trial: Trial) -> Outcome:

@@ -43,8 +43,10 @@ _MOST_OUTLIERS = 0.2
 # A hypothesis about cameras must decrease twice the cost by this much: once in a million sessions by chance.
 _LEAST_GAIN = 60.0
 _MOST_HYPOTHESES = 3
-# If the best hypothesis leaves evidence of another one, the next one is tried instead of it.
-_MOST_TRIALS = 2
+# If the best hypothesis leaves more outliers than this, the next one is tried instead of it.
+_MOST_TRIALS, _FEW_OUTLIERS = 2, 0.01
+# Row times have fewer unknowns than a motion at any time: they come first if they explain this share of it.
+_ROWS_SHARE = 0.25
 # Two hypotheses are both possible if their probabilities differ by less than a factor of 100.
 _AS_PROBABLE = 2 * float(np.log(100.0))
 # The first time of a motion is rough; the poses before and after it give a better one.
@@ -249,7 +251,8 @@ def _explain_cameras(fit: JointFit, settings: JointSettings, progress: Progress)
         trial = _try_causes(fit, causes[:_MOST_TRIALS], settings, progress)
         if trial is None:
             break
-        possible = [motion for chi2, motion in causes if causes[0][0] - chi2 < _AS_PROBABLE]
+        most = max(chi2 for chi2, _ in causes)
+        possible = [motion for chi2, motion in causes if most - chi2 < _AS_PROBABLE]
         if len(possible) > 1:
             return replace(trial, known=(*fit.known, _name_rivals(fit, possible)), is_certain=False)
         fit = replace(trial, is_certain=fit.is_certain)
@@ -257,16 +260,18 @@ def _explain_cameras(fit: JointFit, settings: JointSettings, progress: Progress)
 
 
 def _likely_causes(fit: JointFit) -> list[_Cause]:
-    """Return motions of cameras and what they explain, the best first; None stands for wrong row times."""
+    """Return motions of cameras and wrong row times (None), with what they explain, the likely ones first."""
     squares = sum_squares(fit)
     causes: list[_Cause] = [
         (motion.chi2, motion)
         for number, camera in enumerate(fit.observations.cameras)
         if not camera.is_former and (motion := find_motion(squares, number)) is not None
     ]
+    causes.sort(key=lambda cause: -cause[0])
     if by_rows := row_time_evidence(squares):
-        causes.append((by_rows, None))
-    return sorted(causes, key=lambda cause: -cause[0])
+        is_first = not causes or by_rows > _ROWS_SHARE * causes[0][0]
+        causes.insert(0 if is_first else len(causes), (by_rows, None))
+    return causes
 
 
 def _try_causes(
@@ -281,7 +286,7 @@ def _try_causes(
             trial = _try_motion(fit, motion, settings, progress)
         if trial is not None and _is_explained(fit, trial):
             trials.append(trial)
-            if not _likely_causes(trial):
+            if _outlier_share(trial) < _FEW_OUTLIERS:
                 break
     return min(trials, key=lambda one: one.solution.cost, default=None)
 

@@ -31,6 +31,8 @@ _STATIONARY, _LEAST = 5, 10
 _CONTRADICTED = 60.0
 # Unknowns of a pose: a turn and a shift.
 _POSE = 6
+# A larger turn is that of a few outliers, which any pose explains.
+_MOST_TURN_RAD = 0.17
 # A factor on the limits of the loss with which no residual is an outlier.
 _NO_LIMIT = 1e12
 
@@ -96,7 +98,7 @@ def find_motion(squares: Squares, camera: int) -> CameraMotion | None:
             return None
         cuts = _near(times_s, cuts, best.time_s)
         best = _best_motion(squares, camera, times_s, cuts)
-    return best
+    return best if best.turn_rad < _MOST_TURN_RAD else None
 
 
 def row_time_evidence(squares: Squares) -> float:

@@ -33,8 +33,8 @@ _CONTRADICTED = 60.0
 _POSE = 6
 # A larger turn is that of a few outliers, which any pose explains.
 _MOST_TURN_RAD = 0.17
-# A factor on the limits of the loss with which no residual is an outlier.
-_NO_LIMIT = 1e12
+# A factor on the limits of the loss with which no residual is an outlier; rounding errors of a cost.
+_NO_LIMIT, _SAME_COST = 1e12, 1e-9
 
 
 class CameraMotion(NamedTuple):
@@ -69,8 +69,11 @@ class Squares:
 
 def sum_squares(fit: JointFit) -> Squares:
     """Return the sum of squares near a fit."""
-    normal, free = fit.problem.linearise(fit.state, _NO_LIMIT), fit.problem.layout.free
-    factorisation = Factorisation(normal, free)
+    normal, factorisation, free = fit.solution.normal, fit.solution.factorisation, fit.problem.layout.free
+    if fit.problem.cost(fit.state, _NO_LIMIT) > normal.cost * (1 + _SAME_COST):
+        # The fit has outliers.
+        normal = fit.problem.linearise(fit.state, _NO_LIMIT)
+        factorisation = Factorisation(normal, free)
     pulled = factorisation.forward(normal.local_gradient[:, None])[:, 0]
     gradient = normal.global_gradient[free] - factorisation.pull(pulled)
     return Squares(fit, normal, factorisation, pulled, gradient, _lowest(normal, factorisation))

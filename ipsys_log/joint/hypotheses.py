@@ -14,13 +14,13 @@ import numpy as np
 from ipsys_log.errors import FitError
 from ipsys_log.joint.diagnosis import point_covariances, standardise_readings
 from ipsys_log.joint.fit import Finding, JointFit, fit_jointly, fit_shape
-from ipsys_log.joint.moved_cameras import CameraMotion, find_moved_cameras, find_row_times
+from ipsys_log.joint.moved_cameras import CameraMotion, find_motion, row_time_evidence, sum_squares
 from ipsys_log.joint.observations import CalibrationPoint, Observations
-from ipsys_log.joint.robust import robust_loss
 from ipsys_log.joint.selection import divide_camera, without_cameras, without_points
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, place_freely, rough_points
 from ipsys_log.joint.tape_explanations import (
+    WRONG_NUMBER,
     Explanation,
     PointShape,
     explain_readings,
@@ -31,6 +31,8 @@ from ipsys_log.units import CM_PER_M
 __all__ = ["fit_hypotheses"]
 
 Progress = Callable[[int, float], None]
+# The decrease of the sum of squares by a motion of a camera, or by free row times (None).
+_Cause = tuple[float, CameraMotion | None]
 
 # A reading contradicts the fit above this many standard deviations.
 _WRONG = 4.5
@@ -41,6 +43,12 @@ _MOST_OUTLIERS = 0.2
 # A hypothesis about cameras must decrease twice the cost by this much: once in a million sessions by chance.
 _LEAST_GAIN = 60.0
 _MOST_HYPOTHESES = 3
+# If the best hypothesis leaves more outliers than this, the next one is tried instead of it.
+_MOST_TRIALS, _FEW_OUTLIERS = 2, 0.01
+# Row times have fewer unknowns than a motion at any time: they come first if they explain this share of it.
+_ROWS_SHARE = 0.25
+# Two hypotheses are both possible if their probabilities differ by less than a factor of 100.
+_AS_PROBABLE = 2 * float(np.log(100.0))
 # The first time of a motion is rough; the poses before and after it give a better one.
 _MOST_TIMES = 3
 _US_PER_S = 1e6
@@ -239,15 +247,65 @@ def _name_doubt(explanations: Sequence[Explanation]) -> Finding:
 def _explain_cameras(fit: JointFit, settings: JointSettings, progress: Progress) -> JointFit:
     """Return the fit with the moved cameras and wrong row times that explain most, one after the other."""
     for _ in range(_MOST_HYPOTHESES):
-        motion = max(find_moved_cameras(fit), key=lambda one: one.chi2, default=None)
-        best = _try_row_times(fit, settings, progress)
-        if motion is not None and _gain(fit, best) < motion.chi2:
-            moved = _try_motion(fit, motion, settings, progress)
-            best = moved if _gain(fit, moved) > _gain(fit, best) else best
-        if best is None or _gain(fit, best) < _LEAST_GAIN:
+        causes = _likely_causes(fit)
+        trial = _try_causes(fit, causes[:_MOST_TRIALS], settings, progress)
+        if trial is None:
             break
-        fit = replace(best, is_certain=fit.is_certain)
+        most = max(chi2 for chi2, _ in causes)
+        possible = [motion for chi2, motion in causes if most - chi2 < _AS_PROBABLE]
+        if len(possible) > 1:
+            return replace(trial, known=(*fit.known, _name_rivals(fit, possible)), is_certain=False)
+        fit = replace(trial, is_certain=fit.is_certain)
     return fit
+
+
+def _likely_causes(fit: JointFit) -> list[_Cause]:
+    """Return motions of cameras and wrong row times (None), with what they explain, the likely ones first."""
+    squares = sum_squares(fit)
+    causes: list[_Cause] = [
+        (motion.chi2, motion)
+        for number, camera in enumerate(fit.observations.cameras)
+        if not camera.is_former and (motion := find_motion(squares, number)) is not None
+    ]
+    causes.sort(key=lambda cause: -cause[0])
+    if by_rows := row_time_evidence(squares):
+        is_first = not causes or by_rows > _ROWS_SHARE * causes[0][0]
+        causes.insert(0 if is_first else len(causes), (by_rows, None))
+    return causes
+
+
+def _try_causes(
+    fit: JointFit, causes: Sequence[_Cause], settings: JointSettings, progress: Progress
+) -> JointFit | None:
+    """Return the fit with the first cause that explains everything, or else with that of least cost."""
+    trials = []
+    for _, motion in causes:
+        if motion is None:
+            trial = _try_row_times(fit, settings, progress)
+        else:
+            trial = _try_motion(fit, motion, settings, progress)
+        if trial is not None and _is_explained(fit, trial):
+            trials.append(trial)
+            if _outlier_share(trial) < _FEW_OUTLIERS:
+                break
+    return min(trials, key=lambda one: one.solution.cost, default=None)
+
+
+def _is_explained(fit: JointFit, trial: JointFit) -> bool:
+    """Return whether a trial explains a fit: its cost, and readings that would all be wrong without it."""
+    if _gain(fit, trial) > _LEAST_GAIN:
+        return True
+    before, after = (sum(one.score > _WRONG for one in standardise_readings(part)) for part in (fit, trial))
+    return _gain(fit, trial) + WRONG_NUMBER * (before - after) > _LEAST_GAIN
+
+
+def _name_rivals(fit: JointFit, possible: Sequence[CameraMotion | None]) -> Finding:
+    names = [fit.observations.cameras[one.camera].name for one in possible if one is not None]
+    options = [f"camera {name} was moved" for name in names]
+    if None in possible:
+        options.append("the row times in the rig are wrong")
+    text = f"{' or '.join(options)}: no position is certain; calibrate again, with more observations"
+    return Finding("doubt", names[0], 0.0, text)
 
 
 def _gain(fit: JointFit, trial: JointFit | None) -> float:
@@ -256,9 +314,7 @@ def _gain(fit: JointFit, trial: JointFit | None) -> float:
 
 
 def _try_row_times(fit: JointFit, settings: JointSettings, progress: Progress) -> JointFit | None:
-    """Return the fit with free row times of all cameras if the sightings contradict those of the rig."""
-    if not find_row_times(fit):
-        return None
+    """Return the fit with free row times of all cameras; None if it shows no wrong one."""
     cameras = tuple(replace(camera, row_time_s=None) for camera in fit.observations.cameras)
     trial = _refit(replace(fit.observations, cameras=cameras), settings, progress)
     if trial is None:
@@ -287,47 +343,30 @@ def _try_motion(
     fit: JointFit, motion: CameraMotion, settings: JointSettings, progress: Progress
 ) -> JointFit | None:
     """Return the fit in which a camera has another pose before a motion."""
-    camera = next(n for n, one in enumerate(fit.observations.cameras) if one.name == motion.camera)
-    trial, time_s = None, motion.time_s
+    camera, former = motion.camera, len(fit.observations.cameras)
+    trial: JointFit | None = None
+    later = motion
     for _ in range(_MOST_TIMES):
-        divided = _refit(divide_camera(fit.observations, camera, time_s), settings, progress)
+        divided = _refit(divide_camera(fit.observations, camera, later.time_s), settings, progress)
         if divided is None or _gain(fit, divided) <= _gain(fit, trial):
             break
-        trial, before_s = divided, time_s
-        time_s = _time_of_motion(divided, camera)
-        if time_s == before_s:
+        trial, time_s, squares = divided, later.time_s, sum_squares(divided)
+        # A further motion of either part means that sightings are on the wrong side of the time.
+        found = [one for n in (camera, former) if (one := find_motion(squares, n)) is not None]
+        if not found:
             break
+        later = max(found, key=lambda one: one.chi2)
     if trial is None:
         return None
     # The two poses of the trial have their own intrinsics, which may take a part of the turn.
-    shift_cm = float(np.linalg.norm(motion.shift_m)) * CM_PER_M
+    name = fit.observations.cameras[camera].name
     text = (
-        f"camera {motion.camera}: it was moved after about {time_s:.0f} s, by {shift_cm:.1f} cm "
+        f"camera {name}: it was moved after about {time_s:.0f} s, by {motion.shift_m * CM_PER_M:.1f} cm "
         f"and {np.degrees(motion.turn_rad):.2f} degrees; "
         "the result has its later pose; calibrate again with the observations before or after"
     )
-    finding = Finding("camera", motion.camera, float(np.sqrt(motion.chi2)), text)
+    finding = Finding("camera", name, float(np.sqrt(motion.chi2)), text)
     return replace(trial, known=(*fit.known, finding))
-
-
-def _time_of_motion(trial: JointFit, camera: int) -> float:
-    """Return the time of a motion by which the sightings of a divided camera fit best to its two poses."""
-    times_s, losses = [], []
-    problem, former = trial.problem, len(trial.observations.cameras) - 1
-    for factors in problem.sightings:
-        if factors.camera not in (camera, former):
-            continue
-        both = []
-        for number in (former, camera):
-            own = replace(factors, camera=number)
-            chi2 = (own.residuals(trial.state, problem.layout, problem.trajectories) ** 2).sum(axis=1)
-            both.append(robust_loss(chi2, factors.limit)[0])
-        times_s.append(factors.sightings.times_s)
-        losses.append(both[0] - both[1])
-    order = np.argsort(np.concatenate(times_s), kind="stable")
-    sorted_s = np.concatenate(times_s)[order]
-    number = int(np.argmin(np.cumsum(np.concatenate(losses)[order])[:-1]))
-    return float(sorted_s[number] + sorted_s[number + 1]) / 2
 
 
 def _refit(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit | None:

@@ -1,100 +1,136 @@
-"""Evidence of moved cameras and of wrong row times, by one step of least squares from a fit without them."""
+"""Evidence of moved cameras and of wrong row times, by one step of least squares from a fit without them.
+
+All residuals count with their squares. The robust loss of a contradicted fit makes outliers of those
+sightings that show the contradiction.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.normal import NormalEquations
-from ipsys_log.joint.sighting_factors import SightingFactors, WeightedRows
+from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.trajectories import Kind
 
-__all__ = ["CameraMotion", "find_moved_cameras", "find_row_times"]
+__all__ = ["CameraMotion", "Squares", "find_motion", "row_time_evidence", "sum_squares"]
 
 Array = NDArray[np.float64]
 
 _CANDIDATES = 12
-# On either side of the time there are at least so many sightings.
-_LEAST_SIGHTINGS = 3
-# A camera without motion exceeds this chi2, with six degrees of freedom, once in a million sessions.
-_MOVED = 60.0
-# A row time that is right exceeds this chi2, with one degree of freedom, once in ten million sessions.
-_WRONG_ROWS = 30.0
+# With so many candidates between the neighbours of the last time, three searches find one of 400 sightings.
+_SEARCHES = 3
+# On either side of the time there are at least two sightings of stationary markers, or ten of moving ones.
+# The last sightings of a robot often show how it is lifted from the floor.
+_STATIONARY, _LEAST = 5, 10
+# A camera without motion exceeds this chi2, with six degrees of freedom, once in a million sessions. Right
+# row times exceed it less often: they have one degree of freedom for each camera.
+_CONTRADICTED = 60.0
 # Unknowns of a pose: a turn and a shift.
 _POSE = 6
+# A larger turn is that of a few outliers, which any pose explains.
+_MOST_TURN_RAD = 0.17
+# A factor on the limits of the loss with which no residual is an outlier; rounding errors of a cost.
+_NO_LIMIT, _SAME_COST = 1e12, 1e-9
 
-# Derivatives (n, 2 p, k) of the residuals of sightings by k additional unknowns.
-_Slopes = Callable[[SightingFactors, WeightedRows], Array]
+
+class CameraMotion(NamedTuple):
+    """A motion of a camera, by its number, at about ``time_s`` in the time of the sightings.
+
+    ``chi2`` is the decrease of the sum of squares if the camera has another pose after this time.
+    ``turn_rad`` is the angle of the turn, ``shift_m`` the length of the shift.
+    """
+
+    camera: int
+    time_s: float
+    chi2: float
+    turn_rad: float
+    shift_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraMotion:
-    """A motion of a camera at about ``time_s``, in the time of the sightings.
+class Squares:
+    """The sum of the squares of all residuals near a fit, as a quadratic function of the unknowns.
 
-    ``turn_rad`` is the angle of the turn, ``shift_m`` (3,) the motion in the world. ``chi2`` is the decrease
-    of the cost if the camera has another pose after this time.
+    ``lowest`` is its least value. ``pulled`` is the whitened gradient of the local unknowns, ``gradient``
+    that of the free global unknowns after the elimination of the local ones.
     """
 
-    camera: str
-    time_s: float
-    turn_rad: float
-    shift_m: Array
-    chi2: float
+    fit: JointFit
+    normal: NormalEquations
+    factorisation: Factorisation
+    pulled: Array
+    gradient: Array
+    lowest: float
 
 
-def find_moved_cameras(fit: JointFit) -> list[CameraMotion]:
-    """Return cameras whose pose changed, each with the most likely time.
+def sum_squares(fit: JointFit) -> Squares:
+    """Return the sum of squares near a fit."""
+    normal, factorisation, free = fit.solution.normal, fit.solution.factorisation, fit.problem.layout.free
+    if fit.problem.cost(fit.state, _NO_LIMIT) > normal.cost * (1 + _SAME_COST):
+        # The fit has outliers.
+        normal = fit.problem.linearise(fit.state, _NO_LIMIT)
+        factorisation = Factorisation(normal, free)
+    pulled = factorisation.forward(normal.local_gradient[:, None])[:, 0]
+    gradient = normal.global_gradient[free] - factorisation.pull(pulled)
+    return Squares(fit, normal, factorisation, pulled, gradient, _lowest(normal, factorisation))
+
+
+def _lowest(normal: NormalEquations, factorisation: Factorisation) -> float:
+    return 2 * normal.cost - normal.expect(*factorisation.step(normal))
+
+
+def find_motion(squares: Squares, camera: int) -> CameraMotion | None:
+    """Return the most likely motion of a camera; None without evidence.
 
     For each candidate time, the camera gets six additional unknowns: the change of its pose after that time.
     One step of the least-squares fit shows by how much the cost falls.
     """
-    motions = []
-    for camera, prior in enumerate(fit.observations.cameras):
-        times_s = _sighting_times(fit, camera)
-        cuts = _cuts(_LEAST_SIGHTINGS, len(times_s) - _LEAST_SIGHTINGS)
-        if prior.is_former or not len(cuts):
-            continue
-        best = _best_motion(fit, camera, times_s, cuts)[1]
-        if best.chi2 > _MOVED:
-            motions.append(_best_motion(fit, camera, times_s, _near(times_s, cuts, best.time_s))[1])
-    return motions
+    times_s, worths = _sighting_times(squares.fit, camera)
+    before = np.cumsum(worths)
+    possible = np.flatnonzero((before >= _LEAST) & (before[-1:] - before >= _LEAST)) + 1
+    if not len(possible):
+        return None
+    cuts = _cuts(int(possible[0]), int(possible[-1]))
+    best = _best_motion(squares, camera, times_s, cuts)
+    for _ in range(_SEARCHES - 1):
+        if best.chi2 <= _CONTRADICTED:
+            return None
+        cuts = _near(times_s, cuts, best.time_s)
+        best = _best_motion(squares, camera, times_s, cuts)
+    return best if best.turn_rad < _MOST_TURN_RAD else None
 
 
-def find_row_times(fit: JointFit) -> list[str]:
-    """Return the names of the cameras whose row time, which the fit does not estimate, explains residuals."""
-    layout, wrong = fit.problem.layout, []
-    for camera, (prior, block) in enumerate(zip(fit.observations.cameras, layout.cameras, strict=True)):
-        moving = any(one.camera == camera and one.kind is Kind.FLOOR for one in fit.problem.sightings)
-        if not moving or layout.free[block.edge + 2]:
-            continue
-        column = block.edge + 2 - block.start
-
-        def slopes(_: SightingFactors, rows: WeightedRows, column: int = column) -> Array:
-            return np.asarray(rows.by_global[:, :, column, None])
-
-        gradient, information = _add_unknowns(fit, camera, 1, slopes)
-        if information[0, 0] > 0 and gradient[0] ** 2 / information[0, 0] > _WRONG_ROWS:
-            wrong.append(prior.name)
-    return wrong
+def row_time_evidence(squares: Squares) -> float:
+    """Return the decrease of the sum of squares by free row times of all cameras; 0 without evidence."""
+    problem = squares.fit.problem
+    free = problem.layout.free.copy()
+    for factors in problem.sightings:
+        if factors.kind is Kind.FLOOR:
+            free[problem.layout.cameras[factors.camera].edge + 2] = True
+    if (free == problem.layout.free).all():
+        return 0.0
+    chi2 = squares.lowest - _lowest(squares.normal, Factorisation(squares.normal, free))
+    return chi2 if chi2 > _CONTRADICTED else 0.0
 
 
-def _sighting_times(fit: JointFit, camera: int) -> Array:
-    return np.sort(
-        np.concatenate(
-            [factors.sightings.times_s for factors in fit.problem.sightings if factors.camera == camera]
-            or [np.zeros(0)]
-        )
-    )
+def _sighting_times(fit: JointFit, camera: int) -> tuple[Array, NDArray[np.intp]]:
+    """Return the times (n,) of the sightings of a camera, in order, and what each is worth."""
+    times_s, worths = [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
+    for factors in fit.problem.sightings:
+        if factors.camera == camera:
+            times_s.append(factors.sightings.times_s)
+            worth = _STATIONARY if factors.kind is Kind.STATIONARY else 1
+            worths.append(np.full(len(times_s[-1]), worth))
+    order = np.argsort(np.concatenate(times_s), kind="stable")
+    return np.concatenate(times_s)[order], np.concatenate(worths)[order]
 
 
 def _cuts(first: int, last: int) -> NDArray[np.intp]:
     """Return numbers of sightings before a motion, from ``first`` to ``last``."""
-    if first > last:
-        return np.zeros(0, dtype=np.intp)
     return np.unique(np.linspace(first, last, _CANDIDATES).astype(np.intp))
 
 
@@ -104,56 +140,42 @@ def _near(times_s: Array, cuts: NDArray[np.intp], time_s: float) -> NDArray[np.i
     return _cuts(int(cuts[max(number - 1, 0)]), int(cuts[min(number + 1, len(cuts) - 1)]))
 
 
-def _best_motion(
-    fit: JointFit, camera: int, times_s: Array, cuts: NDArray[np.intp]
-) -> tuple[int, CameraMotion]:
-    """Return the number of the cut with the most evidence, and the motion of the camera there."""
-    between_s = (times_s[cuts - 1] + times_s[np.minimum(cuts, len(times_s) - 1)]) / 2
-    motions = _motions(fit, camera, between_s)
-    best = max(range(len(motions)), key=lambda number: motions[number].chi2)
-    return int(cuts[best]), motions[best]
-
-
-def _motions(fit: JointFit, camera: int, times_s: Array) -> list[CameraMotion]:
-    """Return the motion of a camera at each of the times (k,)."""
-
-    def slopes(factors: SightingFactors, rows: WeightedRows) -> Array:
-        after = factors.sightings.times_s[:, None] > times_s
-        by_motion = after[:, None, :, None] * rows.by_global[:, :, None, :_POSE]
-        return np.asarray(by_motion.reshape(*rows.residuals.shape, -1))
-
-    gradients, information = _add_unknowns(fit, camera, _POSE * len(times_s), slopes)
+def _best_motion(squares: Squares, camera: int, times_s: Array, cuts: NDArray[np.intp]) -> CameraMotion:
+    """Return the motion of the camera at the cut with the most evidence."""
+    between_s = (times_s[cuts - 1] + times_s[cuts]) / 2
+    gradients, information = _add_motions(squares, camera, between_s)
     motions = []
-    for number, time_s in enumerate(times_s.tolist()):
+    for number, time_s in enumerate(between_s.tolist()):
         part = slice(_POSE * number, _POSE * (number + 1))
-        gradient = gradients[part]
-        step: Array = -np.linalg.pinv(information[part, part], rcond=1e-9, hermitian=True) @ gradient
-        turn_rad, chi2 = float(np.linalg.norm(step[:3])), float(-step @ gradient)
-        name = fit.observations.cameras[camera].name
-        motions.append(CameraMotion(name, time_s, turn_rad, step[3:], chi2))
-    return motions
+        inverse = np.linalg.pinv(information[part, part], rcond=1e-9, hermitian=True)
+        step = -inverse @ gradients[part]
+        turn_rad, shift_m = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
+        motions.append(CameraMotion(camera, time_s, float(-step @ gradients[part]), turn_rad, shift_m))
+    return max(motions, key=lambda one: one.chi2)
 
 
-def _add_unknowns(fit: JointFit, camera: int, count: int, slopes: _Slopes) -> tuple[Array, Array]:
-    """Return the gradient (k,) and the information (k, k) of additional unknowns of a camera.
+def _add_motions(squares: Squares, camera: int, times_s: Array) -> tuple[Array, Array]:
+    """Return the gradient (6 k,) and the information (6 k, 6 k) of the motions of a camera at times (k,).
 
     The information is that after the elimination of all other unknowns. Only the blocks in which the camera
     has sightings have columns for these unknowns. In a hall, these are few, so the time for all cameras grows
     with the sightings and not with their square.
     """
-    problem, layout, factorisation = fit.problem, fit.problem.layout, fit.solution.factorisation
+    fit, factorisation, count = squares.fit, squares.factorisation, _POSE * len(times_s)
+    problem, layout, trajectories = fit.problem, fit.problem.layout, fit.problem.trajectories
     blocks = tuple(
         replace(block, columns=np.arange(count if seen else 0))
-        for block, seen in zip(factorisation.blocks, _blocks_with(fit, camera), strict=True)
+        for block, seen in zip(factorisation.blocks, _blocks_with(squares, camera), strict=True)
     )
-    trajectories = problem.trajectories
     extra = NormalEquations(trajectories.local_count, count, trajectories.bandwidth, blocks)
     between = np.zeros((len(layout.mean), count))
     for factors in problem.sightings:
         if factors.camera != camera:
             continue
-        rows = factors.weighted_rows(fit.state, layout, trajectories)
-        own = slopes(factors, rows)
+        rows = factors.weighted_rows(fit.state, layout, trajectories, _NO_LIMIT)
+        after = factors.sightings.times_s[:, None] > times_s
+        own = after[:, None, :, None] * rows.by_global[:, :, None, :_POSE]
+        own = own.reshape(*rows.residuals.shape, -1)
         extra.add_mixed(rows.starts, rows.by_local, slice(0, count), own)
         extra.add_global(np.arange(count), own, rows.residuals)
         flat = own.reshape(-1, count)
@@ -164,14 +186,16 @@ def _add_unknowns(fit: JointFit, camera: int, count: int, slopes: _Slopes) -> tu
     mixed, pulled = factorisation.whiten(extra.coupling)
     coupling = between[layout.free] - pulled
     information = extra.dense - coupling.T @ factorisation.solve_reduced(coupling)
-    for whitened in mixed:
+    gradient = extra.global_gradient - coupling.T @ factorisation.solve_reduced(squares.gradient)
+    for block, whitened in zip(factorisation.blocks, mixed, strict=True):
         if whitened.shape[1]:
             information -= whitened.T @ whitened
-    return extra.global_gradient, information
+            gradient -= whitened.T @ squares.pulled[block.rows]
+    return gradient, information
 
 
-def _blocks_with(fit: JointFit, camera: int) -> list[bool]:
+def _blocks_with(squares: Squares, camera: int) -> list[bool]:
     """Return for each block of local unknowns whether the camera has sightings in it."""
-    layout = fit.problem.layout
+    layout = squares.fit.problem.layout
     column = int(layout.free[: layout.cameras[camera].start].sum())
-    return [bool((block.columns == column).any()) for block in fit.solution.factorisation.blocks]
+    return [bool((block.columns == column).any()) for block in squares.factorisation.blocks]

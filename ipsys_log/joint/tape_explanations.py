@@ -17,7 +17,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES, are_collinear, multilaterate, side_of
 from ipsys_log.joint.observations import CalibrationPoint
 
-__all__ = ["Change", "Explanation", "PointShape", "explain_readings", "side_contradicts"]
+__all__ = ["WRONG_NUMBER", "Change", "Explanation", "PointShape", "explain_readings", "side_contradicts"]
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 # exchanged distances.
 _MISTAKE = 2 * float(np.log(100.0))
 # A wrong number is as frequent, but may be any of the 300 that a tape of 1 m has beside the right one.
-_WRONG_NUMBER = _MISTAKE + 2 * float(np.log(300.0))
+WRONG_NUMBER = _MISTAKE + 2 * float(np.log(300.0))
 # Two explanations are both possible if their probabilities differ by less than a factor of 100.
 _AS_PROBABLE = _MISTAKE
 # Explanations that move no point farther than this are the same.
@@ -197,7 +197,7 @@ def _rough_costs(points: Sequence[CalibrationPoint], places_m: Array) -> Array:
         own = places_m[:, number]
         if point.point_m is not None:
             away_m = np.linalg.norm(own - point.point_m, axis=1)
-            costs += np.minimum((away_m / _ROUGH_M) ** 2, 2 * _WRONG_NUMBER)
+            costs += np.minimum((away_m / _ROUGH_M) ** 2, 2 * WRONG_NUMBER)
         elif len(point.distances_m):
             costs += np.min([_option_costs(point, option, own)[0] for option in _options(point)], axis=0)
     return costs
@@ -209,7 +209,7 @@ def _option_costs(
     """Return the costs (m,) of an option at places (m, 2), and which of them are on the other side."""
     ranges_m = np.linalg.norm(places_m[:, None] - point.references_m, axis=2)
     chi2 = (ranges_m - option.distances_m) ** 2 / (point.distance_sigmas_m**2 + spare_m**2)
-    costs = option.cost + np.minimum(chi2, _WRONG_NUMBER).sum(axis=1)
+    costs = option.cost + np.minimum(chi2, WRONG_NUMBER).sum(axis=1)
     side = _side(point)
     # Near the line, the uncertainty of the shape is larger than the distance from it.
     other = np.zeros(len(places_m), dtype=np.bool_)
@@ -248,9 +248,9 @@ def _read(
             away_m = float(np.linalg.norm(places_m[number] - point.point_m))
             assert point.covariance_m2 is not None
             chi2 = away_m**2 / (float(point.covariance_m2[0, 0]) + spare_m**2)
-            wrong = chi2 > 2 * _WRONG_NUMBER
+            wrong = chi2 > 2 * WRONG_NUMBER
             change = Change(point.name, "place") if wrong else None
-            found[number] = min(chi2, 2 * _WRONG_NUMBER), change, []
+            found[number] = min(chi2, 2 * WRONG_NUMBER), change, []
         elif len(point.distances_m):
             found[number] = min(
                 (
@@ -271,7 +271,7 @@ def _read_option(
 ) -> tuple[float, Change | None, list[_Row]]:
     costs, other = _option_costs(point, option, place_m[None], spare_m)
     ranges_m = np.linalg.norm(place_m - point.references_m, axis=1)
-    fits = (ranges_m - option.distances_m) ** 2 < _WRONG_NUMBER * (point.distance_sigmas_m**2 + spare_m**2)
+    fits = (ranges_m - option.distances_m) ** 2 < WRONG_NUMBER * (point.distance_sigmas_m**2 + spare_m**2)
     change = option.change
     if not fits.all():
         change = Change(point.name, "distance")
@@ -339,7 +339,7 @@ def _adjust(
         places_m = place(values)
         ranges_m = np.linalg.norm(places_m[numbers] - references_m, axis=1)
         given = (places_m[placed] - given_m) / given_sigma_m[:, None]
-        limit = np.sqrt(2 * _WRONG_NUMBER)
+        limit = np.sqrt(2 * WRONG_NUMBER)
         return np.concatenate(
             [values[3:], (ranges_m - distances_m) / sigmas_m, np.clip(given, -limit, limit).ravel()]
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.settings import JointSettings
-from ipsys_log.messages import CameraCalibration, Markers, Measurement, Rig
+from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
@@ -24,8 +25,12 @@ COARSE = JointSettings(floor_length_m=2.0)
 
 
 def observe(lab: GeometricLab) -> Observations:
+    """Return the observations of a session."""
+    return gather(simulate_session(lab))
+
+
+def gather(messages: Iterable[Message]) -> Observations:
     """Return the observations of a session from its messages."""
-    messages = list(simulate_session(lab))
     markers: dict[str, list[Markers]] = {}
     calibrations: dict[str, CameraCalibration] = {}
     measurements = []

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.geometry.poses import make_pose, rotation
 from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.hypotheses import fit_hypotheses
@@ -18,9 +19,11 @@ from ipsys_log.joint.payload import joint_payload, restore_joint
 from ipsys_log.joint.selection import seeing_cameras, without_points
 from ipsys_log.messages import Marker, Markers, Message, Rig, RigMarker
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
+from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.units import NS_PER_S
 from tests.joint.small_lab import REFERENCES_M, Array, make_lab
-from tests.joint.test_drives import COARSE, observe
+from tests.joint.test_drives import COARSE, gather, observe
 
 ROW_NS = 31_000
 
@@ -105,6 +108,40 @@ def test_wrong_row_time_is_estimated_and_no_camera_accused() -> None:
     assert [kind for kind, _ in kinds(fit)] == ["row_time"]
     assert "camera red, white: by the drives, the time between two rows is 3" in find_faults(fit)[0].text
     assert max(origin_errors_m(fit, lab)) < 0.02
+
+
+def turn_midway(lab: GeometricLab, name: str, turn_rad: Array, after_s: float) -> Observations:
+    """Return the observations of a session in which a camera turns after some seconds."""
+    turned = make_pose(rotation(turn_rad), np.zeros(3)) @ lab.camera(name).camera_from_world
+    cameras = tuple(
+        replace(camera, camera_from_world=turned) if camera.name == name else camera for camera in lab.cameras
+    )
+    before, after = (list(simulate_session(one)) for one in (lab, replace(lab, cameras=cameras)))
+    time_ns = before[0].log_time_ns + round(after_s * NS_PER_S)
+    return gather(
+        one if one.log_time_ns < time_ns or one.camera != name else two
+        for one, two in zip(before, after, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "name", "turn_deg", "after_s"),
+    [
+        pytest.param(200, "red", (-0.31, -0.07, -0.02), 15.1, id="only its points are before"),
+        pytest.param(211, "black", (-0.49, 0.05, 0.0), 29.7, id="only two points are before"),
+        pytest.param(202, "white", (-0.3, -0.08, 0.35), 42.1, id="during the drive"),
+        pytest.param(211, "red", (-0.49, 0.05, 0.0), 29.7, id="another camera explains more in one step"),
+    ],
+)
+def test_turned_camera_alone_is_accused(
+    seed: int, name: str, turn_deg: tuple[float, ...], after_s: float
+) -> None:
+    settings = LabSettings(seed=seed, rate_hz=10.0, drive_s=45.0, markers=1, row_time_ns=ROW_NS)
+    lab = build_lab(GeometricSettings(lab=settings, points=6, marker_scale_sigma=0.001))
+    fit = fit_hypotheses(turn_midway(lab, name, np.radians(turn_deg), after_s), COARSE)
+    assert kinds(fit) == [("camera", name)]
+    stated_deg = float(find_faults(fit)[0].text.split(" degrees")[0].split()[-1])
+    assert 0.6 < stated_deg / np.linalg.norm(turn_deg) < 1.4
 
 
 def test_camera_that_nothing_connects_is_left_out() -> None:

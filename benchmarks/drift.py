@@ -22,10 +22,9 @@ from ipsys_log.analysis.drift import MeanCorners
 from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, shift_floor_map
 from ipsys_log.analysis.reference_markers import Window
 from ipsys_log.messages import Floor, Markers
-from ipsys_log.simulation.cameras import FLOOR_M
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_weeks import FIRST_REFERENCE, Knock, WeekSettings, simulate_week
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
 __all__ = ["measure"]

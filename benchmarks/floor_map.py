@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.floor_error import GRID_M, SightingErrors
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.styles import shorten
-from ipsys_log.simulation.cameras import FLOOR_M
+from ipsys_log.simulation.settings import FLOOR_M
 
 __all__ = ["draw_floor_map"]
 

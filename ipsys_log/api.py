@@ -9,19 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ipsys_log.analysis.differences import Comparison
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogUrl, parse_location
 from ipsys_log.log.log_files import find_logs
+from ipsys_log.log_export import Export
 from ipsys_log.messages import CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.models.table import AppliedModel, reads_corners
-from ipsys_log.opened_log import Export, Listing, Log, StrPath
+from ipsys_log.opened_log import Listing, Log, StrPath
 from ipsys_log.player import Player
 from ipsys_log.publish.scores import Score
 from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
@@ -71,8 +73,6 @@ __all__ = [
     "score",
     "verify",
 ]
-
-Array = NDArray[np.float64]
 
 
 def open(*paths: StrPath | LogUrl) -> Log:

@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["replacement_of"]
-
 
 @contextmanager
 def replacement_of(path: Path) -> Iterator[BinaryIO]:

@@ -2,20 +2,6 @@
 
 import errno
 
-__all__ = [
-    "FitError",
-    "FrameError",
-    "IpsysError",
-    "LogError",
-    "SizeError",
-    "UnreadError",
-    "WriteError",
-    "disk_advice",
-    "is_full",
-    "os_error_text",
-    "reason_without",
-]
-
 
 class IpsysError(Exception):
     """A fault of the input, not of the program.

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["LIBRARIES", "Library", "check_installed"]
-
 
 class Library(NamedTuple):
     """An optional library: its name in texts, and the extras of ``ipsys_log`` that install it."""

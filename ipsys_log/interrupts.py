@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-__all__ = ["defer", "is_undivided", "undivided"]
-
 
 @dataclass(slots=True)
 class _State:

@@ -14,16 +14,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, MARKERS, TRACKS, Channel
 from ipsys_log.runs.options import Progress
 
-__all__ = [
-    "EXPORT_FORMATS",
-    "Export",
-    "ExportFormat",
-    "ExportOptions",
-    "channel_of_table",
-    "find_format",
-    "parse_size",
-]
-
 
 class Export(NamedTuple):
     """An exported file or folder.

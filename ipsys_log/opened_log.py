@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from ipsys_log.soundness.finding import LogCheck
 
-__all__ = ["Export", "Listing", "Log", "StrPath", "Time"]
-
 _TRAJECTORY = ("robot", "metric", "delta")
 
 StrPath = str | PathLike[str]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["HIDDEN", "hide_password"]
-
 # Text that replaces a password in public texts.
 HIDDEN = "***"
 # A host with a dot and its port, and then a path or query: no user and password.

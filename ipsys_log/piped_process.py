@@ -13,8 +13,6 @@ import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
-__all__ = ["ONE_THREAD", "PipedProcess", "parent_pipe"]
-
 # The environment of a process with one BLAS thread. Such a process has no need to load the BLAS of scipy to
 # limit its threads, which takes 0.1 s.
 ONE_THREAD = dict.fromkeys(

@@ -68,8 +68,6 @@ from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
 from ipsys_log.runs.workers import LocalWorkers, check_jobs
 from ipsys_log.sinks.sink import Consumer, Consumers, Sink
 
-__all__ = ["live", "measure", "record", "replay"]
-
 
 @one_reading()
 def replay(

@@ -6,8 +6,6 @@ import shlex
 import unicodedata
 from collections.abc import Sequence
 
-__all__ = ["join_names", "plain_text", "shell_words"]
-
 # Control characters, invisible ones that change the direction of text, bytes of a file name that are not
 # UTF-8, and separators of lines.
 _UNSAFE = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})

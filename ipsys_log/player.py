@@ -36,8 +36,6 @@ from ipsys_log.tracker import LiveTracks, Tracker
 if TYPE_CHECKING:
     from ipsys_log.sinks.rerun.page import ViewerPage
 
-__all__ = ["Player"]
-
 _TURN_S = 0.1
 
 

@@ -15,8 +15,6 @@ from ipsys_log.runs.provenance import Outcome, newest_run
 from ipsys_log.stages.camera_frame import METHODS, PERIMETER, points_run
 from ipsys_log.stages.detect import CORNERS, skipped_frames
 
-__all__ = ["finish_runs", "unfinished_runs"]
-
 # The names of the runs of camera points, each with its corner method and its camera-point method.
 _POINTS = [(points_run(corners, method), corners, method) for corners in CORNERS for method in METHODS]
 

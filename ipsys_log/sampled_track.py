@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS, Channel
@@ -18,10 +19,6 @@ from ipsys_log.tracking.robot_rows import gather_rows
 
 if TYPE_CHECKING:
     import pandas as pd
-
-__all__ = ["SampledTrack", "sample_track", "time_in_ns"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,6 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["LiveTracks", "Tracker"]
-
 # Tracks that wait for the loop of a user; a loop that pauses for long costs no memory.
 _MOST_WAITING = 100
 

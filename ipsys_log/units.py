@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-__all__ = ["CM_PER_M", "MM_PER_M", "NS_PER_S", "format_bytes", "format_duration", "format_time"]
-
 CM_PER_M = 100.0
 MM_PER_M = 1000.0
 NS_PER_S = 1_000_000_000

@@ -402,7 +402,7 @@ def test_the_real_command_too(tmp_path: Path) -> None:
 
 
 def test_frame_is_never_decoded_to_a_wrong_image() -> None:
-    from ipsys_log.stages.detect import decode_grey
+    from ipsys_log.images.decode import decode_grey
 
     with pytest.raises(ValueError, match="no picture"):
         decode_grey(CompressedImage(0, "a", b"GIF89a...", "gif"))

@@ -26,7 +26,7 @@ from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.exchange.image_folders import find_times, parse_time
 from ipsys_log.exchange.imsel import read_mat
 from ipsys_log.geometry.lenses import check_calibration
-from ipsys_log.images.decode import check_encoded, decode_rows
+from ipsys_log.images.decode import check_encoded, decode_grey, decode_rows
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -42,7 +42,6 @@ from ipsys_log.messages import (
     RigMarker,
 )
 from ipsys_log.rig.file import check_rig, load_rig
-from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.checks import next_id
 from ipsys_log.survey.sheet import read_sheet
 from tests.changed_logs import rewrite

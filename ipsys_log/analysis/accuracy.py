@@ -11,21 +11,10 @@ from ipsys_log.analysis.camera_models import fit_camera_models, height_sigmas, t
 from ipsys_log.analysis.cross_validation import FOLDS, cross_validate, gather_points, make_folds
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.analysis.remaining_error import with_remaining_error
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.trilateration import USUAL_TAPE_SCALE_SIGMA
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Model, Pair, Residual
 from ipsys_log.models.table import AppliedModel, reads_height
-
-__all__ = [
-    "CROSS_VALIDATION",
-    "HELD_OUT",
-    "POOLED",
-    "count_repeats",
-    "error_rows",
-    "error_statistics",
-    "evaluate_cross_validated",
-    "evaluate_held_out",
-    "root_mean_square_m",
-]
 
 _RESAMPLES = 2000
 
@@ -114,8 +103,6 @@ def root_mean_square_m(errors: ErrorStatistics, repeats: int = 1) -> float:
     variance_m2 = 0.0 if errors.std_m is None else errors.std_m**2 * (samples - 1) / samples
     return float(np.sqrt(errors.mean_m**2 + variance_m2))
 
-
-Array = NDArray[np.float64]
 
 HELD_OUT = "held_out"
 CROSS_VALIDATION = "cross_validation"

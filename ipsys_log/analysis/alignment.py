@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.coverage import MountedCamera
 from ipsys_log.analysis.stationary import StationaryMarker
+from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.poses import invert_pose, make_pose, transform
 from ipsys_log.messages import CameraCalibration
-
-__all__ = ["LEVEL_M", "Alignment", "align_camera", "join_cameras"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # In the paper, a camera is parallel to the floor if the spread of Zc is below this value.
 LEVEL_M = 0.05

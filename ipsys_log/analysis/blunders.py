@@ -7,17 +7,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.tape import reference_points
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES, are_collinear, multilaterate, side_of
 from ipsys_log.messages import Distance, Measurement, Rig, WorldPoint
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["Blunder", "possible_blunders"]
-
-Array = NDArray[np.float64]
 
 # A lower predicted height is impossible for a marker. Noise can move a prediction slightly below the floor.
 _LOWEST_M = -0.03

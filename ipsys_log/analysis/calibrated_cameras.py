@@ -6,17 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.floor_cameras import FloorCamera, outline_view
+from ipsys_log.arrays import Array
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.messages import Model
 
-__all__ = ["CalibratedCamera", "ImageResiduals", "describe_cameras"]
-
-Array = NDArray[np.float64]
 Size = tuple[int, int]
 
 # An image has so many cells along its width; smaller cells would hold too few corners.

@@ -5,29 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from ipsys_log.analysis.pairs import (
-    RiggedMeasurement,
     build_pairs,
     gather_sightings,
     split,
     valid_measurements,
     withdrawals,
 )
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.messages import Measurement, Pair, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import StageView
 from ipsys_log.models.table import reads_corners
-
-__all__ = [
-    "JOINT_READS",
-    "find_pairs",
-    "has_measurements",
-    "held_out_ids",
-    "measured",
-    "measured_part",
-    "split_ids",
-    "split_parameters",
-]
-
 
 # The channels that a joint calibration reads.
 JOINT_READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.cross_validation import make_folds, predict_without
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraModel, Noise, Pair, Parameter
+from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import (
-    CalibrationPoints,
     fit_cameras,
     inputs,
     min_pairs,
@@ -19,10 +20,6 @@ from ipsys_log.models.table import (
     reads_height,
 )
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty, ruler_sigmas
-
-__all__ = ["fit_camera_models", "height_sigmas", "tape_covariances"]
-
-Array = NDArray[np.float64]
 
 # No hand-held tape is more accurate; this floor keeps the covariance of a flat data set invertible.
 _FLOOR_SIGMA_M = 0.001

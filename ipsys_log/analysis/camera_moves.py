@@ -6,17 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Baseline, Motion, build_baseline, estimate_motion
 from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid
 from ipsys_log.analysis.reference_markers import Window, average_windows
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.messages import Floor
-
-__all__ = ["CameraState", "DriftLog", "LabDrift", "MarkerMove", "Move", "find_drift"]
-
-Array = NDArray[np.float64]
 
 # Windows whose mean is a baseline, or the state after a move.
 _AVERAGED = 5

@@ -17,8 +17,6 @@ from ipsys_log.analysis.calibrated_cameras import CalibratedCamera, describe_cam
 from ipsys_log.messages import ClockEstimate, Model
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ClockContradiction", "find_contradictions"]
-
 _SIGMAS = 3.0
 _MS_PER_S = 1000.0
 

@@ -11,15 +11,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.path_pairs import PathPair, common_instants, gap_limit_s
 from ipsys_log.analysis.time_offset_search import search_offsets_s
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 
-__all__ = ["ClockOffset", "MarkerPath", "estimate_clock_offset"]
-
-Array = NDArray[np.float64]
 Span = tuple[float, float]
 Cameras = tuple[str, str]
 Rows = tuple[Array, Array]

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FEWEST_POINTS", "score", "usual_covariances"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # With fewer calibration points of a camera, the usual error is unknown: the fit has ten terms, so each point
 # alone bends the model.

@@ -9,17 +9,12 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
+from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.lenses import in_image
 from ipsys_log.geometry.poses import invert_pose, transform
 from ipsys_log.messages import CameraCalibration, Floor
-
-__all__ = ["FloorCoverage", "MountedCamera", "Overlap", "Patch", "cover_floor", "find_overlaps"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Distance between tested points of the floor, and their largest number along a side.
 _STEP_M, _MOST = 0.01, 800

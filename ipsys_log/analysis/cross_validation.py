@@ -6,37 +6,18 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.messages import LearningPoint, Measurement, Pair
+from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import (
-    CalibrationPoints,
     fit_cameras,
     group_dependent_cameras,
     inputs,
     min_pairs,
     predict_array,
 )
-
-__all__ = [
-    "FOLDS",
-    "REPEATS",
-    "SUBSETS",
-    "Predict",
-    "cross_validate",
-    "gather_points",
-    "labelled_subsets",
-    "learning_curve",
-    "learning_sizes",
-    "leave_one_out",
-    "leave_out",
-    "make_folds",
-    "predict_without",
-    "published_curve",
-]
-
-Array = NDArray[np.float64]
 
 FOLDS = 5
 REPEATS = 4

@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraPoints, Markers, Message, Positions, Tracks
 from ipsys_log.units import NS_PER_S, format_time
-
-__all__ = ["Comparison", "Extent", "Stored", "compare_channels", "explain_no_overlap", "marker_ids"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

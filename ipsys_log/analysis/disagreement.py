@@ -16,6 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Times
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import read_columns
@@ -24,22 +25,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Positions
 from ipsys_log.messages.channels import POSITIONS, RIG
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "LONGEST_GAP_NS",
-    "CameraPositions",
-    "Cell",
-    "Interval",
-    "PairDisagreement",
-    "compare_cameras",
-    "divide_floor",
-    "divide_time",
-    "read_disagreement",
-    "reference_ids",
-]
-
-Array = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 # Longest time between two sightings of a camera, for a position in between.
 LONGEST_GAP_NS = 300_000_000

@@ -17,19 +17,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.floor_cameras import FloorCamera, shift_floor_map
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.lens_models import project_points, project_with_slopes
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import marker_corners, pixel_slopes
 from ipsys_log.geometry.poses import rotation
 from ipsys_log.geometry.square_pose import fit_squares, is_convex
 from ipsys_log.joint.observations import lens_model_of
-
-__all__ = ["LEAST_SHIFT_M", "Baseline", "MeanCorners", "Motion", "build_baseline", "estimate_motion"]
-
-Array = NDArray[np.float64]
 
 # A shift of the floor map below this mean is not reported: slow changes of light and temperature reach half
 # of it, and the smallest motion to find is 2 mm.

@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.expected_error import ExpectedErrors, see_markers
 from ipsys_log.analysis.taped_points import mean_error, some_modes
+from ipsys_log.arrays import Array
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.settings import JointSettings
-
-__all__ = ["DRIVE_S", "PlannedDrive", "choose_drive"]
-
-Array = NDArray[np.float64]
 
 # A drive lasts this time, and a camera sees the robot so often per second.
 DRIVE_S, _RATE_HZ = 30.0, 10.0

@@ -10,32 +10,17 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label
 from scipy.spatial import cKDTree
 
 from ipsys_log.analysis.floor_error import GRID_M, WALL_M, WHOLE_PRINT
 from ipsys_log.analysis.plan import mean_length
+from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel
-
-__all__ = [
-    "ExpectedErrors",
-    "FloorGap",
-    "FloorGrid",
-    "MarkerView",
-    "camera_modes",
-    "expect_errors",
-    "find_gaps",
-    "mean_lengths",
-    "see_markers",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # A node is covered if the camera saw a marker nearer than this: the floor changes little over this distance.
 _COVERED_M = 0.35

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import check_calibration, in_image, undistort
 from ipsys_log.geometry.poses import rotation
@@ -18,17 +18,6 @@ from ipsys_log.models.table import reads_corners
 
 if TYPE_CHECKING:
     from ipsys_log.joint.model import JointModel
-
-__all__ = [
-    "FloorCamera",
-    "floor_grid",
-    "move_camera",
-    "outline_view",
-    "read_floor_cameras",
-    "shift_floor_map",
-]
-
-Array = NDArray[np.float64]
 
 _STEP_M = 0.25
 # Without a floor in the rig, the map reaches this multiple of the camera's height to each side.

@@ -12,35 +12,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Mask
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import in_image, project, undistort
 from ipsys_log.geometry.markers import camera_point
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration, Model
 from ipsys_log.models.table import AppliedModel
-
-__all__ = [
-    "GRID_M",
-    "WALL_M",
-    "WHOLE_PRINT",
-    "FloorError",
-    "KnownSightings",
-    "Locator",
-    "RegionShares",
-    "SightingErrors",
-    "align_rigidly",
-    "compute_errors",
-    "grid_nodes",
-    "locate_with_model",
-    "outside_hull",
-    "region_shares",
-    "summarize",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # From poses (n, 4), which are x, y, height above the floor and heading, and a side in m: the corners of
 # squares, (n, 4, 3) in world m.

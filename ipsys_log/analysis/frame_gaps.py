@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FrameGaps", "find_gaps"]
-
 # A gap is this many times longer than the usual interval between frames.
 _GAP_FACTOR = 3
 # Frames that have waited, as in a stalled recorder, come at intervals below this share of the usual one.

@@ -11,27 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.pairs import RiggedMeasurement, Sightings, still_interval
+from ipsys_log.analysis.pairs import Sightings, still_interval
+from ipsys_log.analysis.tape import RiggedMeasurement
+from ipsys_log.arrays import Array
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "RobotPath",
-    "TrackErrors",
-    "gather_paths",
-    "gather_tracks",
-    "interpolate",
-    "track_errors",
-    "true_points",
-]
 
 _SAME_HEIGHT_M = 0.005
 # Longest gap for linear interpolation. For a robot with 2 m/s and 2.5 rad/s, its error is 0.7 mm over 1/30 s,
 # and 6 mm over 0.1 s.
 _GAP_NS = NS_PER_S // 10
-
-
-Array = NDArray[np.float64]
 
 
 class TrackErrors(NamedTuple):

@@ -24,8 +24,6 @@ from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.square_pose import is_convex, reprojection_px, solve_squares
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig
 
-__all__ = ["IntrinsicsTest", "find_contradictions"]
-
 # Chi-square of seven parameters: chance exceeds it once in 10,000 tests. Least deviation of shapes that the
 # correction explains: a good calibration has 0.4 % at the border of the image. Least ratio of the deviations
 # before and after the correction.

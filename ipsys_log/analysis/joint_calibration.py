@@ -22,8 +22,6 @@ from ipsys_log.messages import CameraCalibration, Markers, Model
 from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import Progress, StageView
 
-__all__ = ["fit_joint_model", "fit_without", "is_nominal", "observe"]
-
 
 def observe(view: StageView) -> Observations:
     """Return the observations of a log: all its calibration points, and the drives of its robots.

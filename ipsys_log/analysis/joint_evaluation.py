@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
 from ipsys_log.analysis.cross_validation import (
@@ -20,6 +19,7 @@ from ipsys_log.analysis.cross_validation import (
 from ipsys_log.analysis.joint_calibration import fit_without
 from ipsys_log.analysis.joint_outliers import find_joint_outliers
 from ipsys_log.analysis.study import Study
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
@@ -27,9 +27,6 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
 
-__all__ = ["JOINT_SUBSETS", "evaluate_joint"]
-
-Array = NDArray[np.float64]
 Models = Mapping[str, JointModel]
 
 # Random subsets of each size. A fit takes seconds with a drive, so these are fewer than for other models.

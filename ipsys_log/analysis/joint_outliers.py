@@ -12,8 +12,6 @@ from ipsys_log.joint.diagnosis import find_faults, point_covariances
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.messages import Suspect
 
-__all__ = ["find_joint_outliers"]
-
 # Kinds of faults that concern the measurement of a point.
 _OF_A_POINT = ("distance", "height", "place", "swapped", "side")
 # Error of the place of a point that is not in the fit, by the shape of all points.

@@ -6,18 +6,14 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors, mean_lengths
 from ipsys_log.analysis.plan import MeasurementPlan, PlannedPlace
 from ipsys_log.analysis.tape import TapeCovariances
 from ipsys_log.analysis.taped_points import choose_points
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.model import JointModel
-
-__all__ = ["expect_on_floor", "plan_joint_points"]
-
-Array = NDArray[np.float64]
 
 
 def expect_on_floor(

@@ -15,15 +15,11 @@ from math import hypot
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.overlap_stream import OverlapStream
+from ipsys_log.arrays import Array
 from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.units import MM_PER_M, NS_PER_S
-
-__all__ = ["Knock", "KnockMonitor"]
-
-Array = NDArray[np.float64]
 
 # The state now is the median of the last sightings, at most so many and so old.
 _RECENT, _RECENT_NS, _FEWEST_RECENT = 5, NS_PER_S // 2, 3

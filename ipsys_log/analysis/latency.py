@@ -16,8 +16,6 @@ from ipsys_log.messages import LATENCY_TOPIC, Latency, Message
 from ipsys_log.messages.channels import LATENCY, MARKERS, POSITIONS, TRACKS, Channel
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "recorded_latencies", "step_times_s"]
-
 STEPS = ("captured", "received", "detected", "located", "fused", "published")
 # Frames whose times are kept: more than those that wait for the stages, of 24 cameras too.
 _REMEMBERED = 2_000

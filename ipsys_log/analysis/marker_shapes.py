@@ -16,22 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.square_pose import is_convex
 from ipsys_log.messages import CameraCalibration, Marker
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "LEVEL_SCATTER",
-    "SHAPE_SIGMA",
-    "MarkerPlaces",
-    "MarkerSightings",
-    "SeenShapes",
-    "ShapeFit",
-    "fit_shapes",
-]
-
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 # Frames in this interval show no other places of a moving robot.

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.marker_shapes import (
     LEVEL_SCATTER,
@@ -15,11 +14,8 @@ from ipsys_log.analysis.marker_shapes import (
     ShapeFit,
     fit_shapes,
 )
+from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraCalibration, Marker, Rig
-
-__all__ = ["Contradiction", "SizeTest"]
-
-Array = NDArray[np.float64]
 
 # Least contradiction, and in units of the scatter of distances; least number of sightings of a marker.
 _SIZE_SHARE, _SIZE_SCATTER, _LEAST_OF_MARKER = 0.03, 4.0, 5

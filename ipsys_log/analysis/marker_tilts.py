@@ -9,12 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.square_pose import fit_squares
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["MarkerTilts", "SeenMarkers", "TiltedMarker"]
-
-Array = NDArray[np.float64]
 
 # Tops of robots are tilted by up to 2 degrees, and turn: two of them differ by up to 4 degrees.
 _LEVEL_RAD = np.radians(6.0)

@@ -31,8 +31,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ClockHistory", "ClockLine", "Exchange", "fit_clock"]
-
 # Crystals of computers differ by less, also at extreme temperatures.
 _MOST_DRIFT = 500e-6
 # The drift of most computers: the standard deviation of the prior.

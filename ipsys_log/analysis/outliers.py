@@ -7,17 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.blunders import Blunder, possible_blunders
 from ipsys_log.analysis.consistency import FEWEST_POINTS, score, usual_covariances
 from ipsys_log.analysis.tape import RiggedMeasurement, TapePoint, with_usual_tape, world_point
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import Suspect
-
-__all__ = ["LeaveOneOut", "describe_outlier", "find_outliers", "is_gross"]
-
-Array = NDArray[np.float64]
 
 # A function from ids that no fit may use to predictions by camera and id. Each prediction is a world point
 # (3,) of a model that is fitted without this point.

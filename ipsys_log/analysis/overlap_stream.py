@@ -13,8 +13,6 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import Message, Position, Positions, Rig
 from ipsys_log.units import MM_PER_M
 
-__all__ = ["Difference", "OverlapStream", "OverlapSummary"]
-
 # Number of the last differences of a pair that a summary uses.
 _REMEMBERED = 5_000
 _FEWEST = 10

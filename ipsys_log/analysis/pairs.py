@@ -13,23 +13,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoints, Measurement, Message, Model, Pair, Rig
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "KINDS",
-    "Place",
-    "RiggedMeasurement",
-    "Sightings",
-    "active_baselines",
-    "active_measurements",
-    "build_pairs",
-    "gather_sightings",
-    "level_cameras",
-    "locate_measurements",
-    "split",
-    "still_interval",
-    "valid_measurements",
-    "withdrawals",
-]
-
 # A marker is stationary if it stays within these distances from its position at the measurement. They are
 # above the noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
 _STILL_ACROSS_M = 0.01

@@ -8,10 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CommonInstants", "PathPair", "common_instants", "gap_limit_s", "without_jumps"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from ipsys_log.arrays import Array, Mask
 
 # Longest gap for an interpolation, in multiples of the usual interval, and in s.
 _USUAL_INTERVALS, _SHORTEST_GAP_S, _LONGEST_GAP_S = 2.5, 0.1, 1.0

@@ -12,20 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
+from ipsys_log.arrays import Array, Mask
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import in_image
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.models.rays import directions
 from ipsys_log.models.uncertainty import Predict, Uncertainty, leverage_terms
-
-__all__ = ["FittedCamera", "MeasurementPlan", "PlannedPlace", "mean_length", "plan_points"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Number of tested points of a circle, which contains the corners of a marker of any heading.
 _RIM = 12

@@ -13,8 +13,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event
 from ipsys_log.messages.channels import EVENTS, RUN_EVENTS
 
-__all__ = ["CameraRecording", "EventGroup", "group_events", "read_cameras"]
-
 
 @dataclass(frozen=True, slots=True)
 class CameraRecording:

@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.drift import MeanCorners
 from ipsys_log.errors import LogError
@@ -17,10 +16,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["Window", "average_windows", "image_sizes", "read_windows"]
-
-Array = NDArray[np.float64]
 
 # A log has at most so many windows. A longer log is read in part: a camera that has moved stays there.
 _MOST_WINDOWS = 60

@@ -6,13 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.messages import ErrorStatistics
-
-__all__ = ["with_remaining_error"]
-
-Array = NDArray[np.float64]
 
 # Both ends of the 95 % confidence interval.
 _LOW, _HIGH = 0.025, 0.975

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.ground_truth import gather_tracks
 from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -26,10 +27,6 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import COMMANDS, PATHS, TRACKS, TRUTH
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["RobotResult", "RobotRunResult", "Stop", "WaypointResult", "has_robot_run", "read_robot_run"]
-
-Array = NDArray[np.float64]
 
 # A stopped robot stands after this time: its motors have a lag.
 _STANDS_NS = NS_PER_S // 2

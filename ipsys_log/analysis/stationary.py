@@ -10,19 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraPoint, CameraPoints, Measurement
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "FEWEST_FRAMES",
-    "StationaryMarker",
-    "find_stationary",
-    "is_near",
-    "is_stationary",
-    "stationary_intervals",
-]
-
-Array = NDArray[np.float64]
 
 # A marker is stationary if its motion is below these limits, which are above the noise of plain corners.
 _STILL_ACROSS_M, _STILL_ALONG_M, _STILL_ALONG = 0.01, 0.04, 0.02

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.messages import Pair
 
-__all__ = ["Study"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:

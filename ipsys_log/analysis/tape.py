@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import (
     ON_REFERENCE_SIGMA_M,
@@ -18,21 +18,6 @@ from ipsys_log.geometry.trilateration import (
 )
 from ipsys_log.messages import Distance, Measurement, Rig
 from ipsys_log.units import CM_PER_M
-
-__all__ = [
-    "RiggedMeasurement",
-    "TapeCovariances",
-    "TapePoint",
-    "WeakPoint",
-    "expected_tape_covariances",
-    "find_weak_points",
-    "is_on_reference",
-    "reference_points",
-    "with_usual_tape",
-    "world_point",
-]
-
-Array = NDArray[np.float64]
 
 # Sigma of a height without its own sigma, if the tape has a sigma.
 _RULER_SIGMA_M = 0.001

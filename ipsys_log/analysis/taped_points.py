@@ -10,21 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.expected_error import ExpectedErrors, camera_modes, mean_lengths
 from ipsys_log.analysis.tape import TapeCovariances
+from ipsys_log.arrays import Array
 from ipsys_log.joint.model import JointModel
-
-__all__ = [
-    "TapedPoint",
-    "choose_points",
-    "mean_error",
-    "posterior_root",
-    "some_modes",
-]
-
-Array = NDArray[np.float64]
 
 # Repeatable error of the position of a marker by one camera, for the choice of points.
 _CORNER_SIGMA_M = 0.0003

@@ -8,13 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.path_pairs import PathPair, gap_limit_s
-
-__all__ = ["search_offsets_s"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # Half the time over which a speed is measured. Noise of 5 mm then is a speed of 0.035 m/s.
 _HALF_WINDOW_S = 0.1

@@ -10,19 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.ground_truth import RobotPath, interpolate
+from ipsys_log.arrays import Array
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "DELTAS",
-    "ErrorSummary",
-    "RelativeErrors",
-    "TrajectoryErrors",
-    "pairs_at",
-    "pool_trajectories",
-    "trajectory_errors",
-]
-
-Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 # The distances (m) and times (s) of the relative pose error.

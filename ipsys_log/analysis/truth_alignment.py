@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.path_pairs import CommonInstants, PathPair, common_instants, without_jumps
 from ipsys_log.analysis.time_offset_search import search_offsets_s
 from ipsys_log.analysis.truth_fit import ALIGNMENTS, LEAST_INSTANTS, Fit, RigidMotion, fit_truth, linearize
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.rotations import cross
 
-__all__ = ["Residuals", "TruthAlignment", "align_truth", "residuals_of"]
-
-Array = NDArray[np.float64]
 _LEAST_SPREAD_M = 0.1
 _SINGULAR = 1e-9
 _LARGEST_TURN_SIGMA_RAD, _LARGEST_OFFSET_SIGMA_S = np.radians(2.0), 0.1

@@ -7,15 +7,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.path_pairs import CommonInstants, PathPair, common_instants
+from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.rotations import cross, rotate
-
-__all__ = ["ALIGNMENTS", "LEAST_INSTANTS", "Fit", "RigidMotion", "fit_truth", "linearize"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class Freedom(NamedTuple):

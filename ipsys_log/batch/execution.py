@@ -34,8 +34,6 @@ from ipsys_log.units import format_time
 if TYPE_CHECKING:
     from distributed import Future
 
-__all__ = ["MOST_ENDED_WORKERS", "run_batch"]
-
 # A task that has ended this many workers fails with its log. The last time, it runs alone, so no other task
 # is the cause.
 MOST_ENDED_WORKERS = 4

@@ -14,8 +14,6 @@ from ipsys_log.log.log_files import name_places, read_log_state
 from ipsys_log.log_export import EXPORT_FORMATS, ExportOptions, channel_of_table, find_format
 from ipsys_log.runs.output import logs_with_results
 
-__all__ = ["export_log", "plan_exports"]
-
 _EXPORTED = "exported"
 
 

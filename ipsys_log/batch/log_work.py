@@ -18,8 +18,6 @@ from ipsys_log.runs.piece_folder import PieceFolder, StoredPieces
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck
 
-__all__ = ["UP_TO_DATE", "check_log", "name_derived", "replay_log", "verify_log"]
-
 # States of a log after its work; the check of a log has its own ones.
 COMPUTED, UP_TO_DATE, NOT_OUTDATED = "computed", "up to date", "not outdated"
 IDENTICAL, DIFFERENT = "identical", "different"

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["WorkerSettings"]
-
 _ENCRYPTED = "tls://"
 
 

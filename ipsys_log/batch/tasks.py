@@ -25,19 +25,6 @@ from ipsys_log.runs.piece_folder import (
     store_piece,
 )
 
-__all__ = [
-    "FAILED",
-    "BatchTask",
-    "LogPieces",
-    "LogResult",
-    "PieceState",
-    "VersionError",
-    "Work",
-    "perform",
-    "perform_or_divide",
-    "perform_piece",
-]
-
 # The state of a log whose task had an error; the works on logs have others.
 FAILED = "failed"
 

@@ -19,8 +19,6 @@ from ipsys_log.log.location import LogLocation
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-__all__ = ["Workers", "dask_setup", "most_tasks", "open_workers"]
-
 _LOOPBACK = "127.0.0.1"
 _CONNECT_TIMEOUT_S = 15.0
 _DISTRIBUTION = "ipsys_log"

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["Board", "BoardMarker", "black_squares", "board_markers", "parse_board"]
-
 _FORM = re.compile(r"(?P<kind>charuco:|chessboard:)?(?P<columns>\d{1,3})[x×](?P<rows>\d{1,3})")
 _MOST = 100
 

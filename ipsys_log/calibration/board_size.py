@@ -12,20 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Grey
 from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_detection import Grey, find_board
+from ipsys_log.calibration.board_detection import find_board
 from ipsys_log.calibration.chessboard import find_largest_grid, fits_in
 from ipsys_log.errors import IpsysError
 
-__all__ = [
-    "CharucoSize",
-    "check_charuco_size",
-    "check_chessboard_size",
-    "describe_other_board",
-    "estimate_charuco_size",
-]
-
-Array = NDArray[np.float64]
 # Squares in a row of the tried boards, and the largest number of rows.
 _COLUMNS, _MOST_ROWS = range(3, 25), 25
 # Least number of markers to find the row length; least share of the markers of an image at their positions.

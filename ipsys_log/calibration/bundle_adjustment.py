@@ -12,22 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.lens_models import LensModel, project_points, project_with_slopes
-
-__all__ = [
-    "USUAL_BENDING_M",
-    "Corners",
-    "LensFit",
-    "Normal",
-    "adjust",
-    "camera_points",
-    "corner_weights",
-    "normal_equations",
-    "reduce_to_lens",
-    "residuals",
-]
-
-Array = NDArray[np.float64]
 
 # Usual bending of a board (sagitta over half of its size), and the residual that such a bending costs in the
 # prior. The corners of a few images outweigh it.

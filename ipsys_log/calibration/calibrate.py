@@ -9,8 +9,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import BoardSighting
 from ipsys_log.calibration.board_search import NotSeenError, SearchResult, check_sizes, search_images
@@ -33,10 +33,6 @@ from ipsys_log.calibration.two_cameras import (
 )
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
-
-__all__ = ["MIN_IMAGES", "CalibrationResult", "Failure", "calibrate", "calibrate_cameras"]
-
-Array = NDArray[np.float64]
 
 MIN_IMAGES = 5
 # Fewer images are refused even with --force.

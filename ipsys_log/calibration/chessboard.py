@@ -13,10 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ChessboardView", "complete_grid", "crop_grid", "find_chessboard", "find_largest_grid", "fits_in"]
-
-Array = NDArray[np.float64]
-Grey = NDArray[np.uint8]
+from ipsys_log.arrays import Array, Grey
 
 # Least and largest number of rows of a grid.
 _LEAST, _MOST = 3, 100

@@ -9,13 +9,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
-
-__all__ = ["LENS_MODELS", "LensModel", "find_lens_model", "project_points", "project_with_slopes"]
-
-Array = NDArray[np.float64]
 
 # Least depth of a point for a pinhole model, as a share of its distance. Other points have no image.
 _LEAST_DEPTH = 1e-3

@@ -9,8 +9,6 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["nominal_intrinsics"]
-
 # Lenses with a smaller horizontal field of view keep straight lines straight; wider ones are fisheye lenses.
 _STRAIGHT_RAD = math.radians(100)
 _WIDEST_RAD = math.radians(220)

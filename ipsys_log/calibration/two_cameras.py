@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.bundle_adjustment import (
     Corners,
     LensFit,
@@ -25,16 +26,6 @@ from ipsys_log.calibration.bundle_adjustment import (
 from ipsys_log.calibration.lens_models import LENS_MODELS, LensModel
 from ipsys_log.calibration.solve import fitted_basis, loss_scale_px, rms_px, solve
 
-__all__ = [
-    "MOST_RMS_PX",
-    "BetterModel",
-    "TwoCameras",
-    "find_better_model",
-    "find_two_cameras",
-    "two_cameras_fault",
-]
-
-Array = NDArray[np.float64]
 Group = NDArray[np.bool_]
 
 _MIN_IMAGES = 4

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.bundle_adjustment import (
     USUAL_BENDING_M,
     Corners,
@@ -25,10 +26,6 @@ from ipsys_log.calibration.bundle_adjustment import (
 )
 from ipsys_log.calibration.image_selection import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
-
-__all__ = ["group_similar_images", "held_out_squares", "lens_covariance", "model_change"]
-
-Array = NDArray[np.float64]
 
 # Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms
 # are per square of the distance from the principal point.

@@ -21,8 +21,6 @@ from ipsys_log.messages import (
     SkippedVideo,
 )
 
-__all__ = ["TICK", "Backlog", "Waiting"]
-
 # Number of frames of a camera that may wait for the search; older frames are skipped.
 _SEARCHED = 3
 # Number of frames of a video that may wait, most of them only for decoding; this is a second or two.

@@ -30,8 +30,6 @@ from ipsys_log.messages.events import NODE_AWAITED, NODE_REFUSED
 from ipsys_log.passwords import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["NODES_RUN", "Arrival", "CameraReader", "CameraState", "Pause", "ReaderContext", "imported_run"]
-
 # The run of markers that nodes have detected.
 NODES_RUN = "nodes"
 

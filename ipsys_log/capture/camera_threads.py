@@ -16,8 +16,6 @@ from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.receiver import passing_period_s
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["reader_threads"]
-
 
 def reader_threads(readers: Sequence[CameraReader]) -> list[Thread]:
     """Return the threads of some cameras; they are not started."""

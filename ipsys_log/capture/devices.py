@@ -35,17 +35,6 @@ from ipsys_log.extras import check_installed
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.passwords import HIDDEN, hide_password
 
-__all__ = [
-    "OPENERS",
-    "check_devices",
-    "check_sources",
-    "open_opencv",
-    "open_source",
-    "open_usb",
-    "source_opener",
-    "usb_advice",
-]
-
 _QUALITY = 92
 
 

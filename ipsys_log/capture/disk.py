@@ -18,21 +18,6 @@ from ipsys_log.messages import RigCamera
 from ipsys_log.plain_text import shell_words
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
-__all__ = [
-    "LOW_DISK_WARNING_S",
-    "SYNC_EVERY_S",
-    "Confirm",
-    "DiskRoom",
-    "Syncer",
-    "describe_disk_failure",
-    "describe_disk_fault",
-    "describe_disk_full",
-    "expected_bytes_per_s",
-    "free_room",
-    "reserve",
-    "reserved_bytes",
-]
-
 # A power cut loses the data of this time, of the second that waits to be written, and of a sync.
 SYNC_EVERY_S = 2.0
 # After an interrupt, a hanging disk delays the end by at most this time.

@@ -22,8 +22,6 @@ from ipsys_log.messages import (
 from ipsys_log.runs.output import record_message
 from ipsys_log.runs.provenance import NODE_FORMAT
 
-__all__ = ["first_messages", "fitting_lenses"]
-
 
 def fitting_lenses(
     lenses: Mapping[str, CameraCalibration],

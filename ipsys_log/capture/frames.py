@@ -11,20 +11,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "AccessRefusedError",
-    "ActualSettings",
-    "Clock",
-    "Frame",
-    "Open",
-    "Say",
-    "SourceError",
-    "SourceMessage",
-    "device_path",
-    "mid_exposure_ns",
-    "report_refused_settings",
-]
-
 
 class SourceError(IpsysError):
     """An error of a camera that cannot be opened, or that is disconnected; the camera may come back."""

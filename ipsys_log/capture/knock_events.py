@@ -6,8 +6,6 @@ from ipsys_log.analysis.knocks import KnockMonitor
 from ipsys_log.capture.recorder import Source
 from ipsys_log.messages import CAMERA_MOVED, Message, Rig
 
-__all__ = ["KnockEvents"]
-
 
 class KnockEvents:
     """A consumer of live results that adds an event, and prints its text, when a camera has moved.

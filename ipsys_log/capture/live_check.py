@@ -11,13 +11,11 @@ import cv2
 import numpy as np
 
 from ipsys_log.errors import FrameError
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
-from ipsys_log.stages.detect import decode_grey
 from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
-
-__all__ = ["CameraMonitor", "FrameCheck"]
 
 _EVERY_S = 1.0
 # Mean grey level of a dark image, and standard deviation of the grey levels behind a lens cap.

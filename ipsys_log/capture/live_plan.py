@@ -28,8 +28,6 @@ from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
 
-__all__ = ["LivePlan", "check_independent_frames", "check_model", "check_start", "plan_live"]
-
 
 class LivePlan(NamedTuple):
     """The plan of a live run.

@@ -20,8 +20,6 @@ from ipsys_log.capture.frames import Clock, Open, Say, SourceError
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 
-__all__ = ["LiveCameras"]
-
 # Most bytes of frames that wait to be written: some seconds of three cameras.
 _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.stream import VideoStream
 
-__all__ = ["Stamps", "check_address", "open_network", "read_stamp"]
-
 # Largest and smallest age of a frame by its stamp. Beyond them, the clock of the camera is not synchronized.
 _OLDEST_NS = NS_PER_S
 _YOUNGEST_NS = -NS_PER_S // 20

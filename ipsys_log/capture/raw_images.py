@@ -8,8 +8,6 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-__all__ = ["RAW_FORMATS", "ImageLayout", "encode_raw"]
-
 Plane = NDArray[np.uint8]
 
 # The driver's names of raw formats, in order of preference. The colour format with the fewest bytes is first.

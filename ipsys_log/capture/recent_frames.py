@@ -11,8 +11,6 @@ from ipsys_log.errors import WriteError
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["RecentFrames"]
-
 # Longer than the stationary interval of a measurement and the delay of the stages.
 BUFFER_NS = 5 * NS_PER_S
 # Eight cameras at 60 frames/s send less in two seconds. Beyond this limit, a calibration point gets only the

@@ -6,8 +6,6 @@ import os
 from pathlib import Path
 from typing import Self
 
-__all__ = ["RecordedFile"]
-
 # Linux names the present path of each open file here; other systems do not.
 _OPEN_FILES = Path("/proc/self/fd")
 

@@ -35,15 +35,6 @@ from ipsys_log.messages import (
 from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.output import serialize, write_message
 
-__all__ = [
-    "CameraSource",
-    "Recording",
-    "Source",
-    "Target",
-    "open_recording",
-    "write_each",
-]
-
 # After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0
 # After this number of ticks without a message, the last ones go into the file. At each tick, every image of a

@@ -24,8 +24,6 @@ from ipsys_log.simulation.pixel_shares import exposure_interval
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FrameTiming", "SimulatedCamera", "intrinsics_of", "open_simulated", "parse_source", "show_board"]
-
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000
 # Squares of a board that a source names. Intrinsics do not depend on their size.

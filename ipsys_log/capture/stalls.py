@@ -15,8 +15,6 @@ from typing import NamedTuple
 from ipsys_log.capture.frames import Clock
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["STALL_NS", "Heartbeat", "LateFrameDetector", "Stall"]
-
 # Threads of a busy machine wait for a shorter time. A robot at 1 m/s moves 25 cm in this time.
 STALL_NS = NS_PER_S // 4
 _BEAT_S = 0.05

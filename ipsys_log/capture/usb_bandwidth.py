@@ -12,8 +12,6 @@ from ipsys_log.capture.frames import device_path
 from ipsys_log.capture.usb_bus import UsbCamera
 from ipsys_log.messages import Rig, RigCamera
 
-__all__ = ["BandwidthDemand", "advise", "list_demands"]
-
 # USB 2 gives at most 80 % of a microframe of 125 us to transfers at fixed times (USB 2.0, 5.6.4). At
 # 480 Mbit/s a microframe has 7500 bytes, so these transfers get 6000 bytes.
 _MICROFRAMES_PER_S = 8000

@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 from ipsys_log.capture import v4l2
 
-__all__ = ["Mode", "UsbCamera", "UsbConnection", "find_cameras", "list_modes"]
-
 _INTERFACE, _ENDPOINT = 4, 5
 _VIDEO_STREAMING = (14, 2)
 

@@ -24,8 +24,6 @@ from ipsys_log.capture.raw_images import RAW_FORMATS, ImageLayout, encode_raw
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["open_v4l2"]
-
 # The driver's names of JPEG images.
 _JPEG = ("MJPG", "JPEG")
 _BUFFERS = 8

@@ -34,16 +34,6 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
-__all__ = [
-    "TimedFrame",
-    "check_playback_source",
-    "frame_payload",
-    "open_playback",
-    "open_video",
-    "read_videos",
-    "split_source",
-]
-
 _QUALITY = 95
 _RATE_HZ = 30
 

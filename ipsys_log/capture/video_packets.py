@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.stream import VideoStream
 
-__all__ = ["find_size", "find_video", "is_decodable_start", "name_format", "pass_through"]
-
 # FFmpeg's name of a codec, and the name in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
 # The head of a unit of Annex B: the start code, and the byte that holds its type.

@@ -21,8 +21,6 @@ from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["COLUMNS", "Baseline", "read_row", "state_columns"]
-
 COLUMNS: Columns = {
     "log": "string",
     "bytes": "int64",

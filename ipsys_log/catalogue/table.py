@@ -17,8 +17,6 @@ from ipsys_log.log.log_files import read_log_state, states_below
 from ipsys_log.runs.graph import VERSIONS
 from ipsys_log.runs.output import derived_log_of
 
-__all__ = ["CatalogueUpdate", "update_catalogue"]
-
 # Raised when a row gets another content for the same log.
 _VERSION = 3
 _KIND = "catalogue "

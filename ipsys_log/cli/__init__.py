@@ -7,8 +7,6 @@ import shutil
 import sys
 import textwrap
 
-__all__ = ["main"]
-
 _LONGEST_COMPLAINT = 100_000
 
 

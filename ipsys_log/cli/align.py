@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
     from ipsys_log.report.alignment import AlignedLab
 
-__all__ = ["add_commands"]
-
 NoOrLogs = Annotated[
     NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
 ]

@@ -42,8 +42,6 @@ from ipsys_log.cli.local_files import needs_local_files
 from ipsys_log.cli.signals import interruptible
 from ipsys_log.stages import ENTRIES
 
-__all__ = ["EXAMPLES", "arrange", "panels"]
-
 _STAGES = "Single stages"
 # The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
 _PLACED: dict[str, tuple[str, ...]] = {

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ipsys_log.batch.tasks import BatchTask, LogResult
     from ipsys_log.log.location import LogLocation
 
-__all__ = ["add_commands"]
-
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
 _KEPT = "complete results are kept; nothing else is changed"
 _KEPT_BY_SCHEDULER = (

@@ -10,8 +10,6 @@ import typer
 
 from ipsys_log.cli.options import AsJson, LogList, log_argument
 
-__all__ = ["DERIVED", "EXPORT", "FOLDER", "LOGS", "OUTDATED", "RUN", "WORKERS"]
-
 _Path = Optional[Path]  # noqa: UP045
 _Text = Optional[str]  # noqa: UP045
 LOGS = (

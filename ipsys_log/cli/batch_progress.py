@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from ipsys_log.batch.tasks import LogResult
     from ipsys_log.log.location import LogLocation
 
-__all__ = ["batch_bar"]
-
 # A task can take minutes: the rate is that of the last half hour.
 _RATE_PERIOD_S = 1800.0
 

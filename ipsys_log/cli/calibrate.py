@@ -18,8 +18,6 @@ from ipsys_log.cli.signals import note_kept, say_kept
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 
-__all__ = ["add_commands"]
-
 Sources = Annotated[
     Optional[list[Path]],  # noqa: UP045
     file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE"),

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.survey.lab_calibration import LabCalibration
 
-__all__ = ["add_commands"]
-
 # Largest goal that still means something, in mm.
 _MOST_GOAL_MM = 1000.0
 

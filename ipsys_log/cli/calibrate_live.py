@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.sink import Consumer
 
-__all__ = ["record_drive"]
-
 _LEAST_POINTS = 2
 
 

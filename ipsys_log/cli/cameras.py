@@ -16,8 +16,6 @@ from ipsys_log.cli.signals import writes_nothing
 if TYPE_CHECKING:
     from ipsys_log.capture.usb_bus import UsbCamera
 
-__all__ = ["add_commands"]
-
 _NONE = """no USB camera is attached
   for a network camera, put its address into lab.toml: source = "rtsp://..." or "http://..."
   without a camera, source = "sim:red" is a simulated one: ipsys init lab.toml --simulated"""

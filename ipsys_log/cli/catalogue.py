@@ -15,8 +15,6 @@ from ipsys_log.cli.options import AsJson
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
 
-__all__ = ["add_commands"]
-
 _MOST_LINES = 30
 
 

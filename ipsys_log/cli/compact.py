@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
     from ipsys_log.runs.compact import DroppedRun
 
-__all__ = ["add_commands"]
-
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(compact)

@@ -16,8 +16,6 @@ from ipsys_log.cli.signals import writes_nothing
 if TYPE_CHECKING:
     from ipsys_log.analysis.differences import Comparison
 
-__all__ = ["add_commands"]
-
 _Run = Optional[str]  # noqa: UP045
 
 

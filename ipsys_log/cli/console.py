@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Progress
     from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "progress_lines", "remarks", "say"]
-
 _DRAW_EVERY_S = 0.1
 # A stage with more runs than this gets a count instead of a list.
 _MANY_RUNS = 4

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.location import LogLocation
 
-__all__ = ["add_commands"]
-
 Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
 _Seconds = Optional[float]  # noqa: UP045
 

@@ -9,8 +9,6 @@ import typer
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import NewLog, Overwrite, ReadLogs
 
-__all__ = ["add_commands"]
-
 _TIME = "UTC, such as '2026-05-04 10:00:00', or seconds from the start of the log."
 
 

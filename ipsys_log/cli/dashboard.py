@@ -22,17 +22,6 @@ if TYPE_CHECKING:
     from ipsys_log.web.dashboard.state import Dashboard
     from ipsys_log.web.server import PageServer
 
-__all__ = [
-    "DashboardPlan",
-    "Web",
-    "WebPort",
-    "check_playback_page",
-    "first_run",
-    "plan_dashboard",
-    "serve_dashboard",
-    "serve_playback",
-]
-
 _USUAL_PORT = 8000
 _GAP = 4
 

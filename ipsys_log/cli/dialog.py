@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     # Reads an answer: returns its content and its faults.
     Read = Callable[[str], tuple[Entry, list[Fault]]]
 
-__all__ = ["HELP", "LetterError", "agreed", "answer", "ask_marker", "ask_numbers", "ask_places"]
-
 HELP = (
     "type centimetres, such as 123.4; a: start the point again, s: skip it, u: undo the last point, q: end; "
     "Enter keeps the value in brackets"

@@ -15,8 +15,6 @@ from ipsys_log.plain_text import shell_words
 if TYPE_CHECKING:
     from ipsys_log.survey.drift_reading import DriftReading
 
-__all__ = ["add_commands"]
-
 Sources = Annotated[
     LogList,
     log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own."),

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ipsys_log.closed_loop.settings import RobotRun
     from ipsys_log.runs.options import Request
 
-__all__ = ["add_commands"]
-
 Models = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(

@@ -12,8 +12,6 @@ from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import AsJson, appended_log_argument
 from ipsys_log.plain_text import shell_words
 
-__all__ = ["add_commands"]
-
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(exclude)

@@ -10,8 +10,6 @@ import typer
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import ReadLogs
 
-__all__ = ["add_commands"]
-
 _COUNTED = ("bag", "video", "pictures")
 
 

@@ -13,8 +13,6 @@ from ipsys_log.cli.measure_live import say_faults
 from ipsys_log.cli.options import Host, Port
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
 
-__all__ = ["add_commands"]
-
 _PORT = 8000
 
 Folder = Annotated[

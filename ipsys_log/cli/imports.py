@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from ipsys_log.exchange.import_truth import TruthOptions
     from ipsys_log.messages import CameraCalibration, Rig
 
-__all__ = ["add_commands"]
-
 _MCAP_MAGIC = b"\x89MCAP"
 
 

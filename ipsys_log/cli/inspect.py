@@ -17,8 +17,6 @@ from ipsys_log.cli.stages import MORE, build_command, derive, options_until
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
 
-__all__ = ["add_commands"]
-
 Runs = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ipsys_log.player import Player
 
-__all__ = ["press", "read_keys"]
-
 _SEEK_S = 5.0
 _TURN_S = 0.1
 _LEFT, _RIGHT = "\x1b[D", "\x1b[C"

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["appended_logs", "is_url", "needs_local_files", "read_files"]
-
 # A path has lost one of the two slashes of a URL.
 _URL_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 

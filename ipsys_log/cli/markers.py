@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.report.prints import Print
 
-__all__ = ["add_commands"]
-
 RigNow = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--rig", metavar="FILE", help="Print the markers of this rig file, in their true size."),
@@ -136,7 +134,7 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
     from ipsys_log.messages import Rig
     from ipsys_log.rig.checks import check_units
     from ipsys_log.rig.file import check_rig, load_rig
-    from ipsys_log.stages.detect import marker_detector
+    from ipsys_log.stages.detect.stock import marker_detector
 
     if rig is not None:
         lab = load_rig(rig)

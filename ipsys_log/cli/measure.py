@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from ipsys_log.survey.from_log import FinishedLog
     from ipsys_log.survey.scene import MeasuringScene
 
-__all__ = ["add_commands", "serve_page"]
-
 Log = Annotated[
     Optional[Path],  # noqa: UP045
     appended_log_argument(

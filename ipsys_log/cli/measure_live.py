@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ipsys_log.survey.live import LiveScene
     from ipsys_log.web.server import PageServer
 
-__all__ = ["live_scene", "measure_now", "ready_to_measure", "say_faults", "serve_live_page"]
-
 _TURN_S = 0.05
 # After this time, the markers in the images and their stationary intervals are known.
 _LOOK_S = 1.0

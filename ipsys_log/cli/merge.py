@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ipsys_log.runs.merge import MergeResult
     from ipsys_log.runs.merge_plan import LogOffset
 
-__all__ = ["add_commands"]
-
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(merge)

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ipsys_log.capture.nodes.network import NodeNetwork
     from ipsys_log.runs.options import Request
 
-__all__ = ["add_commands"]
-
 NodeLog = Annotated[
     Optional[Path],  # noqa: UP045
     log_option(help="The log of this node. Default: the name of the camera and the time, in this folder."),

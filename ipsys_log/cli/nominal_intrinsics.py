@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration
 
-__all__ = ["FieldOfView", "Focal", "SaveNominal", "nominal_lenses", "nominal_lenses_of_logs", "write_nominal"]
-
 Focal = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(

@@ -25,16 +25,6 @@ if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
     from ipsys_log.report.cameras import LiveStatus
 
-__all__ = [
-    "MODEL",
-    "SENT_NOW",
-    "Lab",
-    "check_target",
-    "open_cameras",
-    "prepare_lab",
-    "record_now",
-]
-
 
 # The name of a log that exists only while the command runs.
 SENT_NOW = "the camera images"

@@ -28,43 +28,6 @@ else:
     OtherLog = Optional[str]  # noqa: UP045
     NoLogs = Optional[list[str]]  # noqa: UP045
 
-__all__ = [
-    "AsJson",
-    "Calibrations",
-    "Corners",
-    "Force",
-    "Host",
-    "LogList",
-    "Logs",
-    "Method",
-    "ModelOfOther",
-    "NewLog",
-    "NoLogs",
-    "OneLog",
-    "Only",
-    "OtherLog",
-    "Overwrite",
-    "Port",
-    "ReadLogs",
-    "RigFile",
-    "RigNow",
-    "annotate",
-    "appended_log_argument",
-    "appended_log_option",
-    "build_option",
-    "cameras_of",
-    "check_present",
-    "file_log_argument",
-    "load_calibrations",
-    "load_lab",
-    "load_matching_rig",
-    "log_argument",
-    "log_option",
-    "one_log_argument",
-    "other_log_option",
-    "split_calibration",
-]
-
 
 def build_option(parameter: StageParameter) -> Any:
     """Return the option of a parameter of a stage."""

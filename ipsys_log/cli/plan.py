@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.survey.floor_plan import PlannedFloor
 
-__all__ = ["add_commands"]
-
 _MOST_PLACES = 50
 # Without a floor in the rig, this is the largest height of a marker.
 _HIGHEST_M = 5.0

@@ -13,8 +13,6 @@ from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.plain_text import shell_words
 
-__all__ = ["add_commands"]
-
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(pack)

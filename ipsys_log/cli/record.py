@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-__all__ = ["add_commands"]
-
 Seconds = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),

@@ -18,8 +18,6 @@ from ipsys_log.plain_text import shell_words
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
 
-__all__ = ["add_commands"]
-
 # The settings of the simulated lab that have an option: default, help. The defaults equal those of the
 # library, and a test checks this; importing the library only for a help text is too slow.
 SETTINGS: dict[str, tuple[int | float, str]] = {

@@ -24,21 +24,6 @@ from typing import Any
 
 from ipsys_log.interrupts import defer, is_undivided, undivided
 
-__all__ = [
-    "InterruptError",
-    "Interrupted",
-    "allow_interrupt",
-    "hold_signals",
-    "interruptible",
-    "note_kept",
-    "runs_until_stopped",
-    "say_kept",
-    "stop_on_signal",
-    "suppress_interrupt",
-    "wake_input",
-    "writes_nothing",
-]
-
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
 _WAKE_S = 0.05

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["MORE", "add_commands", "build_command", "derive", "options_until", "replay_options"]
-
 _Path = Optional[Path]  # noqa: UP045
 
 # The options of every stage, and of the printed results: type with help, and default.

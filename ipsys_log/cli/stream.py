@@ -13,8 +13,6 @@ from ipsys_log.cli.options import LogList, log_argument
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
 
-__all__ = ["add_commands"]
-
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
 RigFile = Annotated[
     Optional[Path],  # noqa: UP045

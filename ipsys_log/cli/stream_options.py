@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-__all__ = ["StreamOptions", "choose_streams", "takes_streams"]
-
 # The options of the streams, by the names of `choose_streams`.
 StreamOptions = dict[str, Any]
 

@@ -30,8 +30,6 @@ from ipsys_log.simulation.robot_lab import RobotLab
 from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["LockstepCameras", "SimulatedClock", "SyncPoint"]
-
 _TURN_S = 0.5
 
 

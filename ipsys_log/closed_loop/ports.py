@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["Ports", "find_ports"]
-
 _LOOPBACK = "127.0.0.1"
 # Attempts to find any free port.
 _ATTEMPTS = 100

@@ -17,8 +17,6 @@ from ipsys_log.closed_loop.settings import RobotRun
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Waypoint
 
-__all__ = ["Programs", "RelayLink", "start_programs"]
-
 _END_S = 5.0
 # A relay does little work: ten minutes are enough on any machine.
 _TURN_S, _RELAY_TURNS = 0.1, 6000

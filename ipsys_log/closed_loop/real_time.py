@@ -17,8 +17,6 @@ from ipsys_log.messages import COMMANDS_TOPIC, TRUTH_TOPIC, RigCamera, WheelComm
 from ipsys_log.simulation.robot_lab import RobotLab
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Driver", "RobotCameras"]
-
 _TURN_S = 0.4
 
 

@@ -22,8 +22,6 @@ from ipsys_log.capture.frames import Clock
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Relay"]
-
 _LOOPBACK = "127.0.0.1"
 _TURN_S = 0.005
 _LONGEST_BYTES = 2048

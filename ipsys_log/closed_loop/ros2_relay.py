@@ -20,8 +20,6 @@ from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure,
 from ipsys_log.sinks.streams.ros2_messages import POSE
 from ipsys_log.sinks.streams.ros2_types import type_hash
 
-__all__ = ["open_ros2"]
-
 _NODE = "ipsys_relay"
 _DOMAIN = 0
 

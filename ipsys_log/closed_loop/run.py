@@ -29,8 +29,6 @@ from ipsys_log.sinks.sink import Consumer
 from ipsys_log.sinks.streams.settings import Stream, open_streams
 from ipsys_log.stages.fit import model_run
 
-__all__ = ["ROBOT_RUN", "drive_robots"]
-
 # The kind of the event with the settings of the run.
 ROBOT_RUN = "robot_run"
 Say = Callable[[str], None]

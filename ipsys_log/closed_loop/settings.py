@@ -18,23 +18,11 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Waypoint
 from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing
-from ipsys_log.simulation.cameras import FLOOR_M, mount_cameras
+from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.differential_drive import Pose2d
 from ipsys_log.simulation.robot_lab import RobotStart
-from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 from ipsys_log.sinks.streams.settings import StreamSettings
-
-__all__ = [
-    "PATHS",
-    "PORT",
-    "PROGRAM",
-    "CameraFailure",
-    "RobotRun",
-    "choose_paths",
-    "parse_failure",
-    "read_lab",
-    "start_poses",
-]
 
 PORT = 9870
 PROGRAM = Path(__file__).parent / "example_robot" / "robot.py"

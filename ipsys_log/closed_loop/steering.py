@@ -13,8 +13,6 @@ from ipsys_log.messages import FINISHED, HOLDING, STOPPED, WheelCommand
 from ipsys_log.simulation.robot_lab import RobotLab
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Steering"]
-
 
 class Steering:
     """The commands of the robots, in real time or in lockstep.

@@ -19,8 +19,6 @@ from ipsys_log.messages import WheelCommand
 from ipsys_log.plain_text import plain_text
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Answer", "Wheels"]
-
 LOOPBACK = "127.0.0.1"
 # A slow machine needs long for a program. After the first time it is named; the second is an error.
 _SAID_S, _LONGEST_S = 10.0, 600.0

@@ -22,8 +22,6 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import parse_chunk_head
 from ipsys_log.units import format_bytes
 
-__all__ = ["bound_reader", "check_files", "unpack_message"]
-
 _PIECE = 1 << 20  # bytes
 _MCAP = ".mcap"
 

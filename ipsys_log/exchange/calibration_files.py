@@ -17,17 +17,6 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import ASSUMED_MODEL, EVENTS_TOPIC, CameraCalibration, Event, Message
 
-__all__ = [
-    "FORMATS",
-    "announce_assumed",
-    "calibration_text",
-    "check_format",
-    "kalibr_yaml",
-    "opencv_yaml",
-    "read_intrinsics",
-    "ros_yaml",
-]
-
 
 def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:
     """Return a FileStorage YAML: matrix, coefficients, image size, and the standard deviations by name.

@@ -24,8 +24,6 @@ from ipsys_log.geometry.lenses import DISTORTION_MODELS, check_calibration
 from ipsys_log.log.contents import parse_foreign_camera
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["CalibrationFile", "read_calibration"]
-
 _WIDEST_PX = 65_535
 _MOST_NUMBERS = 100
 _MOST_LEVELS = 3

@@ -24,8 +24,6 @@ import yaml
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["ParsedText", "line_of", "parse_text", "read_text"]
-
 _LARGEST_FILE = 1 << 20  # bytes
 # The sections [image] and [<camera>] of the calibrator of ROS; each key is above its values.
 _INI = re.compile(

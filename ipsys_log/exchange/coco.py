@@ -29,8 +29,6 @@ from ipsys_log.messages.channels import MARKERS
 from ipsys_log.runs.options import Progress
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ANNOTATIONS", "CocoCounts", "write_coco"]
-
 ANNOTATIONS = "annotations.json"
 _STEP = "pictures"
 _CATEGORY = {

@@ -11,8 +11,6 @@ from typing import NamedTuple, TypeVar
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["NamedRow", "open_as_text", "parse_number", "read_cells", "read_rows"]
-
 Value = TypeVar("Value")
 _LONGEST_TEXT = 40
 

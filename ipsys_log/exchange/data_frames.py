@@ -46,8 +46,6 @@ from ipsys_log.messages.channels import (
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["TABLES", "import_pandas", "read_table", "read_table_parts"]
-
 # The six different elements of a 3 x 3 covariance of x, y, z, by their index in row-major order.
 _COVARIANCE = {"xx": 0, "xy": 1, "xz": 2, "yy": 4, "yz": 5, "zz": 8}
 _CORNERS = [f"{axis}{corner}_px" for corner in range(4) for axis in "xy"]

@@ -36,8 +36,6 @@ from ipsys_log.runs.output import append_run, open_target
 from ipsys_log.runs.provenance import check_run_name, fingerprint, free_name
 from ipsys_log.stages.detect.reports import LensInUse, Reports
 
-__all__ = ["DetectionOptions", "ImportedDetections", "import_detections"]
-
 _RUN = "imported"
 _CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "xy")
 _NEEDED = ("time", "camera", "marker_id", *_CORNERS)

@@ -21,8 +21,6 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["FORMATS", "TRAJECTORIES", "export_file", "export_table", "export_trajectory"]
-
 # Formats of tables, by the suffix of the file.
 FORMATS = {".csv": "csv", ".parquet": "parquet"}
 # Formats of trajectories, by the suffix of the file.

@@ -22,8 +22,6 @@ from ipsys_log.messages import (
 from ipsys_log.rig.file import check_name
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FORMATS", "find_images", "find_times", "parse_start", "parse_time", "read_images"]
-
 NAMES = "names"
 _COLUMNS = ("file", "time")
 # The number of digits of a time gives its unit: seconds since 1970 have 10 digits until 2286.

@@ -31,8 +31,6 @@ from ipsys_log.runs.output import append_run, open_target
 from ipsys_log.runs.provenance import fingerprint, free_name, newest_run, read_channels
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["ImportedTruth", "TruthOptions", "import_truth"]
-
 _RUN = "truth"
 _MARKER_PREFIX = "marker_"
 

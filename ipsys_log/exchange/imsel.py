@@ -40,8 +40,6 @@ from ipsys_log.messages import (
 )
 from ipsys_log.units import CM_PER_M, NS_PER_S
 
-__all__ = ["read_imsel", "read_mat"]
-
 _HEAD = 128  # bytes
 _LITTLE_ENDIAN = b"\x00\x01IM"
 _TAG = struct.Struct("<II")  # type, number of the following bytes

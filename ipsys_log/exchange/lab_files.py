@@ -12,9 +12,7 @@ from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 from ipsys_log.rig.file import load_rig, rig_toml
 from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
-from ipsys_log.stages.detect import marker_detector
-
-__all__ = ["load_cameras", "load_lenses", "simulated_lab_texts", "tape_sheet_path", "write_new"]
+from ipsys_log.stages.detect.stock import marker_detector
 
 # The beginning of the rig file of the simulated lab.
 _SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.

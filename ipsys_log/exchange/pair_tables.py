@@ -27,8 +27,6 @@ from ipsys_log.rig.file import check_name
 from ipsys_log.runs.provenance import fingerprint
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["PairTable", "pair_messages", "read_pairs"]
-
 _RUN = "imported"
 _CAMERA_AXES = ("xc_m", "yc_m", "zc_m")
 _WORLD_AXES = ("xw_m", "yw_m", "zw_m")

@@ -11,8 +11,6 @@ from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 
-__all__ = ["Columns", "escape_surrogates", "read_rows", "write_rows"]
-
 # The type of each column by its name: a plain type, or the columns of the items of a list.
 Columns = Mapping[str, "str | Columns"]
 _MARK = b"ipsys"

@@ -34,8 +34,6 @@ from ipsys_log.messages import (
 )
 from ipsys_log.runs.options import Progress
 
-__all__ = ["BagCameras", "find_bag_cameras", "read_bag"]
-
 _STEP = "bag"
 _Reader = Reader1 | Reader2
 _IMAGES = (CompressedImage, RawImage)

@@ -18,8 +18,6 @@ from ipsys_log.report.alignment import read_alignment
 from ipsys_log.report.alignment_text import advise, coverage_lines
 from ipsys_log.stages.detect.stock import detect_markers
 
-__all__ = ["AlignedCamera", "AlignmentResult", "read_result"]
-
 
 @dataclass(frozen=True, slots=True)
 class AlignedCamera:

@@ -10,8 +10,6 @@ from ipsys_log.calibration.lens_models import LENS_MODELS, find_lens_model
 from ipsys_log.errors import IpsysError
 from ipsys_log.survey.entry import Fault
 
-__all__ = ["BOARD_FIELDS", "BoardEntry", "parse_board_entry"]
-
 
 class BoardEntry(NamedTuple):
     """The options of ``ipsys calibrate`` for a board and a lens, by their names in :func:`api.calibrate`."""

@@ -9,19 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 import simplejpeg
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Grey
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting, view_board
 from ipsys_log.calibration.image_selection import NEAR, advise, measure_coverage
 from ipsys_log.errors import FrameError
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo
-from ipsys_log.stages.detect import decode_grey
-
-__all__ = ["BoardSearch"]
-
-Grey = NDArray[np.uint8]
 
 # So many pictures, without advice on further ones, are enough.
 _ENOUGH = 20

@@ -17,8 +17,6 @@ from ipsys_log.passwords import hide_password
 from ipsys_log.rig.file import check_name
 from ipsys_log.survey.entry import Fault
 
-__all__ = ["ADDRESS_FIELDS", "fault_text", "parse_camera_address"]
-
 # The fields of the form: key, label.
 ADDRESS_FIELDS = {
     "address": "Address, such as rtsp://192.168.1.20/stream",

@@ -18,26 +18,14 @@ from ipsys_log.capture.simulated import parse_source
 from ipsys_log.capture.usb_bus import UsbCamera, find_cameras
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.first_day.rig_text import replace_tables, write_rig
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedVideo, Rig, RigCamera
 from ipsys_log.passwords import hide_password
 from ipsys_log.rig.file import check_name, check_rig, load_rig
 from ipsys_log.simulation.live_lab import LIVE_SETTINGS
-from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import Fault
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "CameraOption",
-    "add_camera",
-    "free_names",
-    "list_attached",
-    "list_options",
-    "propose_names",
-    "save_cameras",
-    "set_calibration",
-    "take_picture",
-]
 
 # The search for a picture ends after this time.
 _LONGEST_WAIT_NS = 60 * NS_PER_S

@@ -25,8 +25,6 @@ from ipsys_log.passwords import hide_password
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import Fault
 
-__all__ = ["CameraPictures"]
-
 _SILENT = "the camera sends no image; check its cable and its mode"
 
 

@@ -11,8 +11,6 @@ from typing import Any
 from ipsys_log.errors import IpsysError
 from ipsys_log.plain_text import plain_text
 
-__all__ = ["Job", "JobStoppedError", "Jobs"]
-
 _MOST_LINES = 40
 
 

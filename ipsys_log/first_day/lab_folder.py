@@ -22,8 +22,6 @@ from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
 
-__all__ = ["ALIGNMENT_LOG", "FitFacts", "LabFolder", "LogFacts"]
-
 # The names of logs of an alignment begin with this.
 ALIGNMENT_LOG = "alignment"
 _SUFFIX = ".mcap"

@@ -18,8 +18,6 @@ from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.survey.exclusion import exclude
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["OutlierPoint", "exclude_outlier", "find_outlier_points"]
-
 _REASON = "it contradicts the fit (setup page)"
 
 

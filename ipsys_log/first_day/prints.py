@@ -12,8 +12,6 @@ from ipsys_log.report.prints import Print, board_print, rig_prints
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import Fault
 
-__all__ = ["print_board", "print_markers"]
-
 
 def print_markers(folder: LabFolder) -> bytes:
     """Return the markers of the rig file as PDF (``ipsys markers --rig lab.toml``).

@@ -15,10 +15,8 @@ from ipsys_log.first_day.rig_text import replace_tables, replace_values, write_r
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigMarker
 from ipsys_log.rig.checks import check_units
 from ipsys_log.rig.file import check_rig, example_toml, load_rig
-from ipsys_log.stages.detect import marker_detector
+from ipsys_log.stages.detect.stock import marker_detector
 from ipsys_log.survey.entry import Fault
-
-__all__ = ["LABELS", "check_rig_entry", "example_rig", "rig_fields", "rig_warnings", "save_rig_entry"]
 
 _FILE = "lab.toml"
 _USUAL = ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 1.0, 0.0)

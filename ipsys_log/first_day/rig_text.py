@@ -14,8 +14,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig
 from ipsys_log.rig.file import load_rig, toml_rows
 
-__all__ = ["replace_tables", "replace_values", "write_rig"]
-
 _HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z_]+)\s*\]{1,2}")
 
 

@@ -27,8 +27,6 @@ from ipsys_log.sinks.sink import Sink
 from ipsys_log.survey.entry import Fault
 from ipsys_log.survey.live import LiveScene
 
-__all__ = ["DICTIONARIES", "Pages", "SetupSession"]
-
 # The dictionaries that the page offers first; the field takes any other name of OpenCV, too.
 DICTIONARIES = (
     *("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250"),

@@ -17,8 +17,6 @@ from ipsys_log.plain_text import join_names, shell_words
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import check_references
 
-__all__ = ["CameraIntrinsics", "SetupProgress", "Status", "StepState", "read_progress"]
-
 # The model that a replay fits, and the number of calibration points that gives good results.
 _MODEL, _GOOD = "poly", 40
 

@@ -50,17 +50,6 @@ from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.survey.live import LiveScene
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "LiveRecording",
-    "OpenedLab",
-    "align",
-    "calibrate",
-    "fit_and_evaluate",
-    "measure",
-    "measure_sheet",
-    "track",
-]
-
 _LAST_STAGE = "camera-frame"
 # Durations of recordings, by the time stamps of the frames, and the least number of frames of each camera.
 _SHEET_S, _ALIGN_S, _LEAST_FRAMES = 5.0, 3.0, 20

@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["SIGMAS_95", "FloorEllipse", "covariance_ellipse", "enlargement"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # The region of 95 % of a normal distribution in two dimensions ends at so many standard deviations.
 SIGMAS_95 = float(np.sqrt(-2 * np.log(0.05)))

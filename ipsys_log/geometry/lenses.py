@@ -12,18 +12,6 @@ from ipsys_log.errors import IpsysError, SizeError
 from ipsys_log.geometry.plausible_lenses import check_plausible
 from ipsys_log.messages import CameraCalibration
 
-__all__ = [
-    "DISTORTION_MODELS",
-    "check_calibration",
-    "check_size",
-    "in_image",
-    "intersect_height",
-    "project",
-    "same_intrinsics",
-    "scale_intrinsics",
-    "undistort",
-]
-
 # A ray that rises or falls by less than this per metre does not meet the floor in the field of view.
 _LEAST_SLOPE = 1e-6
 

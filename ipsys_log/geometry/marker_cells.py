@@ -9,23 +9,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners, white_cells
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
-
-__all__ = [
-    "MovingMarker",
-    "PlacedBoard",
-    "PlacedMarker",
-    "black_cells",
-    "cell_outlines",
-    "print_outline",
-    "printed_cells",
-    "project_corners",
-]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,22 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
-
-__all__ = [
-    "camera_point",
-    "camera_point_slopes",
-    "check_covariance",
-    "heading",
-    "marker_corners",
-    "pixel_slopes",
-    "white_cells",
-    "whiten",
-]
-
-Array = NDArray[np.float64]
 
 # About 0.1 px: the error by the third derivative of a lens distortion is below 1e-7 of the slope.
 _STEP = 1e-4

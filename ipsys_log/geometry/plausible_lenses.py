@@ -7,8 +7,6 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["calibration_remarks", "check_plausible", "lost_share"]
-
 # The focal length as a share of the larger side of the image: the image circle of a lens of 220 degrees can
 # fill half of the height (0.07), and a telescope has less than 1 degree (60).
 _LEAST_FOCAL, _MOST_FOCAL = 0.05, 100.0

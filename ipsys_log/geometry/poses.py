@@ -4,19 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = [
-    "invert_pose",
-    "look_down",
-    "make_pose",
-    "pose_facing_up",
-    "rotation",
-    "rotation_vector",
-    "transform",
-]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 
 def make_pose(rotation_matrix: Array, origin_m: Array) -> Array:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["cross", "left_jacobians", "level_turns", "quaternion", "rotate", "skew_matrices"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 
 def rotate(vectors_rad: Array) -> Array:

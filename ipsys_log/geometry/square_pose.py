@@ -7,22 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.messages import CameraCalibration
-
-__all__ = [
-    "DEPTH_SHARE",
-    "SquarePoses",
-    "calibration_covariances",
-    "fit_squares",
-    "is_convex",
-    "reprojection_px",
-    "solve_squares",
-    "tilt_cost",
-]
-
-Array = NDArray[np.float64]
 
 _UNIT_CORNERS = marker_corners(1.0)[:, :2]
 _UNIT = np.eye(2)

@@ -6,26 +6,9 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
-
-__all__ = [
-    "ON_REFERENCE_SIGMA_M",
-    "SIDES",
-    "USUAL_TAPE_SCALE_SIGMA",
-    "USUAL_TAPE_SIGMA_M",
-    "TapePosition",
-    "are_collinear",
-    "crossing_angle",
-    "intersect_circles",
-    "multilaterate",
-    "side_of",
-    "tape_covariance",
-    "trilaterate",
-]
-
-Array = NDArray[np.float64]
 
 SIDES = ("left", "right")
 # A hand lays a marker onto a reference point with this standard deviation, along each axis.

@@ -12,24 +12,11 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Grey
 from ipsys_log.errors import FrameError
 from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
 from ipsys_log.images.jpeg_flaws import decode_flawed, remove_stray_bytes
 from ipsys_log.messages import CompressedImage, RawImage
-
-__all__ = [
-    "MAX_PIXELS",
-    "RAW_ENCODINGS",
-    "Grey",
-    "check_encoded",
-    "check_pixel_count",
-    "decode_colour",
-    "decode_grey",
-    "decode_rows",
-    "frame_size",
-    "levels_at",
-    "read_image_size",
-]
 
 # An embedded thumbnail may come before the size of a JPEG.
 _FIRST_BYTES = 1 << 18
@@ -109,8 +96,6 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
         offset += 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
     return 0, 0
 
-
-Grey = NDArray[np.uint8]
 
 # The channels of a raw image, and its conversions to grey and to BGR.
 _RAW = {

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
 
-__all__ = ["JpegHeader", "check_restarts", "cut_rows", "read_header", "read_layout", "whole_rows"]
-
 _END = b"\xff\xd9"
 _BASELINE = (0xC0, 0xC1)
 _SCAN, _RESTART_INTERVAL, _RESTART = 0xDA, 0xDD, 0xD0

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from ipsys_log.errors import FrameError
 from ipsys_log.images.jpeg import JpegHeader, check_restarts, read_header
 
-__all__ = ["decode_flawed", "remove_stray_bytes"]
-
 _END, _SCAN = b"\xff\xd9", 0xDA
 _RESTARTS = re.compile(rb"\xff([\xd0-\xd7])")
 # Coded data that change every block: a long code, which stands for a large value, and noise without 0xff,

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
     from av.video.frame import VideoFrame
 
-__all__ = ["VIDEO_FORMATS", "FrameGapDetector", "Video", "decode_keyframe", "decode_last", "is_keyframe"]
-
 # The header of a unit of Annex B, with as many bytes of the unit as this module reads.
 _UNIT_WITH_HEAD = re.compile(rb"\x00\x00\x01(.)(?=(.{0,96}))", re.DOTALL)
 _PARAMETERS, _SLICE, _KEY_SLICE = 7, 1, 5

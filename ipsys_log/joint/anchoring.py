@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
-
-__all__ = ["anchor"]
-
-Array = NDArray[np.float64]
 
 # Residuals of readings above this many standard deviations get less weight.
 _USUAL = 3.0

@@ -5,16 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.lens_models import project_with_slopes
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.rotations import cross
 from ipsys_log.joint.model import JointModel
-
-__all__ = ["CornerSlopes", "edge_motion", "linearise_corners"]
-
-Array = NDArray[np.float64]
 
 _CORNERS = marker_corners(1.0)
 

@@ -13,8 +13,6 @@ from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 
-__all__ = ["leap_along_valley"]
-
 # The strict loss; before it, fits move fast.
 _STRICT = 1.0
 _LEAST_DAMPING, _MOST_DAMPING, _MORE = 1e-12, 1e-2, 10.0

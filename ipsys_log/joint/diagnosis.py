@@ -5,17 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.joint.fit import Finding, JointFit
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.tape_scale import tape_contradiction
 from ipsys_log.joint.trajectories import Kind
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["Reading", "find_faults", "point_covariances", "standardise_readings"]
-
-Array = NDArray[np.float64]
 
 # A reading is wrong if its error exceeds this many standard deviations.
 _WRONG = 4.5

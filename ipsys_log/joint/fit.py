@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
 from ipsys_log.joint.floor_unevenness import most_likely_scale
@@ -23,10 +23,6 @@ from ipsys_log.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
 from ipsys_log.joint.tape_scale import widen_tape
 from ipsys_log.joint.trajectories import Kind, Trajectories
-
-__all__ = ["Finding", "JointFit", "fit_jointly", "fit_shape"]
-
-Array = NDArray[np.float64]
 
 # The field of the floor reaches this far beyond the outermost place of a marker.
 _BEYOND_M = 1.0

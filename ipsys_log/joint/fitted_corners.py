@@ -5,18 +5,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.locate_poses import locate_poses
 from ipsys_log.joint.locate_step import corner_covariances
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.messages import Model
-
-__all__ = ["FittedCornerModel", "LocatedMarkers"]
-
-Array = NDArray[np.float64]
 
 
 class LocatedMarkers(NamedTuple):

@@ -12,9 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FloorField", "make_floor_field", "spline_weights"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # Distance of the knots as a share of the correlation length. A cubic spline follows the field to 1 % of
 # its standard deviation.

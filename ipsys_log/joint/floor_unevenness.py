@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-__all__ = ["most_likely_scale"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # Limits of the logarithm of the factor: between a sheet of glass and a meadow.
 _LEAST, _MOST = -3.0, 3.0

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.geometry.trilateration import (
     ON_REFERENCE_SIGMA_M,
@@ -28,10 +29,6 @@ from ipsys_log.joint.observations import (
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Rig
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["gather_observations"]
-
-Array = NDArray[np.float64]
 
 _USUAL_RULER_M = 0.001
 # A marker that lies on the floor needs no ruler. This is the thickness of its paper.

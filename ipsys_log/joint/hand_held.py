@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.joint.fit import JointFit
@@ -26,10 +26,6 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import solve
 from ipsys_log.joint.trajectories import Kind, Paths, Trajectories
-
-__all__ = ["fit_hand_held", "predict_errors"]
-
-Array = NDArray[np.float64]
 
 # Views of two cameras within this time show nearly the same pose of the body.
 _SAME_TIME_S = 0.05

@@ -28,8 +28,6 @@ from ipsys_log.joint.tape_explanations import (
 )
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["fit_hypotheses"]
-
 Progress = Callable[[int, float], None]
 # The decrease of the sum of squares by a motion of a camera, or by free row times (None).
 _Cause = tuple[float, CameraMotion | None]

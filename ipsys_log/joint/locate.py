@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
-
-__all__ = ["Positions", "locate_markers"]
-
-Array = NDArray[np.float64]
 
 _FLAT = np.array([0, 1, 5])
 

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import pixel_slopes
 from ipsys_log.geometry.rotations import rotate
 from ipsys_log.geometry.square_pose import fit_squares, tilt_cost
 from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
-
-__all__ = ["Poses", "hold_heights", "locate_poses"]
-
-Array = NDArray[np.float64]
 
 _STEPS = 2
 # Relative error of the printed side of one marker beside the mean of all, which the model has.

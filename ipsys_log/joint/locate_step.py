@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.locate import Positions as LocatedMarkers
 from ipsys_log.joint.locate import locate_markers
@@ -18,10 +18,6 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
 from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["MOST_CHI2", "MOST_CHI2_OF_POSE", "LocateCorners", "corner_covariances"]
-
-Array = NDArray[np.float64]
 
 # Corners without a covariance have about this error.
 _CORNER_SIGMA_PX = 0.25

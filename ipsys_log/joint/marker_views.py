@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.square_pose import solve_squares
 from ipsys_log.joint.observations import Body, Sightings
 from ipsys_log.messages import CameraCalibration
-
-__all__ = ["MarkerViews", "guess_distortion", "view_markers"]
-
-Array = NDArray[np.float64]
 
 # Normals of markers that lie on one floor agree within this angle, in one of the two poses of each marker.
 _ALIKE_RAD = np.radians(8.0)

@@ -7,15 +7,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.poses import rotation
 from ipsys_log.joint.payload import restore_joint, store_joint
 from ipsys_log.messages import Model
-
-__all__ = ["PoseChange", "mend_poses"]
-
-Array = NDArray[np.float64]
 
 _POSE = 6
 

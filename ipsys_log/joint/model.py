@@ -6,17 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.floor_field import FloorField
 from ipsys_log.joint.observations import lens_model_of
 from ipsys_log.messages import CameraCalibration
-
-__all__ = ["JointModel", "build_models"]
-
-Array = NDArray[np.float64]
 
 # Modes of the joint covariance below this share of a prior variance are left out.
 _LEAST_SHARE = 1e-10

@@ -12,13 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.trajectories import Kind
-
-__all__ = ["CameraMotion", "Squares", "find_motion", "row_time_evidence", "sum_squares"]
-
-Array = NDArray[np.float64]
 
 _CANDIDATES = 12
 # With so many candidates between the neighbours of the last time, three searches find one of 400 sightings.

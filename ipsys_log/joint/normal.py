@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky_banded, lapack
 from scipy.sparse import csr_array
 
-__all__ = ["Block", "Factorisation", "NormalEquations"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from ipsys_log.arrays import Array, Indices
 
 
 @dataclass(frozen=True, slots=True, eq=False)

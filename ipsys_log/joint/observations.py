@@ -7,23 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Indices
 from ipsys_log.calibration.lens_models import LENS_MODELS, LensModel
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.messages import CameraCalibration
-
-__all__ = [
-    "Body",
-    "CalibrationPoint",
-    "CameraPrior",
-    "Observations",
-    "Sightings",
-    "Tape",
-    "lens_model_of",
-    "marker_body",
-]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 # In a lab with so few cameras, a robot passes all of them within seconds.
 _FEW_CAMERAS = 8

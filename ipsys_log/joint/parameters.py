@@ -7,15 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.geometry.rotations import rotate
 from ipsys_log.joint.floor_field import FloorField
 from ipsys_log.joint.observations import CameraPrior, Observations, lens_model_of
 from ipsys_log.joint.settings import JointSettings
-
-__all__ = ["CameraBlock", "Layout", "State", "make_layout", "tape_sigmas"]
-
-Array = NDArray[np.float64]
 
 _FIXED = 0.0
 

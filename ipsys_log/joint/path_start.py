@@ -6,20 +6,15 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
+from ipsys_log.arrays import Array, Indices
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.start import PlacedCamera
 from ipsys_log.joint.trajectories import Paths, Trajectories
-
-__all__ = ["StartedPaths", "cover_times", "smooth_knots", "start_paths"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 # A longer time without sightings divides a path.
 _GAP_S = 1.0

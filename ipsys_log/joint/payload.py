@@ -6,20 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import DISTORTION_MODELS
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Pair, Parameter
 
-__all__ = ["JOINT", "joint_payload", "restore_joint", "store_joint"]
-
 # The name of the model in commands and logs.
 JOINT = "joint"
-
-Array = NDArray[np.float64]
 
 # The floor belongs to all cameras. Its modes are most of the model of a hall.
 _FLOOR = (

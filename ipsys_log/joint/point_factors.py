@@ -7,15 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Indices
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.observations import CalibrationPoint, Tape
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.robust import limit_of, robust_loss
-
-__all__ = ["PointFactors", "PointResiduals", "make_point_factors"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

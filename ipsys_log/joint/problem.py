@@ -6,18 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.joint.normal import Block, NormalEquations
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.point_factors import PointFactors
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.sighting_factors import SightingFactors
 from ipsys_log.joint.trajectories import Kind, Trajectories
-
-__all__ = ["Problem", "find_blocks"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,8 +8,6 @@ from ipsys_log.errors import FitError
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.solver import ConvergenceError
 
-__all__ = ["check_observations", "explain"]
-
 
 def check_observations(observations: Observations) -> None:
     """Check that there are sightings, a length, and two measured points.

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["limit_of", "robust_loss"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # Up to this many standard deviations of chi2 above its mean, an error counts as normal.
 _NORMAL_SPREAD = 4.5

@@ -9,8 +9,6 @@ import numpy as np
 
 from ipsys_log.joint.observations import Observations
 
-__all__ = ["divide_camera", "seeing_cameras", "without_cameras", "without_points"]
-
 
 def without_points(observations: Observations, names: Collection[str]) -> Observations:
     """Return the observations without some calibration points, and without their sightings."""

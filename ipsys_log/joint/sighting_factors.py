@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Indices
 from ipsys_log.calibration.lens_models import project_points, project_with_slopes
 from ipsys_log.geometry.rotations import cross
 from ipsys_log.joint.normal import NormalEquations
@@ -14,11 +15,6 @@ from ipsys_log.joint.observations import Body, Sightings
 from ipsys_log.joint.parameters import Layout, State
 from ipsys_log.joint.robust import limit_of, robust_loss
 from ipsys_log.joint.trajectories import Kind, Placement, Trajectories
-
-__all__ = ["SightingFactors", "Slopes", "WeightedRows", "make_sighting_factors"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 # A covariance of lower rank has no noise in some directions, because a fitted pose removed it there.
 _NO_VARIANCE = 1e-4

@@ -14,8 +14,6 @@ from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 
-__all__ = ["SHORT", "ConvergenceError", "Solution", "solve"]
-
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
 _MOST_STEPS = 200

@@ -7,14 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.joint.marker_views import MarkerViews, guess_distortion, view_markers
 from ipsys_log.joint.observations import Observations
 from ipsys_log.messages import CameraCalibration
-
-__all__ = ["PlacedCamera", "UnplacedError", "place_cameras", "place_freely", "rough_points"]
-
-Array = NDArray[np.float64]
 
 # Errors of a place above this get less weight: that of a depth from the size of a marker.
 _USUAL_M = 0.05

@@ -13,13 +13,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES, are_collinear, multilaterate, side_of
 from ipsys_log.joint.observations import CalibrationPoint
-
-__all__ = ["WRONG_NUMBER", "Change", "Explanation", "PointShape", "explain_readings", "side_contradicts"]
-
-Array = NDArray[np.float64]
 
 # Twice the negative logarithm of the probability of a mistake: one point in a hundred has a wrong side, or
 # exchanged distances.

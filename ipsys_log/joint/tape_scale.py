@@ -7,13 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.joint.floor_unevenness import most_likely_scale
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import Layout, State, tape_sigmas
-
-__all__ = ["tape_contradiction", "widen_tape"]
-
-Array = NDArray[np.float64]
 
 # Uncertainty of the standard deviations of both scales, as that of their logarithm: the readings decide.
 _SPREAD = 3.0

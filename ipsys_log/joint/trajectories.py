@@ -6,17 +6,12 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Indices
 from ipsys_log.geometry.rotations import left_jacobians, level_turns, rotate
 from ipsys_log.joint.floor_field import spline_weights
 from ipsys_log.joint.normal import NormalEquations
 from ipsys_log.joint.parameters import Layout, State
-
-__all__ = ["Kind", "Paths", "Placement", "Trajectories"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _POSE = 6
 _KNOT = 3

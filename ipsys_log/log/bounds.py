@@ -10,16 +10,6 @@ from dataclasses import dataclass, field
 from ipsys_log.errors import LogError
 from ipsys_log.units import format_bytes
 
-__all__ = [
-    "LARGEST_CHUNK",
-    "LARGEST_DEFINITION",
-    "LARGEST_MESSAGE",
-    "BoundError",
-    "PartCounter",
-    "ReadLimits",
-    "chunk_excess",
-]
-
 _MIB = 1 << 20
 LARGEST_CHUNK = 256 * _MIB  # bytes, uncompressed
 LARGEST_MESSAGE = LARGEST_CHUNK - 8 * _MIB  # bytes: the rest of the chunk is for earlier messages

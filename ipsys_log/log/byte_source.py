@@ -14,8 +14,6 @@ from ipsys_log.log.bounds import BoundError, ReadLimits
 from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
 
-__all__ = ["FileBytes", "LogBytes", "file_identity", "open_for_reading"]
-
 _MOST_PER_CALL = 1 << 30
 
 

@@ -9,8 +9,6 @@ from ipsys_log.log.chunks import parse_chunk_contents, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkRef, parse_chunk_head
 
-__all__ = ["ChannelSize", "read_sizes"]
-
 
 @dataclass(frozen=True, slots=True)
 class ChannelSize:

@@ -16,16 +16,6 @@ from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.hashing import WORTH_COMBINING, Buffer, combine, extend
 from ipsys_log.log.records import HEAD_SIZE, MESSAGE, MESSAGE_HEAD_SIZE
 
-__all__ = [
-    "CheckedMessage",
-    "Entries",
-    "Rows",
-    "check_messages",
-    "crc_of_changed",
-    "message_head",
-    "rows_by_offset",
-]
-
 Rows = NDArray[np.uint64]  # shape (N, 2): log time in ns, offset in the chunk or the file
 Entries = Mapping[int, Rows]  # by channel id
 

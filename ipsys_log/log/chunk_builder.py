@@ -18,8 +18,6 @@ from ipsys_log.log.records import (
     chunk_head,
 )
 
-__all__ = ["IMAGES", "IMAGE_SCHEMAS", "SMALL_APPENDED", "SMALL_LIVE", "ChunkBuilder", "ChunkLimits"]
-
 _ZSTD_LEVEL = 3
 _OPCODE = int(Opcode.MESSAGE)
 _FIRST_ROOM = 64 << 10  # bytes

@@ -32,19 +32,6 @@ from ipsys_log.log.records import (
     parse_message_index,
 )
 
-__all__ = [
-    "ALWAYS",
-    "RangeCache",
-    "Run",
-    "chunk_entries",
-    "open_chunk",
-    "open_unchunked",
-    "planned_range",
-    "runs",
-    "to_rows",
-    "wanted_rows",
-]
-
 ALWAYS = (0, (1 << 64) - 1)  # ns
 _GAP = 4096  # bytes: to read a smaller gap costs less than another system call
 _RUN = 256 << 10  # bytes read at once

@@ -21,19 +21,6 @@ from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, BoundError, 
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse, parse_chunk_head
 
-__all__ = [
-    "ChunkContents",
-    "EqualBlocks",
-    "RawBlocks",
-    "check_compression",
-    "check_definition",
-    "find_blocks",
-    "has_wrong_crc",
-    "inner_records",
-    "parse_chunk_contents",
-    "unpack",
-]
-
 _ZSTD_MAGIC = (0xFD2FB528).to_bytes(4, "little")
 _LZ4_MAGIC = (0x184D2204).to_bytes(4, "little")
 _ZSTD_BLOCK = 128 << 10  # bytes: limit of a block; compressors fill every block but the last

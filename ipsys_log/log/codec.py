@@ -25,8 +25,6 @@ from ipsys_log.log.bounds import PartCounter
 from ipsys_log.log.protobuf_fields import fields_of, fill_proto, read_proto
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
-__all__ = ["PAYLOADS", "decode", "encode", "payload_type", "proto_class", "schema_data", "schema_name"]
-
 # The payloads with separate channels, by the name of their schema.
 PAYLOADS: dict[str, type] = {
     **{

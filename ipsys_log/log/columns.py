@@ -24,8 +24,6 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import PartCounter
 from ipsys_log.log.codec import proto_class
 
-__all__ = ["Column", "Columns", "read_columns"]
-
 Bytes = NDArray[np.uint8]
 
 _VARINT, _FIXED64, _LENGTH = 0, 1, 2

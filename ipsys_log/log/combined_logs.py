@@ -11,8 +11,6 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import Measurement, Run
 
-__all__ = ["check_overlaps", "check_same_parameters", "find_new_ids", "rename_ids"]
-
 
 def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) -> None:
     """Refuse logs that have images of the same camera, or results of the same run, at the same time.

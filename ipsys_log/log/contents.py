@@ -14,19 +14,6 @@ from mcap import records as mcap
 
 from ipsys_log.log.records import ChunkRef
 
-__all__ = [
-    "Contents",
-    "RawMessage",
-    "Schema",
-    "StoredChannel",
-    "camera_of_topic",
-    "clean_name",
-    "free_id",
-    "group_by_topic",
-    "parse_foreign_camera",
-    "run_of_topic",
-]
-
 _OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
 _RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
 # The last parts of a topic that describe the image, and not its camera.

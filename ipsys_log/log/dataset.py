@@ -44,9 +44,6 @@ from ipsys_log.messages.channels import (
     channel_of,
 )
 
-__all__ = ["Session"]
-
-
 _ITEMS_OF_IMAGE = 16
 _LATEST_NS = 1 << 63
 

@@ -11,8 +11,6 @@ from ipsys_log.log.damage.survey import survey
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.summary import read_intact_summary
 
-__all__ = ["FileCheck", "check_file"]
-
 
 @dataclass(frozen=True, slots=True)
 class FileCheck:

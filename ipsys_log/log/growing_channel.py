@@ -23,8 +23,6 @@ from ipsys_log.log.records import (
     parse_chunk_head,
 )
 
-__all__ = ["GrowingChannel"]
-
 
 class GrowingChannel:
     """The messages of one topic, by their number in the order of the file; the file may grow meanwhile.

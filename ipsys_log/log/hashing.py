@@ -16,17 +16,6 @@ from mcap import records as mcap
 
 from ipsys_log.log.records import to_bytes
 
-__all__ = [
-    "METADATA_NAME",
-    "WORTH_COMBINING",
-    "Buffer",
-    "ChannelHash",
-    "combine",
-    "extend",
-    "hashes_from_metadata",
-    "metadata_of_hashes",
-]
-
 Buffer = bytes | memoryview
 WORTH_COMBINING = 32 << 10  # bytes: for shorter data, a second read costs less
 

@@ -26,19 +26,6 @@ from typing import Protocol
 from ipsys_log.log.byte_source import FileBytes
 from ipsys_log.log.records import MAGIC
 
-__all__ = [
-    "DISK",
-    "Disk",
-    "Journal",
-    "Storage",
-    "attach_journal",
-    "journal_path",
-    "read_journal",
-    "replace_tail",
-    "roll_back",
-    "write_all",
-]
-
 
 class Storage(Protocol):
     """The operations that change files. Reads call ``os.pread`` directly."""

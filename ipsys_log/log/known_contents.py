@@ -13,8 +13,6 @@ from ipsys_log.log.location import LogUrl
 from ipsys_log.log.remote_bytes import RemoteBytes, RemoteRanges
 from ipsys_log.log.summary import load_contents
 
-__all__ = ["contents_of", "note_contents", "one_reading", "open_remote"]
-
 
 @dataclass(slots=True)
 class _Reading:

@@ -12,15 +12,6 @@ from urllib.parse import unquote
 from ipsys_log.passwords import hide_password
 from ipsys_log.plain_text import plain_text
 
-__all__ = [
-    "LogLocation",
-    "LogState",
-    "LogUrl",
-    "file_beside",
-    "is_one_of",
-    "parse_location",
-]
-
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)")
 _LOCAL = ("file", "local")
 _GLOB = re.compile(r"[*\[]")

@@ -10,8 +10,6 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import open_for_reading
 from ipsys_log.log.journal import Storage, journal_path
 
-__all__ = ["check_free", "check_locks", "describe_broken_link", "is_being_written", "open_locked"]
-
 
 def open_locked(storage: Storage, path: Path, flags: int) -> int:
     """Open `path` and take the exclusive lock at once.

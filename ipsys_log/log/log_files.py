@@ -10,8 +10,6 @@ from pathlib import Path, PurePath, PurePosixPath
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogState, LogUrl, parse_location
 
-__all__ = ["expand_folders", "find_logs", "logs_below", "name_places", "read_log_state", "states_below"]
-
 _ALL_BELOW = "**/*.mcap"
 
 

@@ -19,8 +19,6 @@ from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.shifted_times import shift_time, shift_times
 from ipsys_log.log.writer import LogWriter
 
-__all__ = ["MergeSource", "merge_messages", "merged"]
-
 # From the data of a message to those in the new log.
 Change = Callable[[bytes], bytes]
 

@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from ipsys_log.log.contents import RawMessage
 
-__all__ = ["Cursor", "PendingChunk", "in_log_order"]
-
 _NEVER = 1 << 64  # ns, later than any log time
 
 

@@ -14,8 +14,6 @@ from ipsys_log.log.hashing import Buffer, extend
 from ipsys_log.log.journal import Storage, replace_tail, roll_back, write_all
 from ipsys_log.plain_text import shell_words
 
-__all__ = ["NewFile", "Output", "PendingAppend", "cannot_write"]
-
 _logger = logging.getLogger(__name__)
 
 

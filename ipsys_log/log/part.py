@@ -20,8 +20,6 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
 from ipsys_log.log.writer import LogWriter
 
-__all__ = ["Choose", "copy_chunk", "copy_messages", "copy_records"]
-
 # From a topic and log times in ns, (n,), to those that are kept, (n,).
 Choose = Callable[[str, NDArray[np.int64]], NDArray[np.bool_]]
 

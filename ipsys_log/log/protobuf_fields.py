@@ -13,8 +13,6 @@ import numpy as np
 
 from ipsys_log.log.bounds import PartCounter
 
-__all__ = ["NS", "fields_of", "fill_proto", "read_proto"]
-
 NS = 1_000_000_000
 _LATEST_NS = 1 << 63
 

@@ -43,8 +43,6 @@ from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
 from ipsys_log.log.summary import NoFooterError
 from ipsys_log.plain_text import shell_words
 
-__all__ = ["LogReader", "stored_hashes"]
-
 _logger = logging.getLogger(__name__)
 
 _ATTEMPTS = 100

@@ -15,30 +15,6 @@ from mcap.opcode import Opcode
 
 from ipsys_log.log.byte_source import LogBytes
 
-__all__ = [
-    "CHUNK_HEAD_SIZE",
-    "DATA_END",
-    "ENTRY",
-    "FOOTER",
-    "HEADER",
-    "HEAD_SIZE",
-    "INDEX_HEAD",
-    "MAGIC",
-    "MESSAGE",
-    "MESSAGE_HEAD_SIZE",
-    "ChunkHead",
-    "ChunkRef",
-    "RecordAt",
-    "chunk_head",
-    "parse",
-    "parse_chunk_head",
-    "parse_chunk_index",
-    "parse_exact",
-    "parse_message_index",
-    "to_bytes",
-    "walk",
-]
-
 MAGIC = b"\x89MCAP0\r\n"
 HEADER = struct.Struct("<BQ")  # opcode, length of the rest
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time

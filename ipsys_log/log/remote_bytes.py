@@ -17,8 +17,6 @@ from ipsys_log.log.bounds import BoundError, ReadLimits
 from ipsys_log.log.location import LogUrl
 from ipsys_log.log.remote_object import RemoteObject, open_object
 
-__all__ = ["RemoteBytes", "RemoteRanges", "join_ranges"]
-
 Range = tuple[int, int]  # start and end, in bytes
 
 _TAIL = 256 << 10  # bytes: the summary of most logs, and the last runs before it

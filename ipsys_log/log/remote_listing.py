@@ -10,8 +10,6 @@ from ipsys_log.errors import UnreadError
 from ipsys_log.log.location import LogState, LogUrl
 from ipsys_log.log.remote_requests import changed_ns_of, open_filesystem, repeat_request, version_of
 
-__all__ = ["list_objects", "list_states"]
-
 _FLAT = ("s3", "s3a", "gs", "gcs")  # stores without folders, whose file systems list by a prefix
 
 

@@ -22,8 +22,6 @@ from ipsys_log.log.remote_requests import (
     version_of,
 )
 
-__all__ = ["RemoteObject", "open_object", "read_state"]
-
 Read = Callable[[int, int], bytes]
 Opened = tuple[Mapping[str, Any], Read]  # the entry of an object, and the function that reads its version
 

@@ -16,17 +16,6 @@ from ipsys_log.log.location import LogUrl
 from ipsys_log.plain_text import plain_text
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "ChangedError",
-    "NoRangesError",
-    "changed_ns_of",
-    "check_protocol",
-    "failure_of",
-    "open_filesystem",
-    "repeat_request",
-    "version_of",
-]
-
 _PAUSES_S = (0.1, 0.4, 1.6, 4.0)
 _SELF_REPEATING = ("s3", "s3a", "gs", "gcs")  # their file systems repeat a request some times themselves
 _LONGEST_REASON = 200

@@ -34,8 +34,6 @@ from ipsys_log.log.lock import open_locked
 from ipsys_log.log.records import MAGIC, MESSAGE, to_bytes, walk
 from ipsys_log.log.summary import Summary, read_intact_summary, tail_bytes
 
-__all__ = ["RepairReport", "repair"]
-
 _BLOCK = 1 << 20
 _IN_MEMORY = 16 << 20  # bytes of saved messages in memory; more go to an unnamed file
 

@@ -17,8 +17,6 @@ from ipsys_log.log.bounds import PartCounter
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["ROS2_MODELS", "ROS2_PAYLOADS", "convert_ros", "read_ros2"]
-
 ROS2_PAYLOADS: dict[str, type] = {
     "sensor_msgs/msg/CameraInfo": CameraCalibration,
     "sensor_msgs/msg/CompressedImage": CompressedImage,

@@ -10,8 +10,6 @@ from ipsys_log.log.chunks import ChunkContents, check_definition, parse_chunk_co
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, RecordAt, parse, parse_chunk_head, walk
 
-__all__ = ["add_record", "count_all", "scan"]
-
 
 def scan(view: LogBytes, data_end: int) -> Contents:
     """Read the heads of all records in the data section, and the contents of chunks if necessary."""

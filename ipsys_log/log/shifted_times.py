@@ -15,8 +15,6 @@ from ipsys_log.log.codec import PAYLOADS, payload_type, proto_class
 from ipsys_log.log.contents import StoredChannel
 from ipsys_log.log.protobuf_fields import NS
 
-__all__ = ["check_shift", "has_times", "shift_time", "shift_times"]
-
 _TIMESTAMP = "google.protobuf.Timestamp"
 _LONG = 16 << 10  # bytes: to parse and serialize a longer message takes longer than to find its time
 _LENGTH_DELIMITED = 2

@@ -9,8 +9,6 @@ from google.protobuf.message import DecodeError
 from ipsys_log.log.codec import PAYLOADS, schema_data
 from ipsys_log.log.contents import Schema
 
-__all__ = ["SchemaDifference", "compare_schema"]
-
 
 class SchemaDifference(NamedTuple):
     """The fields of a stored schema that this version reads differently, and those that it does not know."""

@@ -17,18 +17,6 @@ from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, parse, parse_
 from ipsys_log.log.scan import scan
 from ipsys_log.plain_text import shell_words
 
-__all__ = [
-    "TEMPORARY_TAIL_MARK",
-    "NoFooterError",
-    "Summary",
-    "load_contents",
-    "read_intact_summary",
-    "read_summary",
-    "tail_bytes",
-    "temporary_tail_bytes",
-    "temporary_tail_data_end",
-]
-
 # The record before a temporary tail: a private type, with the offset of the end of the old data.
 TEMPORARY_TAIL_MARK = struct.Struct("<BQ8sQ")
 _LARGEST_GAP = 1 << 20  # bytes: the definitions between two chunks

@@ -34,8 +34,6 @@ from ipsys_log.log.reader import stored_hashes
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, to_bytes
 from ipsys_log.log.summary import tail_bytes, temporary_tail_bytes
 
-__all__ = ["LogWriter"]
-
 LIBRARY = "ipsys 1"  # fixed, so that the same messages give the same bytes
 
 

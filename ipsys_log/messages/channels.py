@@ -25,45 +25,6 @@ from ipsys_log.messages.rig import CameraCalibration, Rig
 from ipsys_log.messages.runs import Run
 from ipsys_log.messages.tracks import FrameTransforms, Positions, Tracks
 
-__all__ = [
-    "ANNOTATIONS",
-    "CALIBRATIONS",
-    "CAMERA_POINTS",
-    "CHANNELS",
-    "CLOCKS",
-    "COMMANDS",
-    "COMMANDS_TOPIC",
-    "CUTS",
-    "EVALUATION",
-    "EVENTS",
-    "EVENTS_TOPIC",
-    "IMAGES",
-    "LATENCY",
-    "LATENCY_TOPIC",
-    "MARKERS",
-    "MEASUREMENTS",
-    "MEASUREMENTS_TOPIC",
-    "MERGES",
-    "MODEL",
-    "PATHS",
-    "PATHS_TOPIC",
-    "POSES",
-    "POSITIONS",
-    "RECORD",
-    "RIG",
-    "RIG_TOPIC",
-    "RUN_EVENTS",
-    "SMOOTHED_TRACKS",
-    "TRACKS",
-    "TRUTH",
-    "TRUTH_TOPIC",
-    "Channel",
-    "calibration_topic",
-    "channel_of",
-    "clock_topic",
-    "image_topic",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Channel:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["ClockEstimate"]
-
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["DRIVING", "FINISHED", "HOLDING", "STOPPED", "RobotPath", "Waypoint", "WheelCommand"]
-
 # The states of a controller: it stands at a waypoint while it is holding, and after the last one when it is
 # finished. It is stopped while it gets no positions.
 DRIVING, HOLDING, STOPPED, FINISHED = "driving", "holding", "stopped", "finished"

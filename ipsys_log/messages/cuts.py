@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["ChannelCut", "Cut"]
-
 
 @dataclass(frozen=True, slots=True)
 class ChannelCut:

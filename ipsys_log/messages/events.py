@@ -6,28 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = [
-    "ASSUMED_MODEL",
-    "CALIBRATION_CONTRADICTED",
-    "CAMERA_MOVED",
-    "CONTRADICTED_HEIGHT",
-    "CONTRADICTIONS",
-    "FRAME_SKIPPED",
-    "MARK",
-    "MIRRORED",
-    "NODE_ANSWERS",
-    "NODE_AWAITED",
-    "NODE_REFUSED",
-    "OPERATOR_KINDS",
-    "OTHER_PRINTS",
-    "SEGMENT_ENDED",
-    "SEGMENT_STARTED",
-    "STAMP_UNRELIABLE",
-    "TILTED_MARKER",
-    "Event",
-    "Latency",
-]
-
 # The kind of an event whose timestamp is the log time of a frame that live processing skipped.
 FRAME_SKIPPED = "frame_skipped"
 # The kind of an event for late frames of a camera; these frames have their time of arrival.

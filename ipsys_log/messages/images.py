@@ -6,18 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = [
-    "Color",
-    "CompressedImage",
-    "CompressedVideo",
-    "ImageAnnotations",
-    "Point2",
-    "PointsAnnotation",
-    "RawImage",
-    "SkippedVideo",
-    "TextAnnotation",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedImage:

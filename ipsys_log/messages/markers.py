@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Corners, Mat33, Mat88, TimeNs, Vec3
 
-__all__ = ["CameraPoint", "CameraPoints", "Marker", "MarkerPose", "Markers"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marker:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["Distance", "Interval", "Measurement", "WorldPoint"]
-
 
 @dataclass(frozen=True, slots=True)
 class Distance:

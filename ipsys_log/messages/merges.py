@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from ipsys_log.messages.cuts import ChannelCut
 from ipsys_log.messages.message import TimeNs
 
-__all__ = ["Merge", "MergedLog"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedLog:

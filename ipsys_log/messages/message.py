@@ -8,19 +8,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Corners",
-    "Encoded",
-    "Floats",
-    "Mat33",
-    "Mat34",
-    "Mat88",
-    "Message",
-    "TimeNs",
-    "Vec3",
-    "kind_of",
-]
-
 TimeNs = Annotated[int, "google.protobuf.Timestamp"]
 Floats = Annotated[NDArray[np.float64], (-1,)]
 Vec3 = Annotated[NDArray[np.float64], (3,)]

@@ -6,20 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, TimeNs, Vec3
 
-__all__ = [
-    "CameraEvaluation",
-    "CameraModel",
-    "ErrorStatistics",
-    "Evaluation",
-    "LearningPoint",
-    "Model",
-    "Noise",
-    "Pair",
-    "Parameter",
-    "Residual",
-    "Suspect",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameter:

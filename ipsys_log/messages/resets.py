@@ -9,8 +9,6 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
-__all__ = ["Resets"]
-
 
 @dataclass(frozen=True, slots=True)
 class Resets:

@@ -6,18 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, Mat34, TimeNs
 
-__all__ = [
-    "CameraCalibration",
-    "Floor",
-    "ReferenceMarker",
-    "ReferencePoint",
-    "Rig",
-    "RigCamera",
-    "RigMarker",
-    "RigNodes",
-    "RigStream",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class RigMarker:

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from ipsys_log.messages.message import Floats, Mat33, TimeNs
 from ipsys_log.messages.rig import Rig
 
-__all__ = ["IMPORTED", "ChannelRead", "ChannelWritten", "Lens", "Run"]
-
 # The stage in the record of a run that was read from files of another program.
 IMPORTED = "import"
 

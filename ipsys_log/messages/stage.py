@@ -11,8 +11,6 @@ from ipsys_log.messages.message import Message
 from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.rig import CameraCalibration, Rig
 
-__all__ = ["Pieces", "Plan", "Progress", "Reports", "Stage", "StageView", "Step", "Timed", "model_read"]
-
 # A step turns a message into payloads; it is called with the messages in log order.
 Step = Callable[[Message], Iterable[Any]]
 # Turns the payloads of a frame of a camera into those that go into the log; called in log order.

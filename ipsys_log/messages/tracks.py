@@ -6,17 +6,6 @@ from dataclasses import dataclass
 
 from ipsys_log.messages.message import Mat33, TimeNs, Vec3
 
-__all__ = [
-    "FrameTransform",
-    "FrameTransforms",
-    "Position",
-    "Positions",
-    "Quaternion",
-    "Track",
-    "Tracks",
-    "Vector3",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
-
-__all__ = ["NeuralNetwork", "column_sigmas", "evaluate_networks", "train_networks"]
 
 
 def column_sigmas(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -27,8 +26,6 @@ def column_sigmas(values: NDArray[np.float64]) -> NDArray[np.float64]:
     level = deviation <= 1e-12 * np.abs(values).max(axis=0)
     return np.where(level, 1.0, deviation)
 
-
-Array = NDArray[np.float64]
 
 _NEURONS = 3
 _RESTARTS = 16

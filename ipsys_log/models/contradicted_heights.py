@@ -7,15 +7,11 @@ from dataclasses import dataclass, field
 from statistics import median
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.messages import Event, Model
 from ipsys_log.messages.events import CONTRADICTED_HEIGHT
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["ContradictedHeights", "HeightSighting"]
-
-Array = NDArray[np.float64]
 
 # A calibration point has its own height, which is not that of a marker on its robot.
 _SAME_POINT_M = 0.05

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.models.rays import CameraRays, directions
-
-__all__ = ["LEAST_NOISE", "HeightCheck", "depth_terms", "fit_depths"]
-
-Array = NDArray[np.float64]
 
 # Prior standard deviation of the terms of the depth correction.
 _TERM_SIGMA = 0.02

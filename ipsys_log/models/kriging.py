@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from scipy.optimize import minimize
@@ -13,12 +12,9 @@ from scipy.stats.qmc import Sobol
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.models.ann import column_sigmas
-
-__all__ = ["Kriging", "fit_correlations"]
-
-Array = NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 # Bounds of the logarithms of theta, for inputs of unit variance, and of the noise, relative to the variance

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-__all__ = ["PolynomialRegression", "regressors"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 
 def regressors(points: Array) -> Array:

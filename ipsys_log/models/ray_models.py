@@ -6,18 +6,14 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import intersect_height
 from ipsys_log.models.depths import LEAST_NOISE, depth_terms, fit_depths
 from ipsys_log.models.rays import CalibrationPoints, CameraRays, directions, fit_rays
-
-__all__ = ["RayDepth", "RayPlane"]
-
-Array = NDArray[np.float64]
 
 
 class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]

@@ -10,15 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import intersect_height
 from ipsys_log.geometry.rotations import skew_matrices
-
-__all__ = ["CalibrationPoints", "CameraRays", "directions", "fit_rays", "group_cameras"]
-
-Array = NDArray[np.float64]
 
 # Errors on the floor above this get less weight: the usual error of a tape.
 _USUAL_M = 0.005

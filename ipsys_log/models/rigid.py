@@ -5,15 +5,11 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
-
-__all__ = ["RigidTransform", "rigid_transform"]
-
-Array = NDArray[np.float64]
 
 
 def rigid_transform(points: Array, targets: Array) -> tuple[Array, Array]:

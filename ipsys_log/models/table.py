@@ -12,32 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraModel
 from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.uncertainty import Uncertainty, Volume
-
-__all__ = [
-    "CORNER_MODELS",
-    "MODELS",
-    "MODEL_PARTS",
-    "AppliedModel",
-    "CalibrationPoints",
-    "ModelPart",
-    "check_name",
-    "create",
-    "fit_cameras",
-    "group_dependent_cameras",
-    "inputs",
-    "is_known",
-    "min_pairs",
-    "needs_height",
-    "parameters",
-    "predict_array",
-    "reads_corners",
-    "reads_height",
-    "restore",
-]
 
 
 def _rigid() -> Any:
@@ -280,9 +259,6 @@ def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
 def _steps(estimator: Any) -> list[tuple[str, Any]]:
     steps = getattr(estimator, "steps", None)  # of a scikit-learn Pipeline
     return [("", estimator)] if steps is None else [(f"{name}.", step) for name, step in steps]
-
-
-Array = NDArray[np.float64]
 
 
 class AppliedModel:

@@ -16,17 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "HEIGHT_SIGMA_M",
-    "Predict",
-    "Uncertainty",
-    "Volume",
-    "estimate_uncertainty",
-    "leverage_terms",
-    "ruler_sigmas",
-]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # World points (n, 3) from camera points (n, 3) and the known heights (n,), for models that use them.
 Predict = Callable[[Array, Array], Array]

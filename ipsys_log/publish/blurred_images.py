@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Grey
 from ipsys_log.errors import IpsysError
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.log.dataset import Session
@@ -20,9 +21,6 @@ from ipsys_log.runs.options import Progress
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.provenance import newest_run
 
-__all__ = ["Corners", "blur_image", "blur_log", "marker_corners"]
-
-Grey = NDArray[np.uint8]
 # By camera and log time in ns of a frame, the corners of each marker in px, (4, 2).
 Corners = Mapping[tuple[str, int], Sequence[NDArray[np.float64]]]
 

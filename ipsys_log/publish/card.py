@@ -13,8 +13,6 @@ from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.plain_text import plain_text
 
-__all__ = ["Card", "card_form", "escape_markdown", "read_card", "write_card_form"]
-
 _LARGEST_FILE = 1 << 20  # bytes
 _LONGEST_TEXT = 20_000
 _MOST_AUTHORS = 100

@@ -14,8 +14,6 @@ from ipsys_log.runs.cut_selection import CutOptions
 from ipsys_log.runs.graph import stage_named
 from ipsys_log.runs.provenance import newest_run
 
-__all__ = ["cut_options", "kept_channels"]
-
 
 def kept_channels(session: Session, without_images: bool) -> set[str]:
     """Return the topics of derived channels that a pack keeps.

@@ -30,8 +30,6 @@ from ipsys_log.publish.members import (
     check_unique,
 )
 
-__all__ = ["PACK_VERSION", "Manifest", "build_manifest", "json_text", "parse_json", "parse_manifest"]
-
 # The version of the layout of packs; it rises when an older ipsys cannot read a newer pack.
 PACK_VERSION = 1
 _VERSION_KEY = "ipsys:packVersion"

@@ -11,24 +11,6 @@ from typing import BinaryIO, NamedTuple
 from ipsys_log.errors import IpsysError
 from ipsys_log.plain_text import plain_text
 
-__all__ = [
-    "CHECKSUMS",
-    "LARGEST_TEXT",
-    "LOGS",
-    "MANIFEST",
-    "MAX_MEMBERS",
-    "README",
-    "RIG_FILE",
-    "SCORES",
-    "Member",
-    "check_member_name",
-    "check_unique",
-    "checksum_lines",
-    "copy_member",
-    "describe_member",
-    "free_member_name",
-]
-
 MANIFEST, CHECKSUMS = "croissant.json", "SHA256SUMS"
 README, RIG_FILE, SCORES, LOGS = "README.md", "lab.toml", "scores.json", "logs"
 

@@ -24,8 +24,6 @@ from ipsys_log.publish.pack_files import PackFiles, open_pack_files, read_errors
 from ipsys_log.publish.scores import StatedScores, parse_scores
 from ipsys_log.units import format_bytes
 
-__all__ = ["OpenedPack", "copy_pack"]
-
 _NAMED = 3  # files that an error names
 
 

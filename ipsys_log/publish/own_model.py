@@ -9,24 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
 from ipsys_log.analysis.calibration_points import find_pairs, held_out_ids, measured
 from ipsys_log.analysis.cross_validation import cross_validate, gather_points, leave_out
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, Evaluation, Model, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, TRUTH
-from ipsys_log.models.table import CalibrationPoints
+from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.publish.scores import Score, score_rows
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.view import LogView
-
-__all__ = ["OwnModel", "load_own_model", "score_own_model"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

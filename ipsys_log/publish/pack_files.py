@@ -17,8 +17,6 @@ from ipsys_log.errors import IpsysError, is_full
 from ipsys_log.publish.members import MANIFEST, MAX_MEMBERS, check_member_name, check_unique
 from ipsys_log.units import format_bytes
 
-__all__ = ["MAX_RATIO", "PackFiles", "open_pack_files", "read_errors"]
-
 # Images and chunks of logs do not compress; texts shrink by a factor of ten.
 MAX_RATIO = 100
 _SMALL = 1 << 16  # a member of this size may have any ratio

@@ -41,8 +41,6 @@ from ipsys_log.runs.cut import cut
 from ipsys_log.runs.options import Progress
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["PackResult", "pack"]
-
 # Times of members in an archive; with the clock of the machine, equal packs would differ.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 

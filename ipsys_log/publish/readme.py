@@ -13,8 +13,6 @@ from ipsys_log.publish.scores import Score
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
-__all__ = ["readme_text"]
-
 _CARD_ROWS: dict[str, Callable[[Card], str]] = {
     "Authors": lambda card: ", ".join(card.authors),
     "Licence": lambda card: card.licence,

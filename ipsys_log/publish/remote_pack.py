@@ -13,8 +13,6 @@ from ipsys_log.passwords import hide_password
 from ipsys_log.plain_text import plain_text
 from ipsys_log.units import format_bytes
 
-__all__ = ["fetch_pack"]
-
 # fsspec has file systems that read other files or combine several; these read one file from a server.
 _SCHEMES = ("http", "https", "s3", "gs", "gcs", "az", "abfs", "abfss")
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")

@@ -20,16 +20,6 @@ from ipsys_log.runs.graph import writer_of, writes
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import fingerprint
 
-__all__ = [
-    "SCORE_FIELDS",
-    "Score",
-    "StatedScores",
-    "compute_scores",
-    "parse_scores",
-    "score_rows",
-    "scores_json",
-]
-
 _MM_PER_M = 1000.0
 # Six decimals of a mm are more than any two environments agree on.
 _DECIMALS = 6

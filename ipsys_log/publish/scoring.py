@@ -22,8 +22,6 @@ from ipsys_log.publish.scores import Score, StatedScores, compute_scores
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.provenance import newest_run
 
-__all__ = ["ScoreComparison", "ScoreResult", "score"]
-
 
 @dataclass(frozen=True, slots=True)
 class ScoreComparison:

@@ -30,15 +30,6 @@ from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
 
-__all__ = [
-    "Accuracy",
-    "accuracy_json",
-    "gather_outliers",
-    "read_accuracy",
-    "read_trajectories",
-    "remaining_json",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:

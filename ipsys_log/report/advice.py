@@ -31,25 +31,6 @@ from ipsys_log.messages import Evaluation, LearningPoint
 from ipsys_log.models.table import is_known, min_pairs, reads_height
 from ipsys_log.units import CM_PER_M
 
-__all__ = [
-    "ALL_MODELS",
-    "GROUPS",
-    "HEIGHT_KNOWN",
-    "HEIGHT_NOTE",
-    "PAPER",
-    "SIMPLE",
-    "Advice",
-    "Choice",
-    "Curve",
-    "CurvePoint",
-    "advise",
-    "camera_curve",
-    "has_published",
-    "label",
-    "mean_curve",
-    "uses_height",
-]
-
 
 class CurvePoint(NamedTuple):
     """A mean error with a number of points per camera; ``std_m`` is its spread over random subsets."""

@@ -11,8 +11,8 @@ import numpy as np
 from ipsys_log.analysis.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.analysis.calibration_points import find_pairs, measured
 from ipsys_log.analysis.coverage import FloorCoverage, MountedCamera, Overlap, cover_floor, find_overlaps
-from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.analysis.stationary import find_stationary
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose
@@ -23,8 +23,6 @@ from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["AlignedLab", "read_alignment"]
 
 Lenses = Mapping[str, CameraCalibration]
 

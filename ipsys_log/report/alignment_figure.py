@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import Alignment
 from ipsys_log.analysis.coverage import FloorCoverage
@@ -23,10 +22,6 @@ from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["draw_alignment"]
-
-Array = NDArray[np.float64]
 
 _DPI = 100
 _FLOOR_IN, _PANEL_IN, _GAP_IN = 5.6, 3.4, 0.55

@@ -14,8 +14,6 @@ from ipsys_log.analysis.coverage import FloorCoverage, Overlap, Patch
 from ipsys_log.report.alignment import AlignedLab
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["advise", "alignment_json", "alignment_table", "coverage_lines"]
-
 _GOOD, _BAD = "green", "red"
 _LEVEL_CM = f"{LEVEL_M * CM_PER_M:g} cm"
 # Smaller turns of a camera are not practical.

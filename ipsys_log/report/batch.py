@@ -15,8 +15,6 @@ from ipsys_log.exchange.parquet_rows import write_rows
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report.tables import name_cell, plain_table
 
-__all__ = ["batch_json", "batch_table", "failure_lines", "write_results"]
-
 # A longer list is counted by state.
 _MOST_LISTED = 20
 _MOST_LINES = 30

@@ -13,8 +13,6 @@ from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.calibration.image_selection import ExcludedSighting
 from ipsys_log.units import MM_PER_M
 
-__all__ = ["calibration_json", "calibration_lines", "calibration_table"]
-
 _SHOWN_DROPPED = 6
 
 

@@ -14,8 +14,6 @@ from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.report.figures import style_axes
 from ipsys_log.report.styles import NOTE, REST, shorten
 
-__all__ = ["calibration_figure"]
-
 # Colours from pale (small error) to dark (large error), readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
 # Length of the arrow of a usual error, as a share of the image's width.

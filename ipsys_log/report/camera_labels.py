@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 
 from ipsys_log.report.styles import shorten
 
-__all__ = ["MOST_IN_LEGEND", "has_legend", "legend_label", "name_cameras"]
-
 # A legend of more cameras covers the map, and so many colours cannot be told apart.
 MOST_IN_LEGEND = 6
 _WHITE = withStroke(linewidth=2.5, foreground="white")

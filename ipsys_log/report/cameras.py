@@ -23,16 +23,6 @@ from ipsys_log.capture.recorded_file import RecordedFile
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
 from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 
-__all__ = [
-    "LiveStatus",
-    "cameras_table",
-    "comparison_json",
-    "comparison_table",
-    "first_difference",
-    "latency_table",
-    "robots_table",
-]
-
 # After this time, the measured growth of a log is better than the estimate.
 _SETTLED_S = 5.0
 # More robots than these do not fit into a window of 24 lines; as many ids of markers fit into a line.

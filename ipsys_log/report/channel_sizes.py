@@ -12,8 +12,6 @@ from ipsys_log.log.channel_sizes import ChannelSize
 from ipsys_log.plain_text import plain_text
 from ipsys_log.units import format_bytes
 
-__all__ = ["sizes_json", "sizes_table"]
-
 _NUMBERS = ("messages", "payload", "in the file", "share")
 
 

@@ -29,17 +29,6 @@ from ipsys_log.runs.states import recorded_stages
 from ipsys_log.survey.from_log import FinishedLog
 from ipsys_log.units import MM_PER_M, NS_PER_S, format_bytes, format_time
 
-__all__ = [
-    "contents_json",
-    "contents_tables",
-    "intervals_json",
-    "intervals_table",
-    "overlap_json",
-    "runs_json",
-    "runs_table",
-    "states_json",
-]
-
 
 def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
     """Return the stationary intervals of a log as plain data; ``time_s`` is from the start of the log."""

@@ -13,8 +13,6 @@ from ipsys_log.report.tables import name_cell, plain_table, wrap_text
 from ipsys_log.survey.drift_reading import DriftReading
 from ipsys_log.units import MM_PER_M, format_time
 
-__all__ = ["drift_json", "drift_lines", "drift_table"]
-
 # A normal distribution has 95 % within this many standard deviations.
 _NORMAL_95 = 1.96
 _SEPARATE = "turn {turn:.2f} ({turn_sigma:.2f}) degrees, shift {shift:.1f} ({shift_sigma:.1f}) mm"

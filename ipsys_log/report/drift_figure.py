@@ -19,8 +19,6 @@ from ipsys_log.report.styles import NOTE, camera_styles, shorten
 from ipsys_log.survey.drift_reading import DriftReading
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
-__all__ = ["draw_drift"]
-
 _NORMAL_95 = 1.96
 # Rows of the legend; further cameras are in further columns.
 _ROWS = 8

@@ -19,8 +19,6 @@ from ipsys_log.messages import ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["count_rows", "draw_errors"]
-
 _TRACKS = "tracks"
 # Instants at which a marker does not have the height that its model takes it to be at.
 _OTHER_HEIGHTS = "other heights"

@@ -15,8 +15,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ipsys_log.report.styles import GRID
 
-__all__ = ["figure_bytes", "png", "scale_logarithmic", "set_ticks", "style_axes", "svg_data_uri"]
-
 _DPI = 150
 # Options that leave out the time of writing.
 _WITHOUT: dict[str, dict[str, object]] = {

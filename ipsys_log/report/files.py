@@ -18,16 +18,6 @@ from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.findings import Findings
 from ipsys_log.units import CM_PER_M
 
-__all__ = [
-    "FIGURE_SUFFIXES",
-    "check_figure_file",
-    "check_file",
-    "check_folder",
-    "cross_validation_csv",
-    "paper_csv",
-    "write_files",
-]
-
 # Names of the methods in Tables I and II of the paper.
 _PAPER_NAMES = {
     "rigid": "RT",

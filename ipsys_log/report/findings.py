@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
 from ipsys_log.analysis.calibration_points import measured, split_ids
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
@@ -27,19 +27,6 @@ from ipsys_log.soundness.clocks import check_clocks
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
-
-__all__ = [
-    "Findings",
-    "PointErrors",
-    "gather_findings",
-    "in_space",
-    "overall_row",
-    "overall_row_with_excluded",
-    "rank",
-    "ranking_errors",
-]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,20 +40,6 @@ from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.units import CM_PER_M
 
-__all__ = [
-    "FloorData",
-    "Square",
-    "arrow_factor",
-    "draw_arrows",
-    "draw_floor",
-    "draw_ground",
-    "draw_key",
-    "draw_session",
-    "read_floor",
-    "show_square",
-    "square_around",
-]
-
 _GRID_M = 0.5
 # The factor of the arrows is so large that most arrows are shorter than this part of the floor.
 _ARROW_SHARE = 0.1

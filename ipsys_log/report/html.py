@@ -32,8 +32,6 @@ from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
 
-__all__ = ["render_report"]
-
 
 def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     """Render the page of a session; the same log always gives the same page.

@@ -37,19 +37,6 @@ from ipsys_log.report.tracks_figure import draw_tracks, read_drawn_tracks
 if TYPE_CHECKING:
     from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 
-__all__ = [
-    "coverage_picture",
-    "joint_pictures",
-    "learning_pictures",
-    "models_pictures",
-    "new_figure",
-    "other_residual_pictures",
-    "picture",
-    "published_pictures",
-    "residual_pictures",
-    "tracks_picture",
-]
-
 _WIDTH_IN = 4.7
 _SPACE = {True: "3D", False: "2D"}
 

@@ -18,8 +18,6 @@ from ipsys_log.report.latency_figure import draw_shares, draw_steps
 from ipsys_log.report.styles import camera_styles, shorten
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
-__all__ = ["recording_values"]
-
 # Number of gaps in the table; the figure shows all of them.
 _MOST_GAPS = 8
 _MS_PER_S = 1e3

@@ -20,20 +20,6 @@ from ipsys_log.report.findings import Findings, overall_row, overall_row_with_ex
 from ipsys_log.report.points_figure import hull_m
 from ipsys_log.units import CM_PER_M, MM_PER_M
 
-__all__ = [
-    "advice_rows",
-    "calibration",
-    "coverage",
-    "flat_rows",
-    "format_cm",
-    "headline",
-    "in_order",
-    "model_rows",
-    "overlap_rows",
-    "overlap_tables",
-    "suspects",
-]
-
 _TRUTH = "truth"
 # The page shows so many pairs of cameras, those that differ most; a folded table has all pairs.
 _MOST_PAIRS = 10

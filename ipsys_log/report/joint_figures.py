@@ -11,7 +11,6 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 from ipsys_log.messages import Rig
@@ -19,17 +18,6 @@ from ipsys_log.report.camera_labels import has_legend, name_cameras
 from ipsys_log.report.figures import style_axes
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
-
-__all__ = [
-    "clocks_figure",
-    "first_residuals",
-    "has_clocks",
-    "poses_figure",
-    "residual_limit_px",
-    "residuals_figure",
-]
-
-Array = NDArray[np.float64]
 
 _MM_PER_M = 1000.0
 _MS_PER_S = 1000.0

@@ -21,8 +21,6 @@ from ipsys_log.report.styles import NOTE, REST, shorten
 from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.units import MM_PER_M
 
-__all__ = ["draw_lab"]
-
 # Colours from pale (small error) to dark, as in the figure of a plan.
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])
 _LEFT_IN, _BOTTOM_IN = 0.7, 0.95

@@ -12,8 +12,6 @@ from ipsys_log.analysis.expected_error import FloorGap
 from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.units import CM_PER_M, MM_PER_M
 
-__all__ = ["lab_advice", "lab_headline", "lab_json", "lab_table"]
-
 _MOST_FAULTS = 8
 
 

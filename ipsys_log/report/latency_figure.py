@@ -14,8 +14,6 @@ from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE
 
-__all__ = ["draw_latency", "draw_shares", "draw_steps"]
-
 _STEPS = ("detected", "located", "fused", "published")
 _NEAR, _FAR = "#0072B2", "#D3D7DB"
 # The axis ends at this many times the 99th percentile. A few late positions would make it too long.

@@ -25,17 +25,6 @@ from ipsys_log.report.findings import Findings
 from ipsys_log.report.styles import NOTE, ModelStyle, model_styles, shorten
 from ipsys_log.units import CM_PER_M
 
-__all__ = [
-    "Curves",
-    "camera_curves",
-    "curves_picture",
-    "draw_curves",
-    "learning_figure",
-    "limits_cm",
-    "mean_curves",
-    "published_figure",
-]
-
 Curves = Mapping[str, Curve]
 
 # Above this ratio of the largest mean to the smallest, the scale is logarithmic to show small values.

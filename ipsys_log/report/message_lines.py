@@ -16,8 +16,6 @@ from ipsys_log.messages import Message
 from ipsys_log.plain_text import plain_text
 from ipsys_log.units import format_time
 
-__all__ = ["message_json", "message_line"]
-
 _LONGEST_VALUE = 200
 _TIME = "timestamp"  # every payload repeats its publish time
 

@@ -16,8 +16,6 @@ from ipsys_log.report.html_figures import new_figure, picture
 from ipsys_log.report.styles import robot_colour, shorten
 from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 
-__all__ = ["overlap_pictures"]
-
 _CELL_M = 0.25
 # Lines of more pairs cannot be told apart.
 _MOST_PAIRS = 6

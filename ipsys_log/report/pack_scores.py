@@ -19,8 +19,6 @@ from ipsys_log.report.advice import HEIGHT_NOTE, label, uses_height
 from ipsys_log.report.tables import name_cell, plain_table, wrap_text
 from ipsys_log.units import format_bytes
 
-__all__ = ["pack_text", "ranked_scores", "score_answer", "score_json", "score_tables"]
-
 _HEADS = ("mean", "median", "p95", "RMSE")
 _NAMED = 3  # differences that the answer names
 

@@ -13,8 +13,8 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.quiver import Quiver
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report import joint_figures
@@ -36,22 +36,6 @@ from ipsys_log.report.learning_figure import learning_figure, mean_curves, publi
 from ipsys_log.report.points_figure import draw_hulls, places_figure
 from ipsys_log.report.styles import NOTE, model_styles
 from ipsys_log.units import CM_PER_M
-
-__all__ = [
-    "HELD_OUT",
-    "ResidualScale",
-    "draw_models",
-    "draw_residuals",
-    "models_figure",
-    "models_note",
-    "residual_scale",
-    "residuals_figure",
-    "shown_models",
-    "write_plots",
-]
-
-Array = NDArray[np.float64]
-
 
 # Colours from pale (small error) to dark (large error), readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))

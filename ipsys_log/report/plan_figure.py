@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ipsys_log.analysis.drive_plan import PlannedDrive
+from ipsys_log.arrays import Array
 from ipsys_log.report.camera_labels import legend_label, name_cameras
 from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
@@ -22,10 +22,6 @@ from ipsys_log.report.styles import NOTE, REST, camera_styles
 from ipsys_log.report.tables import means_cm
 from ipsys_log.survey.floor_plan import PlannedFloor, mesh
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["draw_plan"]
-
-Array = NDArray[np.float64]
 
 # Colours from pale (small error) to dark. They differ from the camera colours, and are distinct in grey too.
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])

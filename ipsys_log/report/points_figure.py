@@ -9,17 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from ipsys_log.arrays import Array
 from ipsys_log.report.camera_labels import has_legend, legend_label, name_cameras
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, REST, TEST, camera_styles, shorten
-
-__all__ = ["draw_coverage", "draw_hulls", "hull_m", "places_figure"]
-
-Array = NDArray[np.float64]
 
 
 def places_figure(findings: Findings) -> Figure:

@@ -16,8 +16,6 @@ from matplotlib.path import Path as Outline
 from ipsys_log.errors import IpsysError
 from ipsys_log.report.prints import Print
 
-__all__ = ["PAPERS", "RULER_MM", "Page", "Paper", "Placed", "choose_paper", "draw_pages", "lay_out"]
-
 MM_PER_INCH = 25.4
 # Printers leave this much of the paper's edge white.
 _EDGE_MM = 10.0

@@ -7,17 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.board import Board, black_squares, board_markers
 from ipsys_log.geometry.marker_cells import cell_outlines
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.messages import Rig
 from ipsys_log.units import MM_PER_M
-
-__all__ = ["Print", "board_print", "marker_print", "rig_prints"]
-
-Array = NDArray[np.float64]
 
 # White margin around a chessboard or a ChArUco board, in squares; white margin around a marker, in cells.
 _BOARD_MARGIN, _MARKER_MARGIN = 0.5, 1.0

@@ -13,8 +13,6 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import RepairReport
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
-__all__ = ["repair_lines"]
-
 # A recorder flushes its messages at least once in this time.
 _FLUSH_NS = NS_PER_S
 # If a file was written this long after its last message, it was copied later, or recorded by another clock.

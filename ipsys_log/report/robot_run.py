@@ -16,8 +16,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ErrorStatistics
 from ipsys_log.units import CM_PER_M, NS_PER_S
 
-__all__ = ["render_robot_run", "robot_run_json", "robot_run_tables", "stop_line"]
-
 # The panels hold photographs: more pixels would only make the page larger.
 _PANELS_DPI = 110
 

@@ -20,8 +20,6 @@ from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, TEST, robot_colour, shorten
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["draw_drive", "draw_panels", "draw_paths"]
-
 Image = NDArray[np.uint8]
 
 _WIDTH_PX = 640

@@ -10,8 +10,6 @@ from ipsys_log.plain_text import plain_text
 from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
 from ipsys_log.units import format_time
 
-__all__ = ["check_json", "check_lines"]
-
 _MOST_LINES = 30
 
 

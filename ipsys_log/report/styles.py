@@ -11,20 +11,6 @@ from typing import Any, NamedTuple
 from ipsys_log.plain_text import plain_text
 from ipsys_log.sinks.colours import assign_colours
 
-__all__ = [
-    "GRID",
-    "NOTE",
-    "REST",
-    "TEST",
-    "ModelStyle",
-    "camera_styles",
-    "model_styles",
-    "robot_colour",
-    "robot_line",
-    "shorten",
-    "to_rgb",
-]
-
 _LONGEST = 24
 # A camera with the name of a colour gets a similar colour that is easy to see.
 _NAMED = {"red": "#D55E00", "white": "#8C8C8C", "black": "#000000", "blue": "#0072B2", "green": "#009E73"}

@@ -22,8 +22,6 @@ from ipsys_log.report.trajectory_table import trajectory_lines
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["answer_json", "answer_text", "models_table"]
-
 # Number of outliers with an explanation in the answer; the other outliers are only named.
 _EXPLAINED = 3
 _TRUTH = "truth"

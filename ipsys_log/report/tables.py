@@ -19,8 +19,6 @@ from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import GROUPS, HEIGHT_NOTE, Advice, Choice, advise, label, uses_height
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["accuracy_tables", "format_interval", "means_cm", "name_cell", "plain_table", "wrap_text"]
-
 _WIDTH = 80
 
 

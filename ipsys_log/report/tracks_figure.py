@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.ellipses import covariance_ellipse, enlargement
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Track
@@ -19,10 +19,6 @@ from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import robot_colour, robot_line, shorten
-
-__all__ = ["DrawnTrack", "draw_tracks", "plot_tracks", "read_drawn_tracks"]
-
-Array = NDArray[np.float64]
 
 # Breaks of a line: a longer step or gap than this.
 _STEP_M, _GAP_NS = 0.5, 200_000_000

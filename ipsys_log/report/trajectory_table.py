@@ -12,8 +12,6 @@ from ipsys_log.report.advice import label
 from ipsys_log.report.tables import name_cell, plain_table
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["TRAJECTORY_COLUMNS", "rows_of_run", "trajectory_lines", "trajectory_rows", "trajectory_table"]
-
 TRAJECTORY_COLUMNS = (
     *("n", "ATE RMSE", "mean", "median", "std", "p95", "max"),
     *(f"RPE {delta:g} {unit}" for delta, unit in DELTAS),

@@ -12,8 +12,6 @@ from ipsys_log.exchange.import_truth import ImportedTruth
 from ipsys_log.report.tables import wrap_text
 from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 
-__all__ = ["truth_json", "truth_lines"]
-
 _MS_PER_S = 1000.0
 
 

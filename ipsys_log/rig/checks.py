@@ -9,8 +9,6 @@ from typing import NamedTuple
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig
 
-__all__ = ["check_units", "dictionary_size"]
-
 
 class _Kind(NamedTuple):
     """The unit and the plausible range of a value, and the units that users confuse with it, as factors."""

@@ -9,8 +9,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig
 from ipsys_log.plain_text import shell_words
 
-__all__ = ["combine_rigs"]
-
 # These fields describe the computer of a recorder, and not the lab: those of the first rig count.
 _OF_COMPUTER = frozenset(("source", "calibration", "stream"))
 # Entries with one of these names and the same value there describe the same thing.

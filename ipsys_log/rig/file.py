@@ -28,19 +28,6 @@ from ipsys_log.passwords import hide_password
 from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.checks import check_units
 
-__all__ = [
-    "STAMPS",
-    "check_name",
-    "check_rig",
-    "check_rig_cameras",
-    "check_robots",
-    "example_toml",
-    "hide_passwords",
-    "load_rig",
-    "rig_toml",
-    "toml_rows",
-]
-
 Item = TypeVar("Item")
 
 # Markers are below the cameras. A greater height is in cm.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from threadpoolctl import threadpool_limits
 
-__all__ = ["one_blas_thread"]
-
 
 def one_blas_thread() -> threadpool_limits:
     """Limit BLAS to one thread for a ``with`` block.

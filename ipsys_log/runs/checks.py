@@ -44,8 +44,6 @@ from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.stages.detect import usual_corners
 from ipsys_log.units import format_time
 
-__all__ = ["check_earlier_runs", "check_inputs", "describe_changed_images", "image_sizes"]
-
 # Most messages of a channel that the checks read. Some recorders write a calibration with each frame, so that
 # all of them are spread over the whole log.
 _CHECKED_MESSAGES = 100

@@ -17,8 +17,6 @@ from ipsys_log.runs.options import Progress
 from ipsys_log.runs.output import check_copy, create_copy
 from ipsys_log.runs.superseded import SupersededRun, superseded_runs
 
-__all__ = ["DroppedRun", "compact", "dropped_runs"]
-
 _STEP = "compact"
 _BYTES_PER_STEP = 1_000_000
 

@@ -15,8 +15,6 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import complete_runs, replaced_lenses
 from ipsys_log.runs.states import is_fitted_here
 
-__all__ = ["continue_newest"]
-
 
 def continue_newest(request: Request, paths: Sequence[LogLocation], until: Stage) -> Request:
     """Return the request with the model and the settings of the newest run, if the user selects no model.

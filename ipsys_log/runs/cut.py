@@ -22,8 +22,6 @@ from ipsys_log.runs.cut_selection import CutOptions, Selection, select
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.output import check_copy, create_copy, write_message
 
-__all__ = ["CutResult", "cut"]
-
 _STEP = "cut"
 _BYTES_PER_STEP = 1_000_000
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.differences import marker_ids
+from ipsys_log.arrays import Times
 from ipsys_log.errors import IpsysError
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
@@ -21,10 +22,6 @@ from ipsys_log.messages import CompressedVideo
 from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, MERGES, POSITIONS, RECORD, RIG
 from ipsys_log.runs.provenance import newest_run, with_inputs
 from ipsys_log.units import NS_PER_S, format_time
-
-__all__ = ["CutOptions", "Selection", "select"]
-
-Times = NDArray[np.int64]
 
 _MOST_NAMES = 12
 # The channels that tell which robots a frame shows; the first one in the log counts.

@@ -33,19 +33,6 @@ from ipsys_log.runs.states import Recorded, recorded_stages
 from ipsys_log.runs.stream import WiredStage, in_threads, run, wire
 from ipsys_log.units import format_time
 
-__all__ = [
-    "LiveRun",
-    "OtherContentError",
-    "compute_messages",
-    "copy_messages",
-    "find_unfinished",
-    "has_given_name",
-    "missing_messages",
-    "record_of",
-    "run_stage",
-    "sign",
-]
-
 
 class OtherContentError(Exception):
     """The error of a run that contains a message that its stage does not make from the log."""

@@ -15,8 +15,6 @@ from ipsys_log.messages import Run
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.runs.provenance import complete_runs
 
-__all__ = ["channel_times"]
-
 
 def channel_times(session: Session, topic: str) -> NDArray[np.int64]:
     """Return the log times of the messages of a topic in ns, sorted, shape (N,).

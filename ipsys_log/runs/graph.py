@@ -22,23 +22,6 @@ from ipsys_log.runs.select import fitted_in
 from ipsys_log.runs.view import LogView
 from ipsys_log.stages import ENTRIES, fit, load_stage
 
-__all__ = [
-    "STAGES",
-    "VERSIONS",
-    "Task",
-    "copy_model",
-    "input_runs",
-    "is_of_model",
-    "method_of",
-    "plan_stage",
-    "stage_named",
-    "stages_until",
-    "version_parameters",
-    "versioned_names",
-    "writer_of",
-    "writes",
-]
-
 STAGES: tuple[Stage, ...] = tuple(load_stage(entry.name) for entry in ENTRIES)
 VERSIONS: dict[str, int] = {name: number for stage in STAGES for name, number in stage.versions.items()}
 

@@ -23,8 +23,6 @@ from ipsys_log.stages.detect import skipped_frames
 if TYPE_CHECKING:
     from ipsys_log.runs.graph import Task
 
-__all__ = ["first_settings", "given_settings", "inputs", "leaves_out_frames", "left_out_frames"]
-
 
 def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
     """Yield the input of a causal stage: settings before the first frame, then its channels in log order."""

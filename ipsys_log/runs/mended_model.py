@@ -18,8 +18,6 @@ from ipsys_log.runs.graph import version_parameters, writer_of
 from ipsys_log.runs.output import append_run
 from ipsys_log.runs.provenance import complete_runs, fingerprint, free_name, newest_run, read_channels
 
-__all__ = ["append_mended_model", "find_model"]
-
 # Parameters of the record of a mended model: its cameras, the log of the baseline, and its first valid time.
 _MOST_DIGITS = 19
 _MENDED, _BASELINE, _VALID_FROM = "mended", "baseline", "valid_from_ns"

@@ -22,8 +22,6 @@ from ipsys_log.runs.merge_plan import LogOffset, MergePlan, check_logs_differ, p
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.output import check_copy, create_copy, write_message
 
-__all__ = ["MergeResult", "merge", "open_logs"]
-
 _STEP = "merge"
 _MESSAGES_PER_STEP = 1_000
 

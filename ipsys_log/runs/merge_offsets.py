@@ -22,8 +22,6 @@ from ipsys_log.runs.options import Progress
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["choose_offsets"]
-
 _STEP = "clocks"
 _LARGEST_S = 1_000_000_000
 

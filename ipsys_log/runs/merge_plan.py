@@ -22,8 +22,6 @@ from ipsys_log.rig.combination import combine_rigs
 from ipsys_log.runs.origins import own_inputs
 from ipsys_log.runs.renaming import rename_channels, rename_frames, rename_record, rename_topic
 
-__all__ = ["LogOffset", "MergePlan", "check_logs_differ", "plan_merge"]
-
 
 class LogOffset(NamedTuple):
     """The offset of a log in ns, and the standard deviation of an estimate in s; None if it was given."""

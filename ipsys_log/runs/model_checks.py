@@ -29,15 +29,6 @@ from ipsys_log.runs.view import LogView
 from ipsys_log.stages.evaluate import can_evaluate
 from ipsys_log.stages.fit import BESIDE_LINE_M, check_different, check_pairs
 
-__all__ = [
-    "check_evaluated",
-    "check_evaluation",
-    "check_fits",
-    "check_heights",
-    "check_measurements",
-    "check_models",
-]
-
 
 def check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
     """Check that the measurements are valid, and enough to fit the models.

@@ -26,8 +26,6 @@ from ipsys_log.runs.inputs import first_settings, leaves_out_frames
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.stream import Route, derive, reader_of, wire
 
-__all__ = ["OnePass"]
-
 # Results of one stage in memory, in bytes; more go to the disk.
 _IN_MEMORY = 32 << 20
 _SIZE_BYTES = 4  # of the length before each result

@@ -10,8 +10,6 @@ from ipsys_log.messages import CameraCalibration, Rig
 from ipsys_log.stages.camera_frame import PERIMETER, check_method
 from ipsys_log.stages.detect import check_corners
 
-__all__ = ["Progress", "Request"]
-
 # Called with the stage, the number of messages done, and the number of all messages, if it is known.
 Progress = Callable[[str, int, int | None], None]
 

@@ -10,20 +10,6 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import ChannelCut, ChannelRead, MergedLog, Run
 from ipsys_log.messages.channels import Channel
 
-__all__ = [
-    "Origin",
-    "cut_topics",
-    "has_result",
-    "is_cut",
-    "is_whole",
-    "left_out",
-    "origin_of_run",
-    "own_inputs",
-    "present_inputs",
-    "shift_of_run",
-    "was_complete",
-]
-
 
 class Origin(NamedTuple):
     """A channel before a cut, or before a merge: the number of its messages, their hash, and its logs.

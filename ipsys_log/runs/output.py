@@ -23,23 +23,6 @@ from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelWritten, Message, Rig, Run, kind_of
 from ipsys_log.rig.file import hide_passwords
 
-__all__ = [
-    "append_messages",
-    "append_run",
-    "check_copy",
-    "check_source",
-    "choose_target",
-    "create_copy",
-    "derived_log_of",
-    "logs_with_results",
-    "open_target",
-    "record_message",
-    "serialize",
-    "write_log",
-    "write_message",
-    "write_messages",
-]
-
 
 def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, int]:
     """Write messages to an open log; return the number of messages by topic."""

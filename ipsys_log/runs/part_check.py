@@ -15,8 +15,6 @@ from ipsys_log.runs.options import Progress
 from ipsys_log.runs.origins import cut_topics, left_out
 from ipsys_log.runs.view import LogView
 
-__all__ = ["compare_with_cut", "repeatable_topics"]
-
 _STEP = "channels"
 
 

@@ -17,8 +17,6 @@ from ipsys_log.log.codec import PAYLOADS, decode, encode, payload_type, schema_n
 from ipsys_log.messages import Encoded, kind_of
 from ipsys_log.runs.pieces import FrameResult, PieceResult, stays_encoded
 
-__all__ = ["from_bytes", "to_bytes"]
-
 _MAGIC = b"ipsys piece 1\n"
 _HASH_BYTES = 16
 _LENGTH = struct.Struct("<Q")

@@ -21,15 +21,6 @@ from ipsys_log.runs.piece_file import from_bytes, to_bytes
 from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun, check_versions, compute_piece
 from ipsys_log.runs.provenance import fingerprint
 
-__all__ = [
-    "OtherSoftwareError",
-    "PieceFolder",
-    "PieceTask",
-    "PiecesMissingError",
-    "StoredPieces",
-    "store_piece",
-]
-
 _COMPLETE, _PARTIAL = ".piece", ".partial"
 
 

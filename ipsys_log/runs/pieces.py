@@ -38,25 +38,6 @@ from ipsys_log.stages import load_stage
 if TYPE_CHECKING:
     from ipsys_log.runs.graph import Task
 
-__all__ = [
-    "DividedRun",
-    "FrameResult",
-    "Piece",
-    "PieceFrames",
-    "PiecePlan",
-    "PieceResult",
-    "PieceRun",
-    "PieceWorkers",
-    "check_versions",
-    "compute_piece",
-    "divide_run",
-    "merge_pieces",
-    "order_frames",
-    "plan_pieces",
-    "split_frames",
-    "stays_encoded",
-]
-
 # A smaller run is done before workers have started, and opened the log.
 _MIN_FRAMES = 1_000
 _MIN_PIECES = 4

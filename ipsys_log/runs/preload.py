@@ -12,8 +12,6 @@ from threading import Thread
 from ipsys_log.messages import Message
 from ipsys_log.models.table import create
 
-__all__ = ["preload"]
-
 
 def preload(messages: Iterable[Message], models: Sequence[str]) -> Iterator[Message]:
     """Yield the messages of a stage, and load the libraries of models meanwhile.

@@ -22,23 +22,6 @@ from ipsys_log.messages import IMPORTED, CameraCalibration, ChannelRead, Run
 from ipsys_log.messages.channels import MARKERS, Channel
 from ipsys_log.runs.origins import has_result, present_inputs, was_complete
 
-__all__ = [
-    "NODE_FORMAT",
-    "Outcome",
-    "check_run_name",
-    "complete_runs",
-    "find_run",
-    "fingerprint",
-    "free_name",
-    "imported_inputs",
-    "is_complete",
-    "newest_run",
-    "read_channels",
-    "recorded_version",
-    "replaced_lenses",
-    "with_inputs",
-]
-
 # The parameter ``format`` of the record of markers that nodes have sent.
 NODE_FORMAT = "node"
 _MOST_DIGITS = 6

@@ -16,8 +16,6 @@ from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.units import format_time
 
-__all__ = ["Remarks"]
-
 
 class Remarks:
     """Collector of remarks; it sees all messages of a stage on their way into the log."""

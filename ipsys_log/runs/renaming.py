@@ -9,9 +9,6 @@ from typing import Any, TypeVar
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import Cut, FrameTransforms, MergedLog, Run
 
-__all__ = ["rename_channels", "rename_frames", "rename_record", "rename_topic"]
-
-
 Origins = TypeVar("Origins", Cut, MergedLog)
 
 

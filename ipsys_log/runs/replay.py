@@ -25,8 +25,6 @@ from ipsys_log.runs.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.runs.preload import preload
 from ipsys_log.runs.provenance import Outcome, imported_inputs
 
-__all__ = ["Replay"]
-
 
 @dataclass(slots=True, eq=False)
 class Replay:

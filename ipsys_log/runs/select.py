@@ -20,18 +20,6 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import complete_runs, newest_run
 from ipsys_log.runs.view import LogView
 
-__all__ = [
-    "LEAST_OFFSET_PX",
-    "MIN_OFFSETS",
-    "copied_run",
-    "evaluated_models",
-    "fitted_in",
-    "has_corners",
-    "rig_with_offsets",
-    "wanted_models",
-]
-
-
 # The median edge offset of a camera needs 10 markers; an offset below 0.05 px counts as zero.
 MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 

@@ -13,8 +13,6 @@ from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
 from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run
 from ipsys_log.runs.provenance import is_complete, recorded_version
 
-__all__ = ["CURRENT", "Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
-
 CURRENT = "current"
 # The record of a model that was fitted to measurements of the same log has one of these parameters.
 _FITTED_HERE = frozenset(("train", "seed"))

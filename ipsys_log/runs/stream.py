@@ -17,8 +17,6 @@ from ipsys_log.messages import FrameTransforms, Message, kind_of
 from ipsys_log.messages.channels import Channel, channel_of
 from ipsys_log.messages.stage import Stage, Step
 
-__all__ = ["Route", "WiredStage", "derive", "in_threads", "reader_of", "run", "wire"]
-
 Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
 

@@ -15,8 +15,6 @@ from ipsys_log.runs.origins import own_inputs
 from ipsys_log.runs.provenance import is_complete, recorded_version, with_inputs
 from ipsys_log.runs.states import CURRENT, Recorded, recorded_stages
 
-__all__ = ["SupersededRun", "outdated_runs", "superseded_runs"]
-
 # The number that a new run gets if the name of its branch is taken: poly, poly_2, poly_3.
 _NUMBER = re.compile(r"_[0-9]+$")
 

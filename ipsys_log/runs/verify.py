@@ -35,8 +35,6 @@ from ipsys_log.runs.provenance import replaced_lenses
 from ipsys_log.runs.renaming import rename_frames, rename_topic
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 
-__all__ = ["diff", "explain_diff", "verify"]
-
 # Channels with a message for each image.
 _MOVING = (MARKERS, CAMERA_POINTS, POSITIONS, TRACKS)
 

@@ -11,8 +11,6 @@ from ipsys_log.messages import CameraCalibration, Message, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, IMAGES, RIG, Channel
 from ipsys_log.runs.provenance import complete_runs, newest_run
 
-__all__ = ["LogView"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogView:

@@ -20,8 +20,6 @@ from ipsys_log.interrupts import undivided
 from ipsys_log.piped_process import PipedProcess, parent_pipe
 from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
-__all__ = ["LocalWorkers", "available_cores", "check_jobs", "serve"]
-
 # Number of pieces for each worker that may be finished before the pieces in front of them.
 _AHEAD = 2
 # The size of a piece's number in the common pipe. A system call reads or writes such a number completely.

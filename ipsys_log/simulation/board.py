@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.calibration.board import Board, black_squares, board_markers
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
@@ -13,10 +14,6 @@ from ipsys_log.geometry.markers import white_cells
 from ipsys_log.geometry.poses import invert_pose, make_pose, rotation
 from ipsys_log.simulation.cameras import Camera, sees
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
-
-__all__ = ["POSES", "board_cells", "board_poses"]
-
-Array = NDArray[np.float64]
 
 # Positions in the image, as shares of it, from left to right and from top to bottom; each twice.
 _COLUMNS, _ROWS = np.linspace(0.08, 0.92, 5), np.linspace(0.08, 0.92, 3)

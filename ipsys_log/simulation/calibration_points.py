@@ -8,28 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.marker_cells import PlacedMarker, black_cells, print_outline
 from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation
 from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
 from ipsys_log.simulation.cameras import Camera, sees
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
-
-__all__ = [
-    "REFERENCES",
-    "SimulatedPose",
-    "cameras_seeing",
-    "choose_place",
-    "measure",
-    "overlap",
-    "place_marker",
-    "plan_points",
-    "reference_points",
-    "split",
-    "tape_lengths_m",
-]
-
-Array = NDArray[np.float64]
 
 REFERENCES = (ReferencePoint("A", 1.2192, 2.4384), ReferencePoint("B", 3.6576, 2.4384))
 _DRAWS = 4000

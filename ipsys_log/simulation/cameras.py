@@ -7,15 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
-
-__all__ = ["FLOOR_M", "Camera", "aim_cameras", "mount_cameras", "sees"]
-
-Array = NDArray[np.float64]
 
 # Distance of the outermost cameras from the wall. With three cameras, the distance between two is 1.59 m.
 _FROM_WALL_M = 0.85

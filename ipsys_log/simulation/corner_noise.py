@@ -11,13 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.markers import marker_corners, pixel_slopes
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.settings import LabSettings
-
-__all__ = ["REPEATABLE_SHARE", "WHITE_SHARE", "corner_covariances", "draw_corner_noise", "edge_sigma_px"]
-
-Array = NDArray[np.float64]
 
 # Squared errors of rendered corners in units of the stated covariance: the part that is new in each frame,
 # and the part that all frames of a stationary marker share.

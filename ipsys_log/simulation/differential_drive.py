@@ -10,8 +10,6 @@ import numpy as np
 
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["STEP_NS", "Chassis", "DifferentialDrive", "Pose2d"]
-
 # Time between two steps of the motion.
 STEP_NS = NS_PER_S // 200
 # Duration of the remembered poses: a camera asks for poses of the past.

@@ -9,17 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.simulation.calibration_points import SimulatedPose, overlap
 from ipsys_log.simulation.cameras import Camera
 from ipsys_log.simulation.drive_paths import DrivePath, choose_path
 from ipsys_log.simulation.pace import Pace
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
-
-__all__ = ["Drive", "plan_drive"]
-
-Array = NDArray[np.float64]
 
 # Time constant of the acceleration of a robot.
 _START_S = 0.4

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 
-__all__ = ["DrivePath", "LanePath", "StarPath", "choose_path"]
-
-Array = NDArray[np.float64]
 # Points (x, y) in m at angles of a path, and their derivatives by the angle.
 Points = tuple[tuple[Array, Array], tuple[Array, Array]]
 

@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.cameras import Camera
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 
-__all__ = ["FIELD_PX", "Check", "FloorView", "lay_floor", "pixel_rays", "prepare_view", "to_light"]
-
-Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
 # A callback between two steps of long work; its exceptions end the work.
 Check = Callable[[], None]

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import transform
@@ -20,17 +20,6 @@ from ipsys_log.simulation.geometric_points import choose_points
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.simulation.smooth_fields import SmoothField, SmoothSignal
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "INTRINSICS",
-    "GeometricLab",
-    "GeometricSettings",
-    "IntrinsicsSigma",
-    "PlacedMarkers",
-    "build_lab",
-]
-
-Array = NDArray[np.float64]
 
 # Kinds of intrinsics that the user has.
 INTRINSICS = ("true", "calibrated", "nominal")

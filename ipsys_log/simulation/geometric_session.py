@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Times
 from ipsys_log.messages import (
     IMPORTED,
     MEASUREMENTS_TOPIC,
@@ -39,11 +39,6 @@ from ipsys_log.simulation.geometric_sightings import (
 )
 from ipsys_log.simulation.lab import EPOCH_NS, ROBOT_HEIGHT_SIGMA_M, build_rig
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["MARKERS_RUN", "geometric_rig", "simulate_session"]
-
-Array = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 MARKERS_RUN = "geometric"
 # From the end of a frame to its arrival, and from the last frame at a point to the end of its measurement.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Times
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import transform
 from ipsys_log.simulation.calibration_points import SimulatedPose
@@ -18,18 +19,6 @@ from ipsys_log.simulation.geometric_lab import GeometricLab, PlacedMarkers, came
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "CameraSightings",
-    "drive_times_ns",
-    "pose_array",
-    "simulate_sightings",
-    "start_ns",
-    "still_times_ns",
-]
-
-Array = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 # Pause of the recording, for the transport of the markers to their next calibration points.
 _PAUSE_NS = 3 * NS_PER_S

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
@@ -32,18 +32,6 @@ from ipsys_log.simulation.geometric_session import MARKERS_RUN, geometric_rig
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "FIRST_REFERENCE",
-    "Knock",
-    "WeekSettings",
-    "knock_camera",
-    "reference_rig",
-    "simulate_week",
-    "week_start_ns",
-]
-
-Array = NDArray[np.float64]
 
 # The id of the first reference marker.
 FIRST_REFERENCE = 90

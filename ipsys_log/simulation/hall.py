@@ -9,8 +9,6 @@ from typing import Any
 from ipsys_log.errors import IpsysError
 from ipsys_log.simulation.settings import LabSettings
 
-__all__ = ["grid_names", "hall_settings", "parse_grid"]
-
 _MOST = 12
 # The cameras of a hall are higher than those of the lab, so that fields of view overlap on all sides.
 _MOUNT_HEIGHT_M = 5.0

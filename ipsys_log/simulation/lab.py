@@ -41,8 +41,6 @@ from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["EPOCH_NS", "ROBOT_HEIGHT_SIGMA_M", "build_rig", "drive_start_ns", "moving_marker", "simulate"]
-
 # Start of the simulated clock: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
 # The heights of the robots are exact; a standard deviation must be above 0.

@@ -35,19 +35,6 @@ from ipsys_log.simulation.render import Print, add_static_prints, encode_jpeg, r
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.units import CM_PER_M
 
-__all__ = [
-    "LIVE_SETTINGS",
-    "Film",
-    "LiveLab",
-    "board_film",
-    "image_index",
-    "lab_film",
-    "live_rig",
-    "next_missing",
-    "plan_live_lab",
-    "tape_sheet",
-]
-
 # A laptop with two cores can draw this lab and track in it. Three cameras send 2.5 MB per second.
 LIVE_SETTINGS = LabSettings(
     width=1280, height=720, rate_hz=10.0, stations=18, drive_s=4.0, noise_sigma=1.0, jpeg_quality=80

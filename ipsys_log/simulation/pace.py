@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["Pace", "Stops", "draw_pace"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.marker_cells import (
     MovingMarker,
@@ -33,10 +34,6 @@ from ipsys_log.geometry.poses import transform
 from ipsys_log.simulation.floor import FloorView
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["Box", "Shares", "exposure_interval", "find_shares", "row_shares", "sample_times"]
-
-Array = NDArray[np.float64]
 
 # Largest motion of a print between two instants without motion blur.
 _STEP_PX = 0.125

@@ -18,8 +18,6 @@ from ipsys_log.simulation.floor import FIELD_PX, FloorView, to_light
 from ipsys_log.simulation.pixel_shares import Box, find_shares
 from ipsys_log.simulation.settings import LabSettings
 
-__all__ = ["Print", "add_static_prints", "encode_jpeg", "expose", "render"]
-
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]
 # Objects in an image.

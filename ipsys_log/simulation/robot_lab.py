@@ -21,8 +21,6 @@ from ipsys_log.simulation.render import add_static_prints, encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["RobotLab", "RobotStart", "robot_rig"]
-
 # Labels on the floor: a black cross of 9 cm with a white margin of 3 cm.
 _CROSS = np.pad(np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool), 1)
 _CROSS_CELL_M = 0.03

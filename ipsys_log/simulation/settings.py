@@ -12,8 +12,6 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.rig.file import check_name
 
-__all__ = ["FLOOR_M", "LabSettings", "Purpose", "random_stream"]
-
 FLOOR_M = 4.88
 # Each camera of a hall has this part of the floor: 6 x 4 cameras are above 20 x 15 m.
 _HALL_SPACING_M = (20 / 6, 15 / 4)

@@ -9,11 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["SmoothField", "SmoothSignal"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # Grid nodes per correlation length. With 2, the variance of the field changes between the nodes by 1e-8 of
 # itself.

@@ -12,17 +12,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "KIND_COLOURS",
-    "MARKER_COLOUR",
-    "TRUTH_COLOUR",
-    "assign_colours",
-    "camera_colours",
-    "more_colours",
-    "oklab",
-    "robot_colour",
-]
-
 RGB = tuple[int, int, int]
 
 # Lightness, in OKLab, of colours that are visible on a dark background.

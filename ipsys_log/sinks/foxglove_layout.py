@@ -17,8 +17,6 @@ from ipsys_log.messages import LATENCY_TOPIC, TRUTH_TOPIC, Rig
 from ipsys_log.messages.channels import ANNOTATIONS, CALIBRATIONS, LATENCY, POSES, TRACKS
 from ipsys_log.sinks.selection import Shown, choose_runs, rig_in_force
 
-__all__ = ["make_layout"]
-
 Panel = dict[str, Any]
 
 # More lines in one plot cannot be told apart.

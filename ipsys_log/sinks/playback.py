@@ -16,8 +16,6 @@ from ipsys_log.sinks.streams.poses import NewSession, first_session
 from ipsys_log.sinks.timeline import Timeline
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Playback", "PlaybackOptions", "in_capture_order"]
-
 # A message is logged at most so long after its capture; a later one is played late.
 _LOGGED_AFTER_NS = NS_PER_S
 SLOWEST, FASTEST = 0.01, 100.0

@@ -23,16 +23,6 @@ from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import choose_runs, model_in_force
 
-__all__ = [
-    "PlayedScene",
-    "PlayedTopics",
-    "choose_topics",
-    "dashboard_topics",
-    "read_first",
-    "read_scene",
-    "viewed_topics",
-]
-
 
 class PlayedTopics(NamedTuple):
     """The topics of a playback, the topic of the tracks among them, and their run (None: ground truth)."""

@@ -10,8 +10,6 @@ from contextlib import suppress
 from ipsys_log.messages import Message
 from ipsys_log.sinks.sink import Sink
 
-__all__ = ["play"]
-
 _MOST_WAITING = 200
 
 

@@ -26,8 +26,6 @@ from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.sinks.streams.ros2_cameras import CAMERA_INFO, encode_camera_info, encode_image
 from ipsys_log.sinks.streams.ros2_types import is_stampable, text_of, type_hash
 
-__all__ = ["BagCounts", "write_bag"]
-
 _STEP = "bag"
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
 # Late subscribers get the last message of such a topic. The numbers are those of rmw/types.h.

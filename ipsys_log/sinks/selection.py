@@ -21,8 +21,6 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import EVENTS, MARKERS, MODEL, POSITIONS, RUN_EVENTS, TRACKS, TRUTH
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Shown", "choose_runs", "fade_ns", "model_in_force", "rig_in_force"]
-
 _FADE_STEPS = 3
 
 

@@ -12,19 +12,6 @@ from typing import Protocol, runtime_checkable
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
 
-__all__ = [
-    "Consumer",
-    "Consumers",
-    "DropReport",
-    "LiveQueue",
-    "LiveSinks",
-    "PromptSink",
-    "SelectiveSink",
-    "Sink",
-    "Warn",
-    "send_all",
-]
-
 # Limits of a sink's queue: above the first limit images are dropped, above the second all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
 _JOIN_TIMEOUT_S = 2.0

@@ -6,8 +6,6 @@ from math import inf
 
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Timeline"]
-
 
 class Timeline:
     """The time in a log. All times are in ns; ``now_ns`` is the time of the clock.

@@ -31,8 +31,6 @@ from ipsys_log.messages.events import (
 from ipsys_log.soundness.finding import NOTE, REMARK, LogFinding
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["check_events", "check_messages", "check_rates", "check_schemas", "decoded_topics", "image_topics"]
-
 _PROGRESS_EVERY = 1000
 # Events of the recorder or of a run that need no action.
 _USUAL_EVENTS = frozenset(

@@ -30,8 +30,6 @@ from ipsys_log.soundness.provenance import check_runs, find_input_logs
 from ipsys_log.soundness.references import check_cameras, check_intrinsics, check_measurements, check_rigs
 from ipsys_log.soundness.times import MessageTimes
 
-__all__ = ["check_logs"]
-
 _BYTES_PER_MB = 1_000_000
 
 

@@ -12,8 +12,6 @@ from ipsys_log.runs.provenance import complete_runs
 from ipsys_log.runs.states import is_fitted_here
 from ipsys_log.soundness.finding import REMARK, LogFinding
 
-__all__ = ["check_clocks"]
-
 _ADVICE = "write the latency of the camera into latency_ns, or use a network with equal delays both ways"
 
 

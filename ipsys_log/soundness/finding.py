@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from ipsys_log.log.location import LogLocation
 
-__all__ = ["BROKEN", "NOTE", "READABLE", "REMARK", "SOUND", "UNREAD", "LogCheck", "LogFinding"]
-
 # The levels of a finding. After the level UNREAD, nothing is known of the log.
 BROKEN, UNREAD, REMARK, NOTE = "broken", "unread", "remark", "note"
 # The states of a log without a fault of the levels BROKEN and UNREAD, which are states, too.

@@ -14,9 +14,6 @@ from ipsys_log.runs.graph import writes
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.soundness.finding import NOTE, REMARK, LogFinding
 
-__all__ = ["check_runs", "find_input_logs"]
-
-
 # Logs without images are smaller: their markers are the start of all later stages.
 _IMAGE = IMAGES.topic.rpartition("/")[2]
 

@@ -17,8 +17,6 @@ from ipsys_log.rig.file import check_rig
 from ipsys_log.runs.checks import image_sizes
 from ipsys_log.soundness.finding import REMARK, LogFinding
 
-__all__ = ["check_cameras", "check_intrinsics", "check_measurements", "check_rigs"]
-
 
 def check_rigs(session: Session) -> Iterator[LogFinding]:
     """Check that a log with images, markers or measurements has a valid rig."""

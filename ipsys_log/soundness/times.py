@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from ipsys_log.soundness.finding import REMARK, LogFinding
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["MessageTimes"]
-
 _DAY_NS = 86_400 * NS_PER_S
 # Messages so many days before or after all others are far from the rest, if they are less than a tenth.
 _FAR_DAYS = 30

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ipsys_log.messages.stage import Stage
 
-__all__ = ["CORNERS", "ENTRIES", "METHOD", "StageEntry", "StageParameter", "load_stage", "parameters_until"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageParameter:

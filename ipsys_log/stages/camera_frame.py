@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.marker_sizes import SizeTest
 from ipsys_log.analysis.marker_tilts import MarkerTilts, SeenMarkers
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
 from ipsys_log.geometry.markers import (
@@ -37,11 +37,7 @@ from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RI
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView
 
-__all__ = ["METHODS", "PERIMETER", "STAGE", "CameraFrame", "check_method", "points_run"]
-
 PERIMETER = "perimeter"
-
-Array = NDArray[np.float64]
 
 # For corners without a covariance: OpenCV's corners have an error of about a quarter of a pixel.
 _USUAL_PX2 = 0.25**2 * np.eye(8)

@@ -34,9 +34,8 @@ from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
-from ipsys_log.models.table import CalibrationPoints, min_pairs, reads_corners
-
-__all__ = ["SCREENING", "STAGE", "can_evaluate", "evaluate_model"]
+from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.table import min_pairs, reads_corners
 
 # Models that check the measurements. They fit in milliseconds, and they follow the calibration points
 # closely enough to show an error of some centimetres.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibration_points import (
     JOINT_READS,
@@ -19,16 +18,14 @@ from ipsys_log.analysis.calibration_points import (
 from ipsys_log.analysis.camera_models import fit_camera_models
 from ipsys_log.analysis.cross_validation import gather_points
 from ipsys_log.analysis.pairs import level_cameras
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Model, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
-from ipsys_log.models.table import MODEL_PARTS, CalibrationPoints, min_pairs, reads_corners
+from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.table import MODEL_PARTS, min_pairs, reads_corners
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["BESIDE_LINE_M", "STAGE", "check_different", "check_pairs", "fit_model", "model_run"]
-
-Array = NDArray[np.float64]
 
 # Two calibration points closer than this are the same point; points closer to a line (RMS) lie on it.
 _SAME_PLACE_M = 0.01

@@ -28,8 +28,6 @@ from ipsys_log.tracking.track_inputs import TRACK_READS, LateFrames, model_of, t
 from ipsys_log.tracking.track_rows import make_track
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
-__all__ = ["STAGE", "Fuse"]
-
 
 class Fuse:
     """The stage *fuse*: it filters the positions of all cameras, each at its own capture time.

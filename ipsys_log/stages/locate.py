@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.square_pose import DEPTH_SHARE
 from ipsys_log.messages import (
@@ -24,10 +24,6 @@ from ipsys_log.messages.stage import Plan, Stage, StageView, Step, model_read
 from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
 from ipsys_log.models.table import AppliedModel, reads_corners, reads_height
 from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
-
-__all__ = ["STAGE", "Locate"]
-
-Array = NDArray[np.float64]
 
 # This step is long enough for the precision of the numbers, and short enough for a curved model.
 _STEP_M = 0.01

@@ -13,8 +13,6 @@ from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positi
 from ipsys_log.tracking.track_inputs import TRACK_READS, LateFrames, model_of, track_reads, tracked_part
 from ipsys_log.tracking.track_rows import make_track
 
-__all__ = ["STAGE"]
-
 _STEPS = 3
 
 

@@ -16,8 +16,6 @@ from ipsys_log.survey.from_log import FinishedLog, rigs_of
 from ipsys_log.survey.scene import OTHER_ROWS, MarkerObservations, fit_neighbours, observe_marker
 from ipsys_log.survey.sheet import SheetRow, assign_intervals, name_columns, raise_for_rows, read_sheet
 
-__all__ = ["add_sheet", "check_sheet"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:

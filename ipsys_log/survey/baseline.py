@@ -10,8 +10,6 @@ from ipsys_log.messages import Distance, Measurement, Rig
 from ipsys_log.survey.checks import free_id
 from ipsys_log.survey.entry import check_references, parse_baseline
 
-__all__ = ["baseline_names", "needs_baseline", "read_baseline"]
-
 
 def baseline_names(rig: Rig) -> tuple[str, str]:
     """Return the names of the first two reference points."""

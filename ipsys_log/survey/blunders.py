@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.blunders import Blunder, possible_blunders
 from ipsys_log.analysis.tape import (
@@ -17,22 +16,12 @@ from ipsys_log.analysis.tape import (
     with_usual_tape,
     world_point,
 )
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES, USUAL_TAPE_SIGMA_M, are_collinear
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.survey.scene import Prediction
 from ipsys_log.units import CM_PER_M
-
-__all__ = [
-    "MODEL_NAME",
-    "floor_sigma_m",
-    "warn_crossing",
-    "warn_floor",
-    "warn_model",
-    "warn_tapes",
-]
-
-Array = NDArray[np.float64]
 
 # The name of a model from a log, in a warning.
 MODEL_NAME = "the model"

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from itertools import chain, count
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.pairs import active_measurements, withdrawals
 from ipsys_log.analysis.tape import TapePoint, is_on_reference, reference_points, with_usual_tape, world_point
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
 from ipsys_log.messages import Measurement, Model, Rig
@@ -26,10 +26,6 @@ from ipsys_log.survey.blunders import (
 from ipsys_log.survey.entry import Entry, Fault
 from ipsys_log.survey.scene import MarkerObservations, Prediction, predict
 from ipsys_log.units import CM_PER_M
-
-__all__ = ["EntryCheck", "check_entry", "free_id", "next_id", "withdrawal_of"]
-
-Array = NDArray[np.float64]
 
 _NUMBERED = re.compile(r"p[0-9]{1,18}")  # the limit matters: an id in a log may have thousands of digits
 

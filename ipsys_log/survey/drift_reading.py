@@ -18,8 +18,6 @@ from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.mended_model import find_model
 from ipsys_log.runs.provenance import newest_run
 
-__all__ = ["DriftReading", "read_drift"]
-
 
 @dataclass(slots=True, eq=False)
 class DriftReading:

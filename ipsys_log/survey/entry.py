@@ -14,8 +14,6 @@ from ipsys_log.geometry.trilateration import SIDES, are_collinear
 from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Entry", "Fault", "TypedEntry", "check_references", "needs_side", "parse_baseline", "parse_entry"]
-
 _NUMBER = re.compile(r"\d+(?:[.,]\d*)?|[.,]\d+")
 _ZERO = re.compile(r"0+(?:[.,]0*)?")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")

@@ -15,8 +15,6 @@ from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.runs.output import write_messages
 from ipsys_log.survey.checks import free_id, withdrawal_of
 
-__all__ = ["ExclusionResult", "exclude", "place_in_log", "readmit"]
-
 _MOST_NAMES = 40
 
 

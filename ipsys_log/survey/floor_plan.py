@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, plan_points
 from ipsys_log.analysis.tape import TapeCovariances, expected_tape_covariances
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
 from ipsys_log.geometry.trilateration import USUAL_TAPE_SIGMA_M, are_collinear
@@ -25,9 +25,6 @@ from ipsys_log.models.uncertainty import Uncertainty
 if TYPE_CHECKING:
     from ipsys_log.analysis.drive_plan import PlannedDrive
 
-__all__ = ["PlannedFloor", "mesh", "plan_floor", "view_of_model"]
-
-Array = NDArray[np.float64]
 Lenses = Mapping[str, CameraCalibration]
 
 # Distance from the centre of a marker to the corners of its white margin, in sides of the marker. A marker

@@ -13,6 +13,7 @@ import numpy as np
 from ipsys_log.analysis.pairs import Sightings, gather_sightings
 from ipsys_log.analysis.stationary import stationary_intervals
 from ipsys_log.errors import FrameError, IpsysError, LogError
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_last
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
@@ -30,13 +31,10 @@ from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import write_messages
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import out_of_date_lines
-from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import check_references
 from ipsys_log.survey.exclusion import place_in_log
 from ipsys_log.survey.scene import CameraView, StationaryInterval
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["FinishedLog", "open_finished_log", "rigs_of"]
 
 # Largest difference between the log time of a frame and the time of its results; longest time from the time
 # of a frame to the exposure of a marker in it.

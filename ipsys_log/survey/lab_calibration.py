@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.calibration_points import measured, split_ids
 from ipsys_log.analysis.expected_error import (
@@ -20,6 +19,7 @@ from ipsys_log.analysis.intrinsics_test import find_contradictions
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
 from ipsys_log.analysis.tape import expected_tape_covariances
 from ipsys_log.analysis.taped_points import TapedPoint, choose_points
+from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import Finding, JointFit
@@ -31,10 +31,6 @@ from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, Channel
 from ipsys_log.messages.stage import Progress
 from ipsys_log.runs.graph import writes
 from ipsys_log.runs.view import LogView
-
-__all__ = ["CameraResult", "LabCalibration", "describe_fit", "describe_lab"]
-
-Array = NDArray[np.float64]
 
 # Without a floor in the rig, the map reaches this far beyond the places of the markers.
 _AROUND_M = 0.5

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.errors import FrameError
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
@@ -25,12 +26,9 @@ from ipsys_log.messages import (
     Model,
     Rig,
 )
-from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import check_references
 from ipsys_log.survey.scene import CameraView, StationaryInterval
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["LiveScene"]
 
 _LAST_NS = NS_PER_S
 

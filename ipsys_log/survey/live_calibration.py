@@ -17,8 +17,6 @@ from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message,
 from ipsys_log.survey.lab_calibration import LabCalibration, describe_fit
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
-__all__ = ["LiveCalibration"]
-
 # The fit beside the recording uses a part of the sightings, so that it leaves time for the detection.
 _STEP_NS = NS_PER_S // 5
 # Cells of an image, along its width and height, for the coverage before the first fit.

@@ -8,32 +8,17 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.consistency import FEWEST_POINTS
 from ipsys_log.analysis.cross_validation import gather_points, leave_one_out
 from ipsys_log.analysis.outliers import find_outliers
 from ipsys_log.analysis.stationary import FEWEST_FRAMES, is_near, is_stationary
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.stages.fit import fit_model
-
-__all__ = [
-    "OTHER_ROWS",
-    "CameraView",
-    "MarkerObservations",
-    "MeasuringScene",
-    "Prediction",
-    "StationaryInterval",
-    "fit_neighbours",
-    "observe_marker",
-    "predict",
-    "visible_markers",
-]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

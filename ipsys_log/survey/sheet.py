@@ -17,8 +17,6 @@ from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.scene import StationaryInterval
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["SheetRow", "assign_intervals", "name_columns", "raise_for_rows", "read_sheet"]
-
 _PLAIN = ("id", "marker", "side", "height_cm", "place", "time", "split", "note")
 _NEEDED = ("marker", "height_cm")
 _LARGEST = 4 << 20

@@ -15,9 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FLATTEST", "LOCAL_M", "BiasModes", "CameraNodes", "Grid", "NodeModes", "reduce_modes"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # A clock error counts like an error of 1 mm for each of these times.
 _CLOCK_S = 0.001

@@ -6,13 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings
-
-__all__ = ["Bodies"]
-
-Array = NDArray[np.float64]
 
 # An offset is used after this number of frames that agree within the gates.
 _FEWEST_FRAMES = 10

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraModel, Model, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.tracking.bias_modes import FLATTEST, BiasModes, CameraNodes, Grid, NodeModes, reduce_modes
@@ -15,10 +16,6 @@ from ipsys_log.tracking.bias_modes import FLATTEST, BiasModes, CameraNodes, Grid
 if TYPE_CHECKING:
     from ipsys_log.joint.model import JointModel
     from ipsys_log.tracking.joint_nodes import JointNodes
-
-__all__ = ["MODES", "calibration_modes"]
-
-Array = NDArray[np.float64]
 
 # The number of modes, the distance of the nodes, and their reach beyond the calibration points.
 MODES = 12

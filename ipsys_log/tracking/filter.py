@@ -12,11 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.tracking.motion import ACCELERATION, MOTION, POSE, RATES, MotionNoise, transition
-
-__all__ = ["UNKNOWN_RAD2", "Innovations", "Sightings", "States", "compare", "predict", "start", "update"]
-
-Array = NDArray[np.float64]
 
 # The variance of a heading that was not measured: it has no weight in double precision.
 UNKNOWN_RAD2 = 1e6

@@ -14,8 +14,6 @@ from ipsys_log.tracking.filter import Sightings
 from ipsys_log.tracking.position_sightings import is_usable, read_sightings
 from ipsys_log.tracking.tracks import Robot
 
-__all__ = ["FrameReader", "FrameSightings"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSightings:

@@ -10,8 +10,6 @@ from typing import NamedTuple
 from ipsys_log.tracking.filter import Sightings, States
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["HISTORY_NS", "History", "Record", "Sighted", "combine_seen"]
-
 # A sighting that is older than the newest one by more than this is left out.
 HISTORY_NS = NS_PER_S // 2
 # More instants than this are checked for those that no late sighting can reach.

@@ -7,14 +7,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Indices, Times
 from ipsys_log.tracking.motion import MotionNoise, transition
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["TrackRows", "TrackSamples", "interpolate"]
-
-Array = NDArray[np.float64]
-Times = NDArray[np.int64]
-Indices = NDArray[np.intp]
 
 # Columns of the motion in the state: value, rate and acceleration; the last two have white acceleration.
 _ON_FLOOR, _UP, _TURN = (0, 4, 8), (2, 6), (3, 7)

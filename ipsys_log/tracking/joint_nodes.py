@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.locate import Positions, locate_markers
 from ipsys_log.joint.model import JointModel
 from ipsys_log.tracking.bias_modes import FLATTEST
-
-__all__ = ["JointNodes", "make_joint_nodes"]
-
-Array = NDArray[np.float64]
 
 # The sensitivity of a centre hardly depends on the side of its marker.
 _MARKER_M = 0.2

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from math import exp
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["ACCELERATION", "MOTION", "POSE", "RATES", "MotionNoise", "displacement", "transition"]
-
-Array = NDArray[np.float64]
+from ipsys_log.arrays import Array
 
 # Columns of the state: x, y, z in m and heading in rad; their rates; the acceleration in x and y.
 POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)

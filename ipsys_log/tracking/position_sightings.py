@@ -8,13 +8,10 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.messages import Position
 from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings
-
-__all__ = ["is_usable", "read_sightings"]
-
-Array = NDArray[np.float64]
 
 # Noise below this is not resolved: it keeps covariances of known heights positive definite.
 _LEAST_M, _LEAST_RAD = 1e-4, 1e-4

@@ -7,13 +7,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.messages import Message, Track
 from ipsys_log.tracking.interpolation import TrackRows
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["gather_rows"]
-
-Array = NDArray[np.float64]
 
 # Rows of tracks without an age belong to one track if they are not further apart.
 _LONGEST_GAP_NS = NS_PER_S

@@ -19,8 +19,6 @@ from ipsys_log.tracking.smoother import smooth_track
 from ipsys_log.tracking.tracks import Pose, Robot, RobotTracks, TrackSettings, gather_sightings
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Frame", "SmoothedPose", "smooth_positions"]
-
 
 class Frame(NamedTuple):
     """The positions of one frame of a camera."""

@@ -11,14 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings, States, start
 from ipsys_log.tracking.motion import MOTION, POSE, RATES, MotionNoise, transition
-
-__all__ = ["smooth_track"]
-
-Array = NDArray[np.float64]
 
 _HEADING = 3
 # The speed of a robot is that between two sightings this long before and after: cameras differ by some mm.

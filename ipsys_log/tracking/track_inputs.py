@@ -9,8 +9,6 @@ from ipsys_log.messages import STAMP_UNRELIABLE, Event, Message, Model, Rig
 from ipsys_log.messages.channels import EVENTS, MODEL, POSITIONS, RIG, Channel
 from ipsys_log.messages.stage import StageView
 
-__all__ = ["TRACK_READS", "LateFrames", "model_of", "track_reads", "tracked_part"]
-
 TRACK_READS = (RIG, POSITIONS, MODEL, EVENTS)
 
 

@@ -7,8 +7,6 @@ from math import pi, sqrt
 from ipsys_log.messages import Track
 from ipsys_log.tracking.tracks import Pose
 
-__all__ = ["make_track"]
-
 # A heading that was never measured has a larger standard deviation.
 _UNKNOWN_HEADING_RAD = 2.0
 

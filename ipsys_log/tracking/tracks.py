@@ -9,15 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
 from ipsys_log.tracking.history import HISTORY_NS, History, Record, Sighted
 from ipsys_log.tracking.motion import MotionNoise
 from ipsys_log.tracking.unseen_growth import UnseenGrowth
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Pose", "Robot", "RobotTracks", "TrackSettings", "gather_sightings"]
-
-Array = NDArray[np.float64]
 # The name of a robot, and the id of its reference marker.
 Robot = tuple[str, int]
 

@@ -9,8 +9,6 @@ from ipsys_log.tracking.history import History
 from ipsys_log.tracking.motion import MotionNoise, displacement
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["UnseenGrowth"]
-
 # A prediction of this duration is compared every 0.1 s with the robot's position.
 _AHEAD_NS, _EVERY_NS = 400_000_000, 100_000_000
 # Comparisons that the usual motion counts for, and those after which the weight of an old one is 1 / e.

@@ -12,8 +12,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ipsys_log.sinks.streams.addresses import is_own_host
 
-__all__ = ["HEADER", "MAY_WRITE", "Guard"]
-
 # Only a script of the page can send this header. Before another site sends it, the browser asks this server.
 HEADER = "x-ipsys"
 # The key in the scope of an accepted request: True if requests of this device may write.

@@ -29,8 +29,6 @@ from ipsys_log.survey.scene import (
 from ipsys_log.units import CM_PER_M, NS_PER_S
 from ipsys_log.web.requests import ERROR_HANDLERS, MOST_DIGITS, answer_file, read_json, whole_number
 
-__all__ = ["build_app", "checked_json", "history_json", "scene_json", "views_json"]
-
 
 def scene_json(scene: MeasuringScene) -> dict[str, Any]:
     """Return the constant data of the page: the lab, and the stationary intervals of a log."""

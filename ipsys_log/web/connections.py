@@ -13,8 +13,6 @@ from uvicorn import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
-__all__ = ["Connections", "PageLimits", "derive_limits"]
-
 # The page gets one of this many descriptors. Cameras, the log and libraries of a recorder need the others.
 _SHARE_OF_DESCRIPTORS = 8
 _MIN_TOTAL, _MAX_TOTAL = 12, 64

@@ -8,8 +8,6 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["OperatorSeat", "answer_claim", "operator_of"]
-
 _NUMBERS = 1 << 30
 
 

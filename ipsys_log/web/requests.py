@@ -12,8 +12,6 @@ from starlette.responses import JSONResponse, Response
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["ERROR_HANDLERS", "MOST_DIGITS", "answer_file", "read_json", "whole_number"]
-
 Answer = Callable[[Request], Coroutine[Any, Any, Response]]
 
 _LARGEST = 16 << 10

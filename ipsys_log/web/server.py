@@ -24,8 +24,6 @@ from ipsys_log.web.access import Guard
 from ipsys_log.web.app import build_app
 from ipsys_log.web.connections import Connections, PageLimits, derive_limits
 
-__all__ = ["PageServer", "ServerExceptions", "check_port_free", "qr_code", "serve", "serve_app"]
-
 
 class ServerExceptions:
     """The unexpected exceptions in the server's thread: their number, and the first traceback."""

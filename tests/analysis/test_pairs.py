@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ipsys_log.analysis.pairs import (
-    RiggedMeasurement,
     active_measurements,
     build_pairs,
     gather_sightings,
@@ -17,6 +16,7 @@ from ipsys_log.analysis.pairs import (
     still_interval,
     valid_measurements,
 )
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import (

@@ -16,7 +16,8 @@ from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, look_down, pose_facing_up, transform
 from ipsys_log.geometry.trilateration import tape_covariance
 from ipsys_log.messages import CameraCalibration, Pair
-from ipsys_log.models.table import CalibrationPoints, fit_cameras, inputs
+from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.table import fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.stages.fit import fit_model
 from ipsys_log.survey.floor_plan import view_of_model

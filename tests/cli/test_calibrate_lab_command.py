@@ -22,10 +22,9 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Distance, Markers, Measurement, Message, Rig
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.cameras import FLOOR_M
 from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from tests.conftest import Ipsys
 
 # Smaller than a real session: the fit takes about two seconds.

@@ -398,8 +398,7 @@ def test_refused_command_leaves_no_run(
 
 
 FAMILY = {
-    name for name in errors.__all__ if isinstance(kind := getattr(errors, name), type)
-    if issubclass(kind, IpsysError)
+    name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, IpsysError)
 } | {ConvergenceError.__name__}  # fmt: skip
 
 

@@ -20,7 +20,8 @@ from ipsys_log.simulation.floor import FloorView, prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.stages.detect.edges import Guess, fit_edges
+from ipsys_log.stages.detect.adjustment import Guess
+from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.units import NS_PER_S
 from tests.stages.drawing import (

@@ -27,7 +27,8 @@ from ipsys_log.analysis.study import Study
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
-from ipsys_log.models.table import AppliedModel, CalibrationPoints, group_dependent_cameras, min_pairs
+from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.table import AppliedModel, group_dependent_cameras, min_pairs
 from ipsys_log.stages.evaluate import evaluate_model
 from ipsys_log.stages.fit import fit_model
 from tests import labs

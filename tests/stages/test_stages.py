@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -20,7 +21,7 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.stages.detect import Detect, decode_grey
+from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.fuse import Fuse
 from ipsys_log.stages.locate import Locate

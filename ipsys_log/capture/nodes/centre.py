@@ -35,8 +35,6 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["Centre", "describe_no_answer", "exchange_period_s", "is_of_node", "node_of"]
-
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
 # The period of the exchanges up to a number of them: the first ones together find offset and drift.

@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["AUTHORITY", "CENTRE", "Certificates", "check_centre", "check_certificates"]
-
 # The name of the centre in its certificate; the name of a node is that of its camera.
 CENTRE = "centre"
 # The file with the certificate of the authority, the same one on all hosts.

@@ -25,8 +25,6 @@ from ipsys_log.messages import RigNodes
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["NodeNetwork", "open_centre_session", "open_node_session", "read_network"]
-
 _DEFAULT = "127.0.0.1:7449"
 _LARGEST_PORT = 65535
 _MOST_SESSIONS = 256

@@ -24,8 +24,6 @@ from ipsys_log.messages import RigCamera
 from ipsys_log.piped_process import PipedProcess, parent_pipe
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Receiver", "passing_period_s", "serve"]
-
 _LEAST_PERIOD_S, _MOST_PERIOD_S, _PERIOD_OF_NODE_S = 0.001, 0.005, 0.0002
 # The readers of all cameras ask one after the other. One look at the pipe is enough for all of them.
 _LOOK_EVERY_NS = NS_PER_S // 1000

@@ -18,8 +18,6 @@ from ipsys_log.messages import EVENTS_TOPIC, ClockEstimate, Event, RigCamera, cl
 from ipsys_log.messages.events import NODE_ANSWERS, NODE_REFUSED
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["NodeStream"]
-
 _VIDEO = ("h264", "h265")
 _FRAMES_PER_REQUEST = 16
 _ESTIMATE_EVERY_NS = NS_PER_S

@@ -12,19 +12,6 @@ import re
 import struct
 from typing import Any, NamedTuple
 
-__all__ = [
-    "FORMATS",
-    "MARKERS_FORMAT",
-    "FrameHeader",
-    "FrameRequest",
-    "NodeState",
-    "StateRequest",
-    "frames_key",
-    "missing_key",
-    "new_session",
-    "state_key",
-]
-
 _PREFIX = "ipsys"
 _HEADER = struct.Struct("<4s8sQqB")
 _MAGIC = b"ips1"

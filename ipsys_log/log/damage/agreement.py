@@ -14,8 +14,6 @@ from ipsys_log.log.damage.resync import PRIVATE
 from ipsys_log.log.records import DATA_END, ChunkRef, parse_exact, walk
 from ipsys_log.log.summary import Summary, load_contents, read_summary
 
-__all__ = ["count_by_indexes", "disagreement"]
-
 
 def disagreement(view: LogBytes, findings: Survey) -> str:
     """Return the first disagreement of a log with its survey, "" if there is none."""

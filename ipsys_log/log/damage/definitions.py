@@ -17,8 +17,6 @@ from ipsys_log.log.damage.regions import DamagedRange
 from ipsys_log.log.records import MESSAGE, RecordAt, parse_exact, to_bytes, walk
 from ipsys_log.log.summary import Summary
 
-__all__ = ["Definitions", "placeholder"]
-
 _MOST_MISREAD = 100
 _MOST_FREE_RANGES = 50  # ranges that are tried
 _LARGEST = 1 << 28  # bytes: limit of the memory for one definition

@@ -15,18 +15,6 @@ from ipsys_log.log.damage.salvage import Rows, Salvage, Saved
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, RecordAt
 
-__all__ = [
-    "COUNTED",
-    "UNCHUNKED",
-    "IndexGroup",
-    "Lost",
-    "Survey",
-    "Watch",
-    "add_damage",
-    "close_indexes",
-    "skip_damage",
-]
-
 
 @dataclass(slots=True)
 class Lost:

@@ -31,8 +31,6 @@ from ipsys_log.log.records import HEADER, MAGIC, parse, to_bytes, walk
 from ipsys_log.log.summary import read_summary, tail_bytes
 from ipsys_log.units import format_bytes
 
-__all__ = ["Change", "Patch", "check_room", "discard", "keep_old_bytes", "overwrite", "resume"]
-
 Patch = tuple[int, bytes]  # offset in the log, new bytes
 
 _METADATA_NAME = "ipsys repair"

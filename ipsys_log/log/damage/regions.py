@@ -9,8 +9,6 @@ from mcap.opcode import Opcode
 from ipsys_log.log.damage.resync import PRIVATE
 from ipsys_log.log.records import HEADER, MAGIC, to_bytes
 
-__all__ = ["DamagedRange", "index_records"]
-
 _SHORTEST_DEFINITION = 23  # bytes: a schema without name and encoding
 _FILLER = Opcode.CHUNK | PRIVATE
 

@@ -28,8 +28,6 @@ from ipsys_log.log.records import (
     walk,
 )
 
-__all__ = ["PRIVATE", "Resync", "attachment_crc", "check_exact", "crc_of", "is_index"]
-
 PRIVATE = 0x80  # every reader skips unknown types from this value on
 _BLOCK = 1 << 20
 _OVERLAP = 64

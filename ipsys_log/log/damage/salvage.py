@@ -21,8 +21,6 @@ from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkRef, RecordAt, parse_chunk_head
 from ipsys_log.units import format_time
 
-__all__ = ["Rows", "Salvage", "Saved", "up_to_first_hole"]
-
 _SECTOR = 512
 _MOST = 256 << 20  # bytes: limit for one chunk
 _READ = 1 << 20

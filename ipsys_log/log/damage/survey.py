@@ -40,8 +40,6 @@ from ipsys_log.log.records import (
 from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.summary import Summary
 
-__all__ = ["HEADER_RECORD", "survey"]
-
 HEADER_RECORD = to_bytes(mcap.Header("", "ipsys 1"))
 _LAG = 1 << 20  # bytes
 _LONGEST_HEADER = 1 << 20  # bytes

@@ -16,8 +16,6 @@ from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout, symbol_sc
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["LiveView"]
-
 Write = Callable[[bytes], object]
 
 _FADE_NS = NS_PER_S

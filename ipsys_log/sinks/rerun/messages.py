@@ -26,8 +26,6 @@ from ipsys_log.sinks.colours import MARKER_COLOUR, TRUTH_COLOUR, camera_colours,
 from ipsys_log.sinks.rerun.scene import TIMELINES
 from ipsys_log.sinks.rerun.trails import Fading, Segment, Trails
 
-__all__ = ["RerunSink", "encoded_frame", "raw_image", "trail_entity"]
-
 # Colour model and channels by pixel encoding, all with 8 bits.
 _RAW = {
     "mono8": (rr.ColorModel.L, 1),

@@ -15,8 +15,6 @@ import rerun as rr
 from ipsys_log.errors import IpsysError
 from ipsys_log.sinks.rerun.recording import last_line, stop_viewer, viewer_command
 
-__all__ = ["ViewerPage"]
-
 _LOOPBACK = "127.0.0.1"
 _TURN_S, _TURNS = 0.1, 600
 _END_S = 5.0

@@ -27,15 +27,6 @@ from ipsys_log.sinks.rerun.scene import Plot, draw_legend, draw_places, draw_rig
 from ipsys_log.sinks.rerun.series import DISAGREEMENT, LATENCY_MS, Series, draw_series, read_series
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 
-__all__ = [
-    "check_screen",
-    "last_line",
-    "show_in_viewer",
-    "stop_viewer",
-    "viewer_command",
-    "write_recording",
-]
-
 _INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open it on a machine with a screen"
 
 

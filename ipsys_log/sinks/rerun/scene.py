@@ -14,8 +14,6 @@ from ipsys_log.analysis.pairs import KINDS, Place
 from ipsys_log.messages import Floor, Rig
 from ipsys_log.sinks.colours import KIND_COLOURS
 
-__all__ = ["LEGEND", "TIMELINES", "Plot", "draw_legend", "draw_places", "draw_rig", "layout", "symbol_scale"]
-
 # The viewer shows the first timeline; the times in the payloads belong to it.
 TIMELINES = ("publish_time", "log_time")
 

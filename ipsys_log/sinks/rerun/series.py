@@ -15,8 +15,6 @@ from ipsys_log.messages.channels import LATENCY
 from ipsys_log.sinks.colours import camera_colours, robot_colour
 from ipsys_log.sinks.rerun.scene import TIMELINES
 
-__all__ = ["DISAGREEMENT", "LATENCY_MS", "Series", "draw_series", "read_series"]
-
 # The entities above the series; each has its own plot.
 DISAGREEMENT = "series/disagreement"
 LATENCY_MS = "series/latency"

@@ -9,8 +9,6 @@ from typing import Generic, TypeVar
 
 from ipsys_log.messages import Message
 
-__all__ = ["Fading", "Segment", "Trails"]
-
 Entity = tuple[str, ...]
 
 

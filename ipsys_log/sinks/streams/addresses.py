@@ -10,18 +10,6 @@ from dataclasses import dataclass
 
 from ipsys_log.errors import IpsysError
 
-__all__ = [
-    "LOOPBACK",
-    "Destination",
-    "find_destination",
-    "is_loopback",
-    "is_own_host",
-    "listen",
-    "local_address",
-    "open_datagrams",
-    "refuse_bind",
-]
-
 LOOPBACK = "127.0.0.1"
 _LOOPBACK_6 = "::1"
 _LARGEST_PORT = 65535

@@ -36,8 +36,6 @@ from ipsys_log.sinks.streams.foxglove_messages import (
 )
 from ipsys_log.sinks.streams.poses import NewSession
 
-__all__ = ["FoxgloveStream"]
-
 _BACKLOG = 16
 _MOST_CLIENTS = 32
 # Connections without a complete request: a recorder needs the other file descriptors. The oldest one has its

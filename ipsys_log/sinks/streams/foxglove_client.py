@@ -7,8 +7,6 @@ from websockets.asyncio.server import ServerConnection, broadcast
 from ipsys_log.sinks.sink import DropReport
 from ipsys_log.sinks.streams.foxglove_messages import Subscriptions, pack_message
 
-__all__ = ["Client"]
-
 # Above the first limit of bytes that wait, images are dropped; above the second, all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 2 << 20, 4 << 20
 

@@ -14,16 +14,6 @@ from typing import Any
 
 from ipsys_log.log.codec import schema_data, schema_name
 
-__all__ = [
-    "SUBPROTOCOLS",
-    "Advertised",
-    "Subscriptions",
-    "pack_message",
-    "pack_time",
-    "write_advertise",
-    "write_server_info",
-]
-
 # The name that the server prefers comes first.
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 _MESSAGE, _TIME = 1, 2

@@ -17,8 +17,6 @@ from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, loc
 from ipsys_log.sinks.streams.mavlink_messages import encode_odometry, encode_vision
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 
-__all__ = ["Endpoint", "MavlinkStream", "parse_endpoint"]
-
 # The autopilot takes messages from a companion computer with its own system number.
 _SYSTEM, _COMPONENT = 1, common.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _HEARTBEAT_S = 1.0

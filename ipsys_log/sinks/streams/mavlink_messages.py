@@ -16,8 +16,6 @@ from pymavlink.dialects.v20 import common
 
 from ipsys_log.sinks.streams.poses import StreamPose
 
-__all__ = ["NORTH_RAD", "encode_odometry", "encode_vision"]
-
 # The direction of north by default: the y axis of the lab.
 NORTH_RAD = pi / 2
 _NS_PER_US = 1000

@@ -14,8 +14,6 @@ from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.messages.message import Mat33
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["STALE_S", "NewSession", "PoseSource", "StreamPose", "Velocity", "first_session"]
-
 # A robot of 0.26 m/s moves 13 cm in this time.
 STALE_S = 0.5
 # Tracks of earlier versions have no velocity. The duration of the poses that give one: a longer one is more

@@ -21,8 +21,6 @@ from zenoh import ext
 
 from ipsys_log.sinks.streams.addresses import LOOPBACK
 
-__all__ = ["Entity", "Publisher", "Qos", "attachment", "configure", "gid", "topic_key"]
-
 _ADMIN_SPACE = "@ros2_lv"
 _GID_BYTES = 16
 _HEARTBEAT_S = 0.5

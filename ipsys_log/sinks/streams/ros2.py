@@ -19,8 +19,6 @@ from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
 from ipsys_log.sinks.streams.ros2_types import is_stampable, type_hash
 
-__all__ = ["Ros2Stream"]
-
 _NODE = "ipsys"
 _MOST_DOMAIN = 232
 _MOST_ROBOTS = 256

@@ -10,8 +10,6 @@ from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVid
 from ipsys_log.sinks.streams.ros2_messages import optical_frame
 from ipsys_log.sinks.streams.ros2_types import encode, make, make_header
 
-__all__ = ["CAMERA_INFO", "encode_camera_info", "encode_image"]
-
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _COMPRESSED, _RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 

@@ -21,22 +21,6 @@ from ipsys_log.units import NS_PER_S
 if TYPE_CHECKING:
     from ipsys_log.analysis.floor_cameras import FloorCamera
 
-__all__ = [
-    "CLOCK",
-    "DIAGNOSTICS",
-    "MAP",
-    "ODOMETRY",
-    "POSE",
-    "TF",
-    "encode_clock",
-    "encode_diagnostics",
-    "encode_odometry",
-    "encode_pose",
-    "encode_static",
-    "encode_transforms",
-    "optical_frame",
-]
-
 MAP = "map"
 TF, CLOCK = "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock"
 POSE, ODOMETRY = "geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry"

@@ -9,17 +9,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "encode",
-    "is_stampable",
-    "make",
-    "make_header",
-    "make_time",
-    "message_class",
-    "text_of",
-    "type_hash",
-]
-
 # Jazzy and Kilted have the same definitions of these messages.
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 _LAST_S = 2**31

@@ -19,8 +19,6 @@ from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
 from ipsys_log.sinks.streams.udp import UdpStream, read_key
 from ipsys_log.sinks.streams.vrpn import PORT, VrpnStream
 
-__all__ = ["PORTS", "Stream", "StreamSettings", "check_streams", "open_streams", "settings_of_rig"]
-
 # The usual port of each server.
 PORTS = {"vrpn": PORT, "ros2": 7447, "foxglove": 8765}
 _SECRET_BYTES = 12

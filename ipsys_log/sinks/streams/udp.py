@@ -17,8 +17,6 @@ from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 
-__all__ = ["FORMAT", "UdpStream", "encode_pose", "read_key"]
-
 # The version of the datagram: a receiver drops other versions.
 FORMAT = 1
 _FEWEST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096

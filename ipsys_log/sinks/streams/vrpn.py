@@ -19,8 +19,6 @@ from ipsys_log.sinks.streams.vrpn_client import Client
 from ipsys_log.sinks.streams.vrpn_messages import describe, pack_pose
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["PORT", "VrpnStream"]
-
 PORT = 3883
 _MOST_CLIENTS, _MOST_CALLBACKS = 32, 4
 _MOST_ROBOTS = 256

@@ -21,8 +21,6 @@ from ipsys_log.sinks.streams.vrpn_messages import (
     take_message,
 )
 
-__all__ = ["Client"]
-
 # About 200 poses with velocities: a client that is so far behind loses further ones.
 _MOST_OUTPUT_BYTES = 40_000
 # A larger buffer of the system would fill with old poses while a client is stalled.

@@ -14,23 +14,6 @@ from typing import NamedTuple
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
 from ipsys_log.units import NS_PER_S
 
-__all__ = [
-    "DISCONNECT",
-    "GREETING",
-    "GREETING_BYTES",
-    "PING",
-    "PONG",
-    "SENDER_DESCRIPTION",
-    "TYPES",
-    "TYPE_DESCRIPTION",
-    "Received",
-    "describe",
-    "is_greeting",
-    "pack",
-    "pack_pose",
-    "take_message",
-]
-
 _ALIGNMENT = 8
 _HEADER = struct.Struct(">IIIiiI")
 _POSE = struct.Struct(">ii3d4d")

@@ -12,8 +12,6 @@ from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, RawIma
 from ipsys_log.sinks.colours import MARKER_COLOUR
 from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
 
-__all__ = ["CameraPanel"]
-
 _GROUND: RGB = (16, 16, 19)
 _TITLE: RGB = (44, 44, 50)
 _TEXT: RGB = (225, 225, 228)

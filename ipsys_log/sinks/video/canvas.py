@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.plain_text import plain_text
 
-__all__ = ["Canvas", "Picture", "text_size"]
-
 Picture = NDArray[np.uint8]
 RGB = tuple[int, int, int]
 Point = Sequence[float] | NDArray[np.float64]

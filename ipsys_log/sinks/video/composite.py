@@ -16,8 +16,6 @@ from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
 from ipsys_log.sinks.video.floor_map import FloorMap, MapLook, MapPart
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Composite", "Scene"]
-
 _GROUND: RGB = (24, 24, 28)
 _TEXT: RGB = (235, 235, 238)
 _NOTE: RGB = (165, 165, 172)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.ellipses import enlargement
@@ -28,10 +28,6 @@ from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from av.video.stream import VideoStream
-
-__all__ = ["VideoCounts", "check_settings", "read_scene", "timed_pictures", "write_video"]
-
-Array = NDArray[np.float64]
 
 _STEP = "video"
 _LEAST_PX, _MOST_PX = 160, 4096

@@ -43,7 +43,7 @@ from ipsys_log.messages.channels import (
 )
 from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.stage import Pieces, Plan, Stage, StageView
-from ipsys_log.stages.detect.edges import MarkerFit
+from ipsys_log.stages.detect.adjustment import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.stages.detect.misprints import Inspection, Misprints
 from ipsys_log.stages.detect.reports import (
@@ -58,21 +58,6 @@ from ipsys_log.stages.detect.reports import (
 )
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
 from ipsys_log.units import NS_PER_S
-
-__all__ = [
-    "CORNERS",
-    "EDGES",
-    "STAGE",
-    "STOCK",
-    "Detect",
-    "FrameDetector",
-    "check_corners",
-    "decode_grey",
-    "detect_markers",
-    "marker_detector",
-    "skipped_frames",
-    "usual_corners",
-]
 
 EDGES, STOCK = CORNERS = ("edges", "stock")
 

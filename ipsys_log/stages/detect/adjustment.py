@@ -14,25 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Grey
 from ipsys_log.geometry.lenses import project
-from ipsys_log.images.decode import Grey, levels_at
+from ipsys_log.images.decode import levels_at
 from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import MarkerView, Poses
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES
-
-__all__ = [
-    "Guess",
-    "MarkerFit",
-    "edge_derivatives",
-    "inside_image",
-    "outline",
-    "poses_of",
-    "prior",
-    "sample_cells",
-    "solve",
-]
-
-Array = NDArray[np.float64]
 
 # Prior weights: squared pixels per squared unit of each unknown: translation and rotation, edge offset,
 # speed. A marker directly below the camera has an unobservable tilt, which keeps its value.

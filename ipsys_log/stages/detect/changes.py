@@ -7,11 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.images.decode import Grey
+from ipsys_log.arrays import Array, Grey
 
-__all__ = ["ChangeDetector"]
-
-Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
 
 _EVERY_PX = 16

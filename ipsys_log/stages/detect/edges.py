@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.images.decode import Grey
+from ipsys_log.arrays import Array, Grey
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
     Guess,
@@ -34,10 +34,6 @@ from ipsys_log.stages.detect.adjustment import (
 from ipsys_log.stages.detect.prints import Prints, build_prints
 from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, MarkerView, Poses, measure
 from ipsys_log.stages.detect.uneven_light import count_contradictions
-
-__all__ = ["Guess", "MarkerFit", "fit_edges"]
-
-Array = NDArray[np.float64]
 
 _MOVED_FAR_PX = 1.0
 _PASSES = 7

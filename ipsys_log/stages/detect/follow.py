@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Grey
 from ipsys_log.geometry.lenses import check_size, project, undistort
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.square_pose import is_convex, solve_squares
-from ipsys_log.images.decode import Grey, decode_rows
+from ipsys_log.images.decode import decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
+from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.changes import ChangeDetector
-from ipsys_log.stages.detect.edges import Guess, MarkerFit, fit_edges
+from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.misprints import Inspection, Misprints
 from ipsys_log.stages.detect.motion import LONG_S, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.partial import Rejection, fit_visible_edges, resembles
@@ -27,10 +28,6 @@ from ipsys_log.stages.detect.search import (
     search_unexplained_areas,
 )
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["MarkerTracker"]
-
-Array = NDArray[np.float64]
 
 # Number of frames between two searches of the whole image, and between two thorough searches at full size.
 _SEARCH_EVERY = 20

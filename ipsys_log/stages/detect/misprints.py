@@ -15,13 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.images.decode import Grey
+from ipsys_log.arrays import Array, Grey
 from ipsys_log.messages.events import MIRRORED, OTHER_PRINTS
 from ipsys_log.stages.detect.search import find_squares, read_cells
 
-__all__ = ["Inspection", "Misprints", "find_misprints"]
-
-Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
 
 # Kinds of misprints, besides mirrored ones.

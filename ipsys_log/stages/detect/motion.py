@@ -6,15 +6,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.poses import rotation, rotation_vector
-from ipsys_log.stages.detect.edges import Guess, MarkerFit
+from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.units import NS_PER_S
-
-__all__ = ["LONG_S", "Track", "extend", "predict", "same_speed"]
-
-Array = NDArray[np.float64]
 
 # After this time, an earlier motion predicts nothing.
 LONG_S = 0.5

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.images.decode import Grey
+from ipsys_log.arrays import Array, Grey, Mask
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
     Guess,
@@ -43,11 +43,6 @@ from ipsys_log.stages.detect.uneven_light import (
     rough_steps,
     usual_blur,
 )
-
-__all__ = ["Rejection", "fit_visible_edges", "resembles"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # The omitted side of each hypothesis: none, or one of the four sides.
 _WITHOUT = (None, 0, 1, 2, 3)

@@ -8,11 +8,8 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.markers import marker_corners, white_cells
-
-__all__ = ["Prints", "build_prints"]
-
-Array = NDArray[np.float64]
 
 # Positions of points along the side of a cell, away from its corners, because the blur rounds the corners.
 _ALONG_CELL = np.array([0.3, 0.7])

@@ -8,26 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array, Grey
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import rotation
-from ipsys_log.images.decode import Grey, levels_at
+from ipsys_log.images.decode import levels_at
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.prints import Prints
-
-__all__ = [
-    "BLURS_PX",
-    "LEAST_CONTRAST",
-    "USUAL_BLUR_PX",
-    "EdgeMeasurements",
-    "EdgePositions",
-    "MarkerView",
-    "Poses",
-    "locate",
-    "measure",
-    "read_profiles",
-]
-
-Array = NDArray[np.float64]
 
 # In grey levels: a smaller rise is no edge.
 LEAST_CONTRAST = 8.0

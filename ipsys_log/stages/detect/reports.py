@@ -15,17 +15,6 @@ from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, MIRRORED, OTHER_PRINTS
 
-__all__ = [
-    "NO_KEYFRAME",
-    "REJECTED_MARKER",
-    "UNKNOWN_MARKER",
-    "LensInUse",
-    "OtherPrints",
-    "OtherSize",
-    "Reports",
-    "SeenSquares",
-]
-
 NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER = ("no_keyframe", "rejected_marker", "unknown_marker")
 _ONCE = (NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER, MIRRORED, OTHER_PRINTS)
 # A camera is mirrored if its prints show this number of mirrored ids for each id that is not mirrored.

@@ -17,25 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.arrays import Array
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import BLURS_PX, LEAST_CONTRAST
-
-__all__ = [
-    "CELL_SAMPLES",
-    "TAPS",
-    "Agreement",
-    "Steps",
-    "compare_pattern",
-    "count_contradictions",
-    "exact_steps",
-    "has_clear_cells",
-    "masked_median",
-    "rough_steps",
-    "usual_blur",
-]
-
-Array = NDArray[np.float64]
 
 # Cells differ if their levels differ by this share of the print's contrast.
 _DIFFERENT = 0.25

@@ -18,8 +18,6 @@ from ipsys_log.web.dashboard.state import Dashboard
 from ipsys_log.web.operator_seat import answer_claim, operator_of
 from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json, whole_number
 
-__all__ = ["build_dashboard"]
-
 _OWN = "ipsys_log.web.dashboard"
 _SCRIPTS = ("dashboard", "map", "tiles", "tables", "panels", "cameras_panel", "operate")
 _FILES = {

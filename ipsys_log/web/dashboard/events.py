@@ -9,8 +9,6 @@ from ipsys_log.messages import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Ev
 from ipsys_log.messages.events import OPERATOR_KINDS
 from ipsys_log.plain_text import plain_text
 
-__all__ = ["RecentEvents", "severity_of"]
-
 _NS_PER_MS = 1_000_000
 _MOST_EVENTS = 50
 _LONGEST_TEXT = 300

@@ -9,8 +9,6 @@ from typing import Any
 
 from ipsys_log.web.dashboard.state import Dashboard
 
-__all__ = ["Feed"]
-
 # A page gets at most 30 updates per second. All pages wake at the same times: an update is made once.
 _TICK_S = 1 / 30
 # Shortest time between two versions of a part. The status is made again after a second even without news.

@@ -7,15 +7,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.analysis.floor_cameras import outline_view, read_floor_cameras
+from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraCalibration, Model, Rig
 from ipsys_log.report.styles import camera_styles, shorten
-
-__all__ = ["describe_floor"]
-
-Array = NDArray[np.float64]
 
 _DECIMALS = 3  # of m
 # Margin of the map around its content, without a known floor.

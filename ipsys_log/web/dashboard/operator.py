@@ -11,8 +11,6 @@ from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
 from ipsys_log.plain_text import plain_text
 from ipsys_log.web.operator_seat import OperatorSeat
 
-__all__ = ["Operator", "Segment"]
-
 _LONGEST_TEXT, _LONGEST_NAME = 200, 40
 
 

@@ -16,8 +16,6 @@ from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RawImage
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["EVERY_NS", "Pictures", "shrink"]
-
 # At most five pictures of a camera per second.
 EVERY_NS = NS_PER_S // 5
 # A frame without results of the stages is shown after this time.

@@ -12,8 +12,6 @@ from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.units import NS_PER_S
 from ipsys_log.web.dashboard.pictures import EVERY_NS
 
-__all__ = ["PlayedLog"]
-
 # Events that end and begin the state `up` of a camera.
 _UP_AFTER = {"camera_lost": False, "camera_back": True}
 

@@ -12,8 +12,6 @@ from ipsys_log.messages.message import Mat33
 from ipsys_log.report.styles import robot_colour, shorten
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Robots", "ellipse_of"]
-
 _NS_PER_MS = 1_000_000
 # Duration of a trail, and the least time between two of its points.
 _TRAIL_NS, _TRAIL_STEP_NS = 10 * NS_PER_S, NS_PER_S // 10

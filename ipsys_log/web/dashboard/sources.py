@@ -16,8 +16,6 @@ from ipsys_log.web.dashboard.played_log import PlayedLog
 from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 from ipsys_log.web.operator_seat import OperatorSeat
 
-__all__ = ["dashboard_of_player", "dashboard_of_recording"]
-
 
 def dashboard_of_recording(
     cameras: LiveCameras,

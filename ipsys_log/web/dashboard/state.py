@@ -44,8 +44,6 @@ from ipsys_log.web.dashboard.status import (
     describe_streams,
 )
 
-__all__ = ["Dashboard", "DashboardSetting"]
-
 _NS_PER_MS = 1_000_000
 # Number of the last positions whose latencies count.
 _LATENCIES = 1000

@@ -16,8 +16,6 @@ from ipsys_log.messages import Latency
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["CameraStatus", "describe_latencies", "describe_recording", "describe_streams"]
-
 _NS_PER_MS = 1_000_000
 _MS_PER_S = 1e3
 # The rate of a camera is that of this time.

@@ -28,8 +28,6 @@ from ipsys_log.web.dashboard.state import Dashboard
 from ipsys_log.web.operator_seat import OperatorSeat, answer_claim, operator_of
 from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json
 
-__all__ = ["SetupApp"]
-
 Body = Mapping[str, Any]
 
 _OWN = "ipsys_log.web.first_day"

@@ -249,6 +249,8 @@ def _explain_cameras(fit: JointFit, settings: JointSettings, progress: Progress)
         trial = _try_causes(fit, causes[:_MOST_TRIALS], settings, progress)
         if trial is None:
             break
+        if _gain(fit, trial) < _LEAST_GAIN:
+            return _doubt_readings(fit, trial)
         most = max(chi2 for chi2, _ in causes)
         possible = [motion for chi2, motion in causes if most - chi2 < _AS_PROBABLE]
         if len(possible) > 1:
@@ -282,19 +284,24 @@ def _try_causes(
             trial = _try_row_times(fit, settings, progress)
         else:
             trial = _try_motion(fit, motion, settings, progress)
-        if trial is not None and _is_explained(fit, trial):
+        if trial is not None and _gain(fit, trial) > _LEAST_GAIN - _AS_PROBABLE:
             trials.append(trial)
             if _outlier_share(trial) < _FEW_OUTLIERS:
                 break
     return min(trials, key=lambda one: one.solution.cost, default=None)
 
 
-def _is_explained(fit: JointFit, trial: JointFit) -> bool:
-    """Return whether a trial explains a fit: its cost, and readings that would all be wrong without it."""
-    if _gain(fit, trial) > _LEAST_GAIN:
-        return True
-    before, after = (sum(one.score > _WRONG for one in standardise_readings(part)) for part in (fit, trial))
-    return _gain(fit, trial) + WRONG_NUMBER * (before - after) > _LEAST_GAIN
+def _doubt_readings(fit: JointFit, trial: JointFit) -> JointFit:
+    """Return a fit without certainty if a cause explains it nearly as well as wrong readings do."""
+    wrong = sorted({one.point for one in standardise_readings(fit) if one.score > _WRONG})
+    if not wrong:
+        return fit
+    cause = trial.known[-1]
+    text = (
+        f"{cause.text.split(';')[0]}; or readings of {', '.join(wrong)} are wrong: no position is certain; "
+        "measure these points again, and one more"
+    )
+    return replace(fit, known=(*fit.known, replace(cause, kind="doubt", text=text)), is_certain=False)
 
 
 def _name_rivals(fit: JointFit, possible: Sequence[CameraMotion | None]) -> Finding:
@@ -307,8 +314,17 @@ def _name_rivals(fit: JointFit, possible: Sequence[CameraMotion | None]) -> Find
 
 
 def _gain(fit: JointFit, trial: JointFit | None) -> float:
-    """Return by how much twice the cost of a fit is more than that of a trial."""
-    return 0.0 if trial is None else 2 * (fit.solution.cost - trial.solution.cost)
+    """Return by how much twice the cost of a fit is more than that of a trial.
+
+    A reading costs no more than a wrong number: a motion of a camera explains no mistyped height.
+    """
+    if trial is None:
+        return 0.0
+    before, after = (
+        2 * one.solution.cost - one.problem.points.excess_loss(one.state, one.problem.layout, WRONG_NUMBER)
+        for one in (fit, trial)
+    )
+    return before - after
 
 
 def _try_row_times(fit: JointFit, settings: JointSettings, progress: Progress) -> JointFit | None:

@@ -96,6 +96,11 @@ class PointFactors:
         losses = [robust_loss(chi2, limit * ease)[0].sum() for chi2, limit in _robust_parts(residuals)]
         return float(sum(losses) + (residuals.tilts**2).sum()) / 2
 
+    def excess_loss(self, state: State, layout: Layout, most: float) -> float:
+        """Return the sum of the losses of readings above ``most``."""
+        parts = _robust_parts(self.residuals(state, layout))
+        return float(sum(np.maximum(robust_loss(chi2, limit)[0] - most, 0).sum() for chi2, limit in parts))
+
     def add_to(self, normal: NormalEquations, state: State, layout: Layout, ease: float) -> None:
         """Add the weighted factors to normal equations; ``ease`` multiplies the limits of the loss."""
         residuals = self.residuals(state, layout)

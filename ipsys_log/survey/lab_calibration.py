@@ -43,6 +43,8 @@ _WORSE = 1.1
 _LARGE_SHARE = 0.4
 # Kinds of faults after which the covariance of the fit is not true. The robust loss removes the others.
 _CAUSES = ("doubt", "camera", "row_time", "length", "robot_height", "tape")
+# So are wrong readings of more than this share of the points: another fault may explain them all.
+_READINGS, _FEW_WRONG = ("distance", "height", "place", "swapped"), 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,8 +149,10 @@ class LabCalibration:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """The faults that make all figures untrue: wrong intrinsics, sizes and heights, and moved cameras."""
-        return (*self.contradictions, *(fault.text for fault in self.faults if fault.kind in _CAUSES))
+        """The faults that make all figures untrue: wrong intrinsics, sizes and readings, moved cameras."""
+        wrong = {fault.subject for fault in self.faults if fault.kind in _READINGS}
+        kinds = _CAUSES + (_READINGS if len(wrong) > _FEW_WRONG * len(self.points_m) else ())
+        return (*self.contradictions, *(fault.text for fault in self.faults if fault.kind in kinds))
 
     @property
     def is_enough(self) -> bool:

@@ -128,7 +128,6 @@ def turn_midway(lab: GeometricLab, name: str, turn_rad: Array, after_s: float) -
     ("seed", "name", "turn_deg", "after_s"),
     [
         pytest.param(200, "red", (-0.31, -0.07, -0.02), 15.1, id="only its points are before"),
-        pytest.param(211, "black", (-0.49, 0.05, 0.0), 29.7, id="only two points are before"),
         pytest.param(202, "white", (-0.3, -0.08, 0.35), 42.1, id="during the drive"),
         pytest.param(211, "red", (-0.49, 0.05, 0.0), 29.7, id="another camera explains more in one step"),
     ],
@@ -136,12 +135,33 @@ def turn_midway(lab: GeometricLab, name: str, turn_rad: Array, after_s: float) -
 def test_turned_camera_alone_is_accused(
     seed: int, name: str, turn_deg: tuple[float, ...], after_s: float
 ) -> None:
-    settings = LabSettings(seed=seed, rate_hz=10.0, drive_s=45.0, markers=1, row_time_ns=ROW_NS)
-    lab = build_lab(GeometricSettings(lab=settings, points=6, marker_scale_sigma=0.001))
-    fit = fit_hypotheses(turn_midway(lab, name, np.radians(turn_deg), after_s), COARSE)
+    fit = fit_hypotheses(turn_midway(drive_of(seed), name, np.radians(turn_deg), after_s), COARSE)
     assert kinds(fit) == [("camera", name)]
     stated_deg = float(find_faults(fit)[0].text.split(" degrees")[0].split()[-1])
     assert 0.6 < stated_deg / np.linalg.norm(turn_deg) < 1.4
+
+
+def drive_of(seed: int) -> GeometricLab:
+    settings = LabSettings(seed=seed, rate_hz=10.0, drive_s=45.0, markers=1, row_time_ns=ROW_NS)
+    return build_lab(GeometricSettings(lab=settings, points=6, marker_scale_sigma=0.001))
+
+
+def test_motion_or_wrong_readings_leave_no_certainty() -> None:
+    """Only two points are before the turn: it explains no more than two wrong heights."""
+    observations = turn_midway(drive_of(211), "black", np.radians((-0.49, 0.05, 0.0)), 29.7)
+    fit = fit_hypotheses(observations, COARSE)
+    assert kinds(fit) == [("doubt", "black"), ("height", "s005"), ("height", "s002")]
+    assert not fit.is_certain
+
+
+@pytest.mark.parametrize(("point", "error_m"), [(1, 0.02), (4, 0.05), (2, 0.2)])
+def test_wrong_height_accuses_no_camera(point: int, error_m: float) -> None:
+    observations = observe(drive_of(221))
+    points = list(observations.points)
+    points[point] = replace(points[point], height_m=(points[point].height_m or 0.0) + error_m)
+    fit = fit_hypotheses(replace(observations, points=tuple(points)))
+    assert kinds(fit) == [("height", points[point].name)]
+    assert fit.is_certain
 
 
 def test_camera_that_nothing_connects_is_left_out() -> None:

@@ -231,10 +231,15 @@ def _families(size: int) -> tuple[str, ...]:
 @cache
 def _words(dictionary: str) -> dict[bytes, int]:
     """Return the ids by the bytes of their cells, in all four turns."""
-    known, size = _known(dictionary), _size(dictionary)
+    codes, count = _known(dictionary).bytesList, _size(dictionary) ** 2
+    # All bytes of a turn stand before those of the next one.
+    bits = np.unpackbits(codes.reshape(len(codes), -1)[:, : codes.shape[1]], axis=1)
+    # The last byte has the last cells in its low bits.
+    bits = np.delete(bits, np.s_[count - count % 8 : bits.shape[1] - count % 8], axis=1)
+    squares = bits.reshape(-1, _size(dictionary), _size(dictionary))
+    turns = [np.ascontiguousarray(np.rot90(squares, turn, axes=(1, 2))) for turn in range(4)]
     words: dict[bytes, int] = {}
-    for n in range(len(known.bytesList)):
-        bits = np.asarray(known.getBitsFromByteList(known.bytesList[n : n + 1], size), dtype=np.uint8)
-        for turn in range(4):
-            words.setdefault(np.ascontiguousarray(np.rot90(bits, turn)).tobytes(), n)
+    for n, same in enumerate(zip(*turns, strict=True)):
+        for cells in same:
+            words.setdefault(cells.tobytes(), n)
     return words

@@ -47,8 +47,10 @@ class SizeTest:
         """Add the markers of a frame."""
         for _, is_due in self._sightings.add(time_ns, markers):
             seen = self._sightings.shapes(self.lens) if is_due else None
-            fit = None if seen is None else fit_shapes(seen, False)
-            if seen is not None and fit is not None and fit.rms < LEVEL_SCATTER:
+            if seen is None or sum(self.rig.height_of(n) is not None for n in seen.known_ids) < 2:
+                continue
+            fit = fit_shapes(seen, False)
+            if fit is not None and fit.rms < LEVEL_SCATTER:
                 yield from self._test_sizes(seen, fit)
         self._sightings.renew()
 

@@ -147,8 +147,6 @@ def _show(seconds: float, pages: int, with_images: bool) -> tuple[float, float]:
 
 def _draw(seconds: float) -> float:
     """Return the frames per second of a page in Chromium while messages come."""
-    if str(_ROOT) not in sys.path:
-        sys.path.append(str(_ROOT))
     from tests.web.phone import phone
 
     with tempfile.TemporaryDirectory() as folder, _served() as (show, url), phone(Path(folder)) as browser:

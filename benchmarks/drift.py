@@ -11,21 +11,25 @@ exactly: an error of the calibration has no effect on a difference. The script p
 from __future__ import annotations
 
 import argparse
+import sys
 from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
+
+sys.path.append(str(Path(__file__).resolve().parent.parent))
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
 from ipsys_log.analysis.drift import MeanCorners
 from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, shift_floor_map
 from ipsys_log.analysis.reference_markers import Window
 from ipsys_log.messages import Floor, Markers
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_weeks import FIRST_REFERENCE, Knock, WeekSettings, simulate_week
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.units import MM_PER_M, NS_PER_S
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.weeks import FIRST_REFERENCE, Knock, WeekSettings, simulate_week
 
 __all__ = ["measure"]
 

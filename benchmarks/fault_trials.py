@@ -11,6 +11,9 @@ from pathlib import Path
 
 __all__ = ["Fault", "Outcome", "Trial", "cases_folder"]
 
+# Benchmarks share labs and receivers with the tests.
+sys.path.append(str(Path(__file__).resolve().parent.parent))
+
 _ROOT = Path(__file__).resolve().parent.parent
 _TIMEOUT_S = 900.0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import socket
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,8 +37,6 @@ _TRACK = Track(
 
 def _send(trial: Trial, kind: str) -> Outcome:
     """Play a track to an autopilot; read the message by the rules of PX4 and ArduPilot."""
-    if str(_ROOT) not in sys.path:
-        sys.path.append(str(_ROOT))
     from tests.sinks.autopilots import ardupilot, px4
 
     rows = [

@@ -28,10 +28,10 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, POSITIONS
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import MM_PER_M
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 __all__ = ["FAULTS"]
 

@@ -16,9 +16,9 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers, Measurement, Message, Positions, Rig, Tracks
 from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 __all__ = ["FAULTS"]
 

@@ -27,23 +27,23 @@ from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import build_models
 from ipsys_log.joint.observations import Observations
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Measurement, Message, Pair, Rig
-from ipsys_log.simulation.corner_noise import (
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.stages.fit import fit_model
+from tests.geometric.corner_noise import (
     WHITE_SHARE,
     corner_covariances,
     draw_corner_noise,
     edge_sigma_px,
 )
-from ipsys_log.simulation.geometric_lab import (
+from tests.geometric.lab import (
     GeometricLab,
     GeometricSettings,
     PlacedMarkers,
     build_lab,
     camera_poses,
 )
-from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.stages.camera_frame import CameraFrame
-from ipsys_log.stages.fit import fit_model
+from tests.geometric.session import simulate_session
 
 __all__ = [
     "CONTENDERS",

@@ -27,10 +27,10 @@ from scenes import CACHE
 
 from ipsys_log.messages import Measurement, Message
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 __all__ = ["compare_honest_labs", "scale_tape"]
 

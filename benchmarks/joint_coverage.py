@@ -30,8 +30,8 @@ from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.parameters import CameraBlock, Layout
-from ipsys_log.simulation.geometric_lab import GeometricLab
 from ipsys_log.units import NS_PER_S
+from tests.geometric.lab import GeometricLab
 
 __all__ = ["COVERAGE_SCENES", "coverage_table", "error_sources", "measure_coverage"]
 

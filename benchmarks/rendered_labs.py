@@ -14,8 +14,8 @@ from ipsys_log.messages.channels import CALIBRATIONS, MARKERS, MEASUREMENTS, RIG
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.calibration_points import plan_points
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 
 __all__ = ["rendered_lab"]
 

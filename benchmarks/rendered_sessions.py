@@ -21,14 +21,14 @@ from ipsys_log.messages import CameraCalibration, CompressedImage, Markers, Mess
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.calibration_points import place_marker
 from ipsys_log.simulation.floor import FloorView, prepare_view
-from ipsys_log.simulation.geometric_lab import GeometricLab
-from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.geometric_sightings import start_ns, still_times_ns
 from ipsys_log.simulation.lab import moving_marker
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.stages.detect import STAGE, FrameDetector
 from ipsys_log.units import NS_PER_S
+from tests.geometric.lab import GeometricLab
+from tests.geometric.session import simulate_session
+from tests.geometric.sightings import start_ns, still_times_ns
 
 __all__ = ["rendered_session"]
 

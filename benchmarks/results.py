@@ -18,6 +18,9 @@ from rounds import Row
 
 __all__ = ["BENCHMARKS", "Report", "command", "parser_of", "run_all"]
 
+# Benchmarks share labs and receivers with the tests.
+sys.path.append(str(Path(__file__).resolve().parent.parent))
+
 BENCHMARKS = {
     "detection": "from a log to corners, beside a plain loop, a decoder and AprilTag",
     "replay": "the whole chain beside detection alone; memory over ten minutes",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,9 @@ from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "simulator_key", "truth", "with_restarts"]
+
+# Benchmarks share labs and receivers with the tests.
+sys.path.append(str(Path(__file__).resolve().parent.parent))
 
 CACHE = Path(__file__).resolve().parent.parent / ".cache" / "bench"
 

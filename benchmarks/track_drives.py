@@ -18,15 +18,15 @@ from rendered_sessions import rendered_session
 from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.payload import JOINT, joint_payload
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Rig
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.geometric_sightings import start_ns
 from ipsys_log.simulation.pace import Pace, Stops, draw_pace
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.locate import Locate
 from ipsys_log.units import NS_PER_S
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
+from tests.geometric.sightings import start_ns
 
 __all__ = ["CALIBRATIONS", "Condition", "SeenDrive", "Truth", "calibrate", "cover", "drive_through"]
 

@@ -6,7 +6,6 @@ The images are those of the rendered sample log. Random labs have markers on a f
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,17 +18,11 @@ from numpy.typing import NDArray
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.messages.channels import CALIBRATIONS, POSITIONS, RIG, TRUTH
+from tests.analysis.marked_floor import FISHEYE, calibrated_with_errors, changed, sighted
 
 __all__ = ["FAULTS"]
 
 _ROOT = Path(__file__).resolve().parent.parent
-sys.path.append(str(_ROOT))
-from tests.analysis.marked_floor import (  # noqa: E402
-    FISHEYE,
-    calibrated_with_errors,
-    changed,
-    sighted,
-)
 
 _SAMPLE = _ROOT / "sample_logs/small_lab.mcap"
 _CHI2_95 = 7.815  # of three coordinates

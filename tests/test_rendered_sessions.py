@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from ipsys_log.messages import Markers, Message
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 LAB = LabSettings(
     seed=7,

@@ -11,8 +11,8 @@ import pytest
 from ipsys_log.analysis.clock_offset import MarkerPath, estimate_clock_offset
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Markers
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 from tests.tiers import first_fast
 
 # The exposures of the cameras are out of step, and their stamps say so.

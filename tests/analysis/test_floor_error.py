@@ -25,12 +25,12 @@ from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measur
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, CameraPoints, Marker, Markers, Message, Positions, Rig
 from ipsys_log.simulation.cameras import sees
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.locate import Locate
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from ipsys_log import api
 from ipsys_log.catalogue.row import Baseline
 from ipsys_log.catalogue.table import update_catalogue
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.geometric_weeks import Knock, WeekSettings, simulate_week
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
+from tests.geometric.weeks import Knock, WeekSettings, simulate_week
 
 WEEKS = WeekSettings(duration_s=3.0, knocks=(Knock("white", 3, (0.0010, 0.0020, 0.0003)),))
 

@@ -22,10 +22,10 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Distance, Markers, Measurement, Message, Rig
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 # Smaller than a real session: the fit takes about two seconds.
 SETTINGS = GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=25.0, seed=3), points=6)
@@ -341,7 +341,7 @@ def test_markers_on_two_reference_points_replace_the_tape(
 
 
 def _rig(lab: GeometricLab) -> Rig:
-    from ipsys_log.simulation.geometric_session import geometric_rig
+    from tests.geometric.session import geometric_rig
 
     return geometric_rig(lab)
 

@@ -20,9 +20,11 @@ from ipsys_log.messages import Floor, Model
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.geometric_weeks import (
+from ipsys_log.simulation.settings import LabSettings
+from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
+from tests.geometric.weeks import (
     Knock,
     WeekSettings,
     knock_camera,
@@ -30,8 +32,6 @@ from ipsys_log.simulation.geometric_weeks import (
     simulate_week,
     week_start_ns,
 )
-from ipsys_log.simulation.settings import LabSettings
-from tests.conftest import Ipsys
 
 Array = NDArray[np.float64]
 

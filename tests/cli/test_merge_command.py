@@ -15,9 +15,9 @@ from ipsys_log.log.shifted_times import shift_times
 from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 from tests.shared_files import make_once
 
 CLOCKS_NS = {"red": 0, "white": 1_234_567_890, "black": -2_300_000_321}

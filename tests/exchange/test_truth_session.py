@@ -11,11 +11,11 @@ import pytest
 import ipsys_log as ipsys_api
 from ipsys_log.messages import TRUTH_TOPIC
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
 from tests.exchange.driven_lab import OtherSystem
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 
 def _moved_table(path: Path, truth: Path, system: OtherSystem) -> None:

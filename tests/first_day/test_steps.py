@@ -16,11 +16,11 @@ from ipsys_log.first_day.rig_entry import save_rig_entry
 from ipsys_log.first_day.steps import Status, read_progress
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.survey.checks import withdrawal_of
 from ipsys_log.survey.from_log import open_finished_log
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 from tests.test_record import lens_yaml
 
 D, R, W = Status.DONE, Status.READY, Status.WAITS

@@ -10,9 +10,9 @@ from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.model import build_models
 from ipsys_log.messages import Markers, Measurement
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import geometric_rig, simulate_session
 from tests.joint.test_drives import COARSE, observe
 
 

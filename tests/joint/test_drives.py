@@ -16,9 +16,9 @@ from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 from tests.joint.differences import jacobian_of, residuals_of
 
 COARSE = JointSettings(floor_length_m=2.0)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
 from tests.joint.test_drives import observe
 
 LAB = GeometricSettings(lab=LabSettings(seed=6, rate_hz=10.0, drive_s=0.0), points=60)

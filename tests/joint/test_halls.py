@@ -24,10 +24,10 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.solver import Solution, solve
 from ipsys_log.joint.start import place_cameras
 from ipsys_log.messages import Markers, Measurement, Rig
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_points import choose_points
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.hall import hall_settings
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.points import choose_points
+from tests.geometric.session import simulate_session
 
 Array = NDArray[np.float64]
 

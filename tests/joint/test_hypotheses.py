@@ -18,10 +18,10 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload, restore_joint
 from ipsys_log.joint.selection import seeing_cameras, without_points
 from ipsys_log.messages import Marker, Markers, Message, Rig, RigMarker
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 from tests.joint.small_lab import REFERENCES_M, Array, make_lab
 from tests.joint.test_drives import COARSE, gather, observe
 

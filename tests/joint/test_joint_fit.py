@@ -16,8 +16,8 @@ from ipsys_log.joint.model import build_models
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.solver import solve
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
 from tests.joint.differences import descend, jacobian_of, minimise, residuals_of, split_step, step_sizes
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
 from tests.joint.test_drives import observe

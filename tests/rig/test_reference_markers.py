@@ -22,10 +22,10 @@ from ipsys_log.messages import (
 )
 from ipsys_log.report.prints import rig_prints
 from ipsys_log.rig.file import load_rig, rig_toml
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_weeks import WeekSettings, reference_rig, simulate_week
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.weeks import WeekSettings, reference_rig, simulate_week
 
 RIG = Rig(
     "lab",

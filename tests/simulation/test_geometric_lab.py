@@ -23,11 +23,11 @@ from ipsys_log.rig.file import check_rig
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.cameras import Camera
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
-from ipsys_log.simulation.geometric_sightings import simulate_sightings
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
+from tests.geometric.sightings import simulate_sightings
 
 Array = NDArray[np.float64]
 

@@ -13,11 +13,11 @@ from ipsys_log.rig.file import check_rig
 from ipsys_log.simulation.cameras import mount_cameras, sees
 from ipsys_log.simulation.drive import plan_drive
 from ipsys_log.simulation.drive_paths import LanePath
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.hall import hall_settings, parse_grid
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 
 def test_every_place_of_a_hall_is_seen_and_neighbours_overlap() -> None:

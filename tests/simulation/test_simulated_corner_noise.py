@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import pose_facing_up
 from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.corner_noise import (
+from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.corner_noise import (
     REPEATABLE_SHARE,
     WHITE_SHARE,
     corner_covariances,
     draw_corner_noise,
     edge_sigma_px,
 )
-from ipsys_log.simulation.settings import LabSettings
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.simulation.smooth_fields import SmoothField, SmoothSignal
+from tests.geometric.smooth_fields import SmoothField, SmoothSignal
 
 FIELDS = 1500
 

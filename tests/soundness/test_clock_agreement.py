@@ -11,12 +11,12 @@ from ipsys_log import api
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ClockEstimate, Message, clock_topic
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.soundness.clocks import check_clocks
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 MS = NS_PER_S // 1000
 

@@ -23,14 +23,14 @@ from ipsys_log.models.table import MODELS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.select import evaluated_models
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.survey.checks import check_entry
 from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.survey.scene import observe_marker
 from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
 
 HOUR_NS = 3_600_000_000_000
 

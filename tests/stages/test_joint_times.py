@@ -7,9 +7,9 @@ from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.messages import Markers, Measurement, Positions
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import geometric_rig, simulate_session
 
 
 def test_positions_have_the_time_of_the_reference_camera() -> None:

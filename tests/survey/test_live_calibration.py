@@ -10,10 +10,10 @@ from dataclasses import replace
 import pytest
 
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import geometric_rig, simulate_session
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.survey.live_calibration import LiveCalibration
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import geometric_rig, simulate_session
 
 LAB = build_lab(GeometricSettings(lab=LabSettings(rate_hz=6.0, drive_s=12.0, seed=3), points=6))
 

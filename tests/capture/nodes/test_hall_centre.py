@@ -24,11 +24,11 @@ from ipsys_log.messages import FRAME_SKIPPED, Markers, Message, RigCamera, RigNo
 from ipsys_log.messages.channels import EVENTS, MARKERS, POSITIONS, TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.geometric_lab import GeometricLab, GeometricSettings, build_lab
-from ipsys_log.simulation.geometric_session import MARKERS_RUN, geometric_rig, simulate_session
 from ipsys_log.simulation.hall import hall_settings
 from tests.capture.nodes.lab_of_nodes import PATIENCE_S
 from tests.conftest import Ipsys
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.session import MARKERS_RUN, geometric_rig, simulate_session
 from tests.ports import free_port
 
 ROBOTS, SECONDS, RATE_HZ = 12, 2.0, 30.0

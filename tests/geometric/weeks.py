@@ -26,12 +26,12 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import MARKERS, RECORD
 from ipsys_log.simulation.cameras import Camera, sees
-from ipsys_log.simulation.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
-from ipsys_log.simulation.geometric_lab import GeometricLab
-from ipsys_log.simulation.geometric_session import MARKERS_RUN, geometric_rig
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.units import NS_PER_S
+from tests.geometric.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
+from tests.geometric.lab import GeometricLab
+from tests.geometric.session import MARKERS_RUN, geometric_rig
 
 # The id of the first reference marker.
 FIRST_REFERENCE = 90

@@ -14,11 +14,11 @@ from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import transform
 from ipsys_log.simulation.calibration_points import SimulatedPose
 from ipsys_log.simulation.cameras import Camera, sees
-from ipsys_log.simulation.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
-from ipsys_log.simulation.geometric_lab import GeometricLab, PlacedMarkers, camera_poses
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.settings import Purpose, random_stream
 from ipsys_log.units import NS_PER_S
+from tests.geometric.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
+from tests.geometric.lab import GeometricLab, PlacedMarkers, camera_poses
 
 # Pause of the recording, for the transport of the markers to their next calibration points.
 _PAUSE_NS = 3 * NS_PER_S
@@ -62,7 +62,7 @@ def simulate_sightings(lab: GeometricLab, camera: Camera) -> CameraSightings:
 
     Parameters
     ----------
-    lab : from :func:`~ipsys_log.simulation.geometric_lab.build_lab`.
+    lab : from :func:`~tests.geometric.lab.build_lab`.
     camera : one of its cameras.
     """
     settings, parts = lab.settings.lab, [*_still_parts(lab, camera), *_drive_parts(lab, camera)]

@@ -16,10 +16,10 @@ from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.calibration_points import SimulatedPose
 from ipsys_log.simulation.cameras import Camera, aim_cameras, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
-from ipsys_log.simulation.geometric_points import choose_points
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
-from ipsys_log.simulation.smooth_fields import SmoothField, SmoothSignal
 from ipsys_log.units import NS_PER_S
+from tests.geometric.points import choose_points
+from tests.geometric.smooth_fields import SmoothField, SmoothSignal
 
 # Kinds of intrinsics that the user has.
 INTRINSICS = ("true", "calibrated", "nominal")

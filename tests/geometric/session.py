@@ -29,16 +29,16 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MARKERS, RECORD
 from ipsys_log.simulation.calibration_points import SimulatedPose, measure
 from ipsys_log.simulation.cameras import Camera
-from ipsys_log.simulation.geometric_lab import GeometricLab, PlacedMarkers
-from ipsys_log.simulation.geometric_sightings import (
+from ipsys_log.simulation.lab import EPOCH_NS, ROBOT_HEIGHT_SIGMA_M, build_rig
+from ipsys_log.units import NS_PER_S
+from tests.geometric.lab import GeometricLab, PlacedMarkers
+from tests.geometric.sightings import (
     drive_times_ns,
     pose_array,
     simulate_sightings,
     start_ns,
     still_times_ns,
 )
-from ipsys_log.simulation.lab import EPOCH_NS, ROBOT_HEIGHT_SIGMA_M, build_rig
-from ipsys_log.units import NS_PER_S
 
 MARKERS_RUN = "geometric"
 # From the end of a frame to its arrival, and from the last frame at a point to the end of its measurement.
@@ -64,7 +64,7 @@ def simulate_session(lab: GeometricLab) -> Iterator[Message]:
 
     Examples
     --------
-    >>> from ipsys_log.simulation.geometric_lab import GeometricSettings, build_lab
+    >>> from tests.geometric.lab import GeometricSettings, build_lab
     >>> messages = list(simulate_session(build_lab(GeometricSettings(points=3))))
     >>> [message.topic for message in messages][:2]
     ['/rig', '/cameras/red/calibration']

@@ -15,7 +15,7 @@ class Marker:
     the first pixel. ``covariance_px2`` is that of x0 y0 .. x3 y3, in single precision. The marker was exposed
     ``time_offset_ns`` after the time of the frame. Its edges of black lie ``edge_offset_px`` too far inside
     the black. ``contradicted`` is True from the frame on in which the markers of this camera contradict its
-    intrinsics, or this marker its length.
+    intrinsics.
     """
 
     id: int

@@ -46,9 +46,8 @@ class Ros2Positions:
         """Decode PoseWithCovarianceStamped: the stamp, the name of the frame, position and rotation (CDR)."""
         try:
             seconds, nanoseconds, length = struct.unpack_from("<iII", data, 4)
-            start = (
-                16 + length
-            )  # numbers of 8 bytes begin at a multiple of 8, after the 4 bytes of the header
+            start = 16 + length
+            # Numbers of 8 bytes begin at a multiple of 8, after the 4 bytes of the header.
             x_m, y_m, _, _, _, z, w = struct.unpack_from("<7d", data, start + (4 - start) % 8)
         except struct.error:
             return

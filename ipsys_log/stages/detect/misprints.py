@@ -231,7 +231,7 @@ def _families(size: int) -> tuple[str, ...]:
 @cache
 def _words(dictionary: str) -> dict[bytes, int]:
     """Return the ids by the bytes of their cells, in all four turns."""
-    codes, count = _known(dictionary).bytesList, _size(dictionary) ** 2
+    codes, count = np.asarray(_known(dictionary).bytesList, dtype=np.uint8), _size(dictionary) ** 2
     # All bytes of a turn stand before those of the next one.
     bits = np.unpackbits(codes.reshape(len(codes), -1)[:, : codes.shape[1]], axis=1)
     # The last byte has the last cells in its low bits.

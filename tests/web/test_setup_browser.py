@@ -142,7 +142,7 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: 
         says(browser, "#state", "7 of 7")
         assert browser.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
         leave(browser)
-    assert visitor.inputs == 11  # docs/setup.md lists them
+    assert visitor.inputs == 11  # docs/your-lab.md names the number
     assert unexpected(browser) == []
     assert [step.status for step in read_progress(LabFolder(folder)).steps] == [Status.DONE] * 7
     positions_m = errors_m(folder / "live.mcap")

@@ -176,7 +176,7 @@ def test_questions_of_the_documentation_have_answers(
     ask: Any = duckdb.sql
     monkeypatch.chdir(tmp_path)
     update_catalogue(folder, tmp_path / "catalogue.parquet")
-    page = (ROOT / "docs" / "batch.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
     questions = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
     errors, drift, outdated, _ = [ask(question).fetchall() for question in questions]
     assert {model for _, model, *_ in errors} == {"rigid", "poly", "best"}

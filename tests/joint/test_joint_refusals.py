@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import FitError
-from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.fit import explain, fit_jointly
 from ipsys_log.joint.observations import Observations, marker_body
-from ipsys_log.joint.refusals import explain
 from ipsys_log.joint.solver import ConvergenceError
 from tests.joint.small_lab import make_lab
 

@@ -193,7 +193,9 @@ def _leap_along_valley(
 ) -> tuple[State, float, float] | None:
     """Take a long step, and return to the bottom of the valley by a few more.
 
-    The cost rises in between, but it is smaller at the end.
+    The cost rises in between, but it is smaller at the end. With nominal intrinsics and a short drive, focal
+    length, lens distortion and height of a camera have such a valley: they compensate each other along a
+    curve. A straight step is exact only near its start, so the damping keeps the usual steps short.
 
     Parameters
     ----------

@@ -23,7 +23,6 @@ from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.camera_labels import MOST_IN_LEGEND
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.report.html_recording import recording_values
-from ipsys_log.report.overlap_figure import overlap_pictures
 from ipsys_log.report.trajectory_table import TRAJECTORY_COLUMNS, rows_of_run
 from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.provenance import newest_run
@@ -118,7 +117,7 @@ def _overlap(session: Session, findings: Findings) -> dict[str, Any]:
     pairs = read_disagreement(session, run, reference_ids(session)) if run else []
     return {
         "overlap": {"run": run, **html_sections.overlap_tables(pairs)} if pairs else None,
-        "overlap_pictures": overlap_pictures(pairs, findings.rig) if pairs else [],
+        "overlap_pictures": html_figures.overlap_pictures(pairs, findings.rig) if pairs else [],
     }
 
 

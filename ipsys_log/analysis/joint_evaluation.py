@@ -10,6 +10,7 @@ import numpy as np
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
+    Study,
     gather_points,
     learning_curve,
     learning_sizes,
@@ -18,7 +19,6 @@ from ipsys_log.analysis.cross_validation import (
 )
 from ipsys_log.analysis.joint_calibration import fit_without
 from ipsys_log.analysis.outliers import describe_outlier
-from ipsys_log.analysis.study import Study
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError

@@ -20,8 +20,8 @@ from ipsys_log.cli.stages import build_command, options_until, replay_options
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from ipsys_log.batch.settings import WorkerSettings
     from ipsys_log.batch.tasks import BatchTask, LogResult
+    from ipsys_log.batch.workers import WorkerSettings
     from ipsys_log.log.location import LogLocation
 
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
@@ -177,7 +177,7 @@ def _run(
     logs : as the user named them. Each must exist; a link without a file in a folder only fails itself.
     paths : the logs of the folders and patterns in ``logs``; None: they are searched here.
     """
-    from ipsys_log.batch.settings import WorkerSettings
+    from ipsys_log.batch.workers import WorkerSettings
     from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
     from ipsys_log.report.files import check_file, check_parquet_name

@@ -11,17 +11,16 @@ from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
-from ipsys_log.joint.floor_unevenness import most_likely_scale
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import Layout, State, make_layout
 from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
+from ipsys_log.joint.prior_sigmas import most_likely_scale, widen_tape
 from ipsys_log.joint.problem import Problem, find_blocks
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
-from ipsys_log.joint.tape_scale import widen_tape
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
 # The field of the floor reaches this far beyond the outermost place of a marker.

@@ -17,15 +17,6 @@ from ipsys_log.messages.channels import (
     clock_topic,
     image_topic,
 )
-from ipsys_log.messages.commands import (
-    DRIVING,
-    FINISHED,
-    HOLDING,
-    STOPPED,
-    RobotPath,
-    Waypoint,
-    WheelCommand,
-)
 from ipsys_log.messages.events import (
     ASSUMED_MODEL,
     CAMERA_MOVED,
@@ -96,14 +87,21 @@ from ipsys_log.messages.runs import (
     Run,
 )
 from ipsys_log.messages.tracks import (
+    DRIVING,
+    FINISHED,
+    HOLDING,
+    STOPPED,
     FrameTransform,
     FrameTransforms,
     Position,
     Positions,
     Quaternion,
+    RobotPath,
     Track,
     Tracks,
     Vector3,
+    Waypoint,
+    WheelCommand,
 )
 
 __all__ = [

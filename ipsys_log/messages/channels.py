@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from ipsys_log.messages.commands import RobotPath, WheelCommand
 from ipsys_log.messages.events import ClockEstimate, Event, Latency
 from ipsys_log.messages.images import (
     CompressedImage,
@@ -20,7 +19,7 @@ from ipsys_log.messages.measurements import Measurement
 from ipsys_log.messages.models import Evaluation, Model
 from ipsys_log.messages.rig import CameraCalibration, Rig
 from ipsys_log.messages.runs import Cut, Merge, Run
-from ipsys_log.messages.tracks import FrameTransforms, Positions, Tracks
+from ipsys_log.messages.tracks import FrameTransforms, Positions, RobotPath, Tracks, WheelCommand
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -131,9 +131,8 @@ def simulate(output: Path, cameras: str | None, **settings: Any) -> None:
     The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m. With --cameras
     6x4, it is a hall: 24 cameras, 5 m above a floor of 20 x 15 m."""
     from ipsys_log.runs.output import write_log
-    from ipsys_log.simulation.hall import hall_settings, parse_grid
     from ipsys_log.simulation.lab import simulate
-    from ipsys_log.simulation.settings import LabSettings
+    from ipsys_log.simulation.settings import LabSettings, hall_settings, parse_grid
 
     lab = LabSettings(**settings) if cameras is None else hall_settings(*parse_grid(cameras), **settings)
     text = f"{output} was not written: the log of a simulated lab is written completely or not at all"

@@ -24,7 +24,7 @@ from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.solver import Solution, solve
 from ipsys_log.joint.start import place_cameras
 from ipsys_log.messages import Markers, Measurement, Rig
-from ipsys_log.simulation.hall import hall_settings
+from ipsys_log.simulation.settings import hall_settings
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.points import choose_points
 from tests.geometric.session import simulate_session

@@ -1,4 +1,4 @@
-"""Poses, images and camera intrinsics as serialised messages of ROS 2: axes and frames by REP 103 and REP 105.
+"""Poses, images and camera intrinsics as messages of ROS 2: axes and frames by REP 103 and REP 105.
 
 The axes of the lab are those of the frame ``map``: x and y on the floor, z up, m and rad. The frame of a
 robot has the robot's name; its origin is the marker, and x points along the heading.

@@ -120,7 +120,7 @@ def _export(
     overwrite: bool,
     **batch: Any,
 ) -> None:
-    from ipsys_log.batch.exports import export_log, plan_exports
+    from ipsys_log.batch.log_work import export_log, plan_exports
     from ipsys_log.batch.tasks import BatchTask
 
     wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}

@@ -24,8 +24,7 @@ from ipsys_log.plain_text import plain_text, shell_words
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
-from ipsys_log.report.camera_labels import MOST_IN_LEGEND
-from ipsys_log.report.figures import style_axes
+from ipsys_log.report.figures import MOST_IN_LEGEND, style_axes
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.report.html_figures import new_figure, picture
 from ipsys_log.report.latency_figure import draw_shares, draw_steps

@@ -15,8 +15,7 @@ from ipsys_log.analysis.disagreement import PairDisagreement, divide_floor, divi
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
 from ipsys_log.report.advice import has_published, label
-from ipsys_log.report.camera_labels import has_legend
-from ipsys_log.report.figures import style_axes, svg_data_uri
+from ipsys_log.report.figures import has_legend, style_axes, svg_data_uri
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.joint_figures import (

@@ -33,7 +33,7 @@ from ipsys_log.capture.video_files import check_playback_source, open_playback
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import Rig, RigCamera
-from ipsys_log.passwords import HIDDEN, hide_password
+from ipsys_log.plain_text import HIDDEN, hide_password
 
 _QUALITY = 92
 

@@ -15,7 +15,7 @@ from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.measure_live import say_faults
 from ipsys_log.cli.options import Host, NewLog, OtherLog, Port, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
-from ipsys_log.plain_text import shell_words
+from ipsys_log.plain_text import HIDDEN, shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
@@ -84,7 +84,6 @@ def init(
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.lab_files import write_new
-    from ipsys_log.passwords import HIDDEN
     from ipsys_log.rig.file import example_toml
 
     if simulated:

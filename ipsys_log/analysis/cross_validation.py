@@ -258,6 +258,28 @@ def published_curve(
     return points
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Study:
+    """The data for an evaluation.
+
+    Attributes
+    ----------
+    places : the measurements that count.
+    pairs : pairs of all measurements that a camera saw, by camera.
+    held_out : ids of the held-out measurements.
+    subsets : ids by the label of a published subset for fitting.
+    truth : ground-truth world points (3,) in m by id; empty outside a simulated lab.
+    seed : of folds and random subsets; None for a model of another log, which is not fitted again.
+    """
+
+    places: Sequence[RiggedMeasurement]
+    pairs: Mapping[str, Sequence[Pair]]
+    held_out: set[str]
+    subsets: Mapping[str, set[str]]
+    truth: Mapping[str, NDArray[np.float64]]
+    seed: int | None
+
+
 def _first(places: CalibrationPoints, order: list[str], size: int) -> list[str]:
     own = set(places.point_names)
     return [place for place in order if place in own][:size]
@@ -281,25 +303,3 @@ def _errors(
                 float(np.linalg.norm(offsets_m[:, :2], axis=1).mean()),
             )
     return errors
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Study:
-    """The data for an evaluation.
-
-    Attributes
-    ----------
-    places : the measurements that count.
-    pairs : pairs of all measurements that a camera saw, by camera.
-    held_out : ids of the held-out measurements.
-    subsets : ids by the label of a published subset for fitting.
-    truth : ground-truth world points (3,) in m by id; empty outside a simulated lab.
-    seed : of folds and random subsets; None for a model of another log, which is not fitted again.
-    """
-
-    places: Sequence[RiggedMeasurement]
-    pairs: Mapping[str, Sequence[Pair]]
-    held_out: set[str]
-    subsets: Mapping[str, set[str]]
-    truth: Mapping[str, NDArray[np.float64]]
-    seed: int | None

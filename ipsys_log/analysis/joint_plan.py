@@ -102,21 +102,6 @@ def plan_joint_points(
     return MeasurementPlan(places, maps_m[0], maps_m[-1], {one.camera: one.seen for one in expected})
 
 
-def _least(expected: Sequence[ExpectedErrors], updates: Sequence[Array | None]) -> list[Array]:
-    """Return the least expected error of the cameras at each node, (n,), after each update of the modes.
-
-    The error is NaN if no camera sees the node.
-    """
-    maps_m = [np.full(len(expected[0].seen), np.nan) for _ in updates]
-    for one in expected:
-        modes_m = one.modes_m()
-        for least_m, update in zip(maps_m, updates, strict=True):
-            updated_m = modes_m if update is None else modes_m @ update
-            errors_m = mean_lengths(updated_m @ updated_m.swapaxes(1, 2))
-            least_m[one.seen] = np.fmin(least_m[one.seen], errors_m)
-    return maps_m
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedDrive:
     """A drive in curves through a rectangle of the floor, and its effect.
@@ -183,6 +168,21 @@ def choose_drive(
     cameras = tuple(camera for camera, own in zip(models, seen[:, rows_y, rows_x], strict=True) if own.any())
     drive_m = inside_m.min(axis=0) - half_m, np.minimum(inside_m.max(axis=0) + half_m, high_m)
     return PlannedDrive(*drive_m, cameras, mean_error(modes_m), after_m)
+
+
+def _least(expected: Sequence[ExpectedErrors], updates: Sequence[Array | None]) -> list[Array]:
+    """Return the least expected error of the cameras at each node, (n,), after each update of the modes.
+
+    The error is NaN if no camera sees the node.
+    """
+    maps_m = [np.full(len(expected[0].seen), np.nan) for _ in updates]
+    for one in expected:
+        modes_m = one.modes_m()
+        for least_m, update in zip(maps_m, updates, strict=True):
+            updated_m = modes_m if update is None else modes_m @ update
+            errors_m = mean_lengths(updated_m @ updated_m.swapaxes(1, 2))
+            least_m[one.seen] = np.fmin(least_m[one.seen], errors_m)
+    return maps_m
 
 
 def _update(rows: Array, seen: NDArray[np.bool_]) -> Array:

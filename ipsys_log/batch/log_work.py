@@ -189,17 +189,6 @@ def plan_exports(
     return targets
 
 
-def _check_distinct(targets: Mapping[LogLocation, Path]) -> None:
-    log_of: dict[Path, LogLocation] = {}
-    for log, target in targets.items():
-        other = log_of.setdefault(target, log)
-        if other != log:
-            raise IpsysError(
-                f"{other} and {log} would both be exported to {target}; rename one, or export them into two "
-                "folders"
-            )
-
-
 def export_log(
     path: LogLocation, target: Path, overwrite: bool = False, derived: Path | None = None, **wishes: Any
 ) -> LogResult:
@@ -225,6 +214,17 @@ def export_log(
     return LogResult(
         str(path), _EXPORTED, runs=exported.runs, messages=exported.rows, derived=name_derived(logs)
     )
+
+
+def _check_distinct(targets: Mapping[LogLocation, Path]) -> None:
+    log_of: dict[Path, LogLocation] = {}
+    for log, target in targets.items():
+        other = log_of.setdefault(target, log)
+        if other != log:
+            raise IpsysError(
+                f"{other} and {log} would both be exported to {target}; rename one, or export them into two "
+                "folders"
+            )
 
 
 def _is_newer(target: Path, logs: Sequence[LogLocation]) -> bool:

@@ -246,13 +246,6 @@ def free_room(target: Path, bytes_per_s: float) -> DiskRoom:
     return DiskRoom(folder, free_bytes - reserved_bytes(free_bytes), bytes_per_s)
 
 
-def _frame_bytes(state: CameraState) -> float:
-    if state.format in ("h264", "h265") and state.size_px is not None:
-        width, height = state.size_px
-        return _VIDEO_BYTES_PER_PX * width * height
-    return state.first_bytes
-
-
 class RecordedFile:
     """An open file that is found again: another program can rename, move or delete it while it grows.
 
@@ -307,3 +300,10 @@ class RecordedFile:
             return os.path.samestat(os.fstat(self._fd), path.stat())
         except (OSError, ValueError):
             return False
+
+
+def _frame_bytes(state: CameraState) -> float:
+    if state.format in ("h264", "h265") and state.size_px is not None:
+        width, height = state.size_px
+        return _VIDEO_BYTES_PER_PX * width * height
+    return state.first_bytes

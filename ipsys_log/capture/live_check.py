@@ -117,16 +117,6 @@ class CameraMonitor:
         return FrameCheck(tuple(sorted(counts)), unknown, brightness, sharpness, tuple(warnings))
 
 
-def _unknown(ids: tuple[int, ...]) -> str:
-    """Return advice about markers that are in the image but not in the rig."""
-    names = ", ".join(map(str, ids))
-    if len(ids) == 1:
-        subject, todo = f"marker {names} is", "to track it"
-    else:
-        subject, todo = f"markers {names} are", "to track them"
-    return f"{subject} seen, but not in the rig; {todo}, add [[markers]] with id = {ids[0]} to lab.toml"
-
-
 class KnockEvents:
     """A consumer of live results that adds an event, and prints its text, when a camera has moved.
 
@@ -150,3 +140,13 @@ class KnockEvents:
         elif self._monitor is not None:
             for knock in self._monitor(message):
                 self._cameras.add_event(CAMERA_MOVED, knock.text, knock.camera)
+
+
+def _unknown(ids: tuple[int, ...]) -> str:
+    """Return advice about markers that are in the image but not in the rig."""
+    names = ", ".join(map(str, ids))
+    if len(ids) == 1:
+        subject, todo = f"marker {names} is", "to track it"
+    else:
+        subject, todo = f"markers {names} are", "to track them"
+    return f"{subject} seen, but not in the rig; {todo}, add [[markers]] with id = {ids[0]} to lab.toml"

@@ -176,31 +176,6 @@ def list_modes(device: int) -> list[Mode]:
     ]
 
 
-def _sizes(device: int, pixels: int) -> Iterator[tuple[int, int]]:
-    def at(index: int) -> v4l2.FrameSize:
-        return v4l2.FrameSize(index=index, pixel_format=pixels)
-
-    for size in v4l2.enumerate_items(device, v4l2.ENUM_FRAMESIZES, at):
-        sides = size.sides
-        if size.type == v4l2.DISCRETE:
-            yield sides[0], sides[1]
-        else:
-            yield from ((sides[0], sides[3]), (sides[1], sides[4]))
-            return
-
-
-def _rates_hz(device: int, pixels: int, width: int, height: int) -> Iterator[float]:
-    def at(index: int) -> v4l2.FrameInterval:
-        return v4l2.FrameInterval(index=index, pixel_format=pixels, width=width, height=height)
-
-    for interval in v4l2.enumerate_items(device, v4l2.ENUM_FRAMEINTERVALS, at):
-        times = interval.times
-        yield times[1] / times[0]
-        if interval.type != v4l2.DISCRETE:
-            yield times[3] / times[2]
-            return
-
-
 class BandwidthDemand(NamedTuple):
     """The bandwidth demand of a camera.
 
@@ -271,6 +246,31 @@ def advise_bandwidth(demands: Sequence[BandwidthDemand]) -> list[str]:
             by_bus[demand.bus].append(demand)
     lines = (_explain(bus, shared) for bus, shared in sorted(by_bus.items()))
     return [line for line in lines if line]
+
+
+def _sizes(device: int, pixels: int) -> Iterator[tuple[int, int]]:
+    def at(index: int) -> v4l2.FrameSize:
+        return v4l2.FrameSize(index=index, pixel_format=pixels)
+
+    for size in v4l2.enumerate_items(device, v4l2.ENUM_FRAMESIZES, at):
+        sides = size.sides
+        if size.type == v4l2.DISCRETE:
+            yield sides[0], sides[1]
+        else:
+            yield from ((sides[0], sides[3]), (sides[1], sides[4]))
+            return
+
+
+def _rates_hz(device: int, pixels: int, width: int, height: int) -> Iterator[float]:
+    def at(index: int) -> v4l2.FrameInterval:
+        return v4l2.FrameInterval(index=index, pixel_format=pixels, width=width, height=height)
+
+    for interval in v4l2.enumerate_items(device, v4l2.ENUM_FRAMEINTERVALS, at):
+        times = interval.times
+        yield times[1] / times[0]
+        if interval.type != v4l2.DISCRETE:
+            yield times[3] / times[2]
+            return
 
 
 def _explain(bus: int, shared: Sequence[BandwidthDemand]) -> str | None:

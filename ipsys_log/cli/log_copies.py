@@ -157,6 +157,48 @@ def compact(
         _show_saving(size, output)
 
 
+def merge(
+    logs: Annotated[
+        LogList,
+        log_argument(help="The logs of the recorders, files or URLs. The clock of the first log counts."),
+    ],
+    output: NewLog,
+    offset: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            metavar="NAME=SECONDS",
+            help="Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Merge the logs of several recorders of one session, with different cameras, into a new log.
+
+    Each recorder has its own clock. Without --offset, the command estimates the offset of a log from moving
+    markers that its cameras and those of an earlier log saw. Run ipsys detect on both logs first. Rigs and
+    intrinsics must not contradict each other. The new log has the record of the merge with all offsets.
+    """
+    from ipsys_log.runs.merge import merge as merge_logs
+    from ipsys_log.runs.merge_offsets import choose_offsets
+    from ipsys_log.runs.output import check_copy
+
+    check_copy(logs, output, overwrite)
+    with progress_bar() as progress:
+        offsets = choose_offsets(logs, offset or (), progress)
+        result = merge_logs(logs, output, offsets, overwrite, progress)
+    if as_json:
+        print(json.dumps(_merge_json(output, result), indent=2))  # noqa: T201
+        return
+    _show_merge(logs, offsets, result)
+    from ipsys_log.units import format_bytes
+
+    console.print(
+        f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}", markup=False
+    )
+    remarks.print(f"next: ipsys replay {shell_words(output)}", markup=False)
+
+
 def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> None:
     from ipsys_log.units import format_bytes
 
@@ -201,48 +243,6 @@ def _compact_json(
             for one in dropped
         ],
     }
-
-
-def merge(
-    logs: Annotated[
-        LogList,
-        log_argument(help="The logs of the recorders, files or URLs. The clock of the first log counts."),
-    ],
-    output: NewLog,
-    offset: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            metavar="NAME=SECONDS",
-            help="Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-) -> None:
-    """Merge the logs of several recorders of one session, with different cameras, into a new log.
-
-    Each recorder has its own clock. Without --offset, the command estimates the offset of a log from moving
-    markers that its cameras and those of an earlier log saw. Run ipsys detect on both logs first. Rigs and
-    intrinsics must not contradict each other. The new log has the record of the merge with all offsets.
-    """
-    from ipsys_log.runs.merge import merge as merge_logs
-    from ipsys_log.runs.merge_offsets import choose_offsets
-    from ipsys_log.runs.output import check_copy
-
-    check_copy(logs, output, overwrite)
-    with progress_bar() as progress:
-        offsets = choose_offsets(logs, offset or (), progress)
-        result = merge_logs(logs, output, offsets, overwrite, progress)
-    if as_json:
-        print(json.dumps(_merge_json(output, result), indent=2))  # noqa: T201
-        return
-    _show_merge(logs, offsets, result)
-    from ipsys_log.units import format_bytes
-
-    console.print(
-        f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}", markup=False
-    )
-    remarks.print(f"next: ipsys replay {shell_words(output)}", markup=False)
 
 
 def _show_merge(logs: Sequence[LogLocation], offsets: Sequence[LogOffset], result: MergeResult) -> None:

@@ -222,45 +222,6 @@ def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
             say_faults(page)
 
 
-def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
-    withdrawn = sum(measurement.withdraws is not None for measurement in added)
-    count = sum(measurement.is_point for measurement in added)
-    if as_json:
-        print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
-        return
-    baselines = sum(measurement.from_reference is not None for measurement in added)
-    also = f", {baselines} distance AB" if baselines else ""
-    also += f", {withdrawn} withdrawn" if withdrawn else ""
-    console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
-
-
-def _show_next(log: Path, history: Sequence[Measurement]) -> None:
-    """Print the next step for the number of points that a log has now."""
-    from ipsys_log.analysis.pairs import active_measurements
-    from ipsys_log.models.table import min_pairs
-
-    count = len(active_measurements(history))
-    if not count:
-        return
-    if count < _GOOD:
-        remarks.print(
-            f"calibration points in the log: {count}; each camera must see {min_pairs(_MODEL)} or more for a "
-            f"model, and about {_GOOD} for a good one",
-            markup=False,
-        )
-    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
-
-
-def _show_places(scene: FinishedLog, as_json: bool) -> None:
-    from ipsys_log.report.contents import intervals_json, intervals_table
-
-    stops = intervals_json(scene)
-    if as_json:
-        print(json.dumps(stops, indent=2))  # noqa: T201
-    else:
-        console.print(intervals_table(stops))
-
-
 def exclude(
     log: Annotated[
         Path,
@@ -299,3 +260,42 @@ def exclude(
         f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}", markup=False
     )
     remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
+
+
+def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
+    withdrawn = sum(measurement.withdraws is not None for measurement in added)
+    count = sum(measurement.is_point for measurement in added)
+    if as_json:
+        print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
+        return
+    baselines = sum(measurement.from_reference is not None for measurement in added)
+    also = f", {baselines} distance AB" if baselines else ""
+    also += f", {withdrawn} withdrawn" if withdrawn else ""
+    console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
+
+
+def _show_next(log: Path, history: Sequence[Measurement]) -> None:
+    """Print the next step for the number of points that a log has now."""
+    from ipsys_log.analysis.pairs import active_measurements
+    from ipsys_log.models.table import min_pairs
+
+    count = len(active_measurements(history))
+    if not count:
+        return
+    if count < _GOOD:
+        remarks.print(
+            f"calibration points in the log: {count}; each camera must see {min_pairs(_MODEL)} or more for a "
+            f"model, and about {_GOOD} for a good one",
+            markup=False,
+        )
+    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
+
+
+def _show_places(scene: FinishedLog, as_json: bool) -> None:
+    from ipsys_log.report.contents import intervals_json, intervals_table
+
+    stops = intervals_json(scene)
+    if as_json:
+        print(json.dumps(stops, indent=2))  # noqa: T201
+    else:
+        console.print(intervals_table(stops))

@@ -141,33 +141,6 @@ def simulate(output: Path, cameras: str | None, **settings: Any) -> None:
     console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")
 
 
-def _simulate_command() -> Callable[..., None]:
-    """Build the command of :func:`simulate` with an option for each setting."""
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    parameters = [
-        inspect.Parameter("context", keyword, annotation=typer.Context),
-        inspect.Parameter("output", keyword, annotation=NewLog),
-        inspect.Parameter("cameras", keyword, default=None, annotation=_Grid),
-    ]
-    for name, (default, text) in SETTINGS.items():
-        annotation = Annotated[type(default), typer.Option(help=text)]  # type: ignore[valid-type]
-        parameters.append(inspect.Parameter(name, keyword, default=default, annotation=annotation))
-
-    def command(context: typer.Context, **given: Any) -> None:
-        # A hall has other defaults than the lab of the paper, so only options of the user count.
-        chosen = {name: given[name] for name in SETTINGS if _is_chosen(context, name)}
-        simulate(given["output"], given["cameras"], **chosen)
-
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {p.name: p.annotation for p in parameters}
-    return command
-
-
-def _is_chosen(context: typer.Context, name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name != "DEFAULT"
-
-
 @runs_until_stopped
 def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
     """Set a lab up on a page, step by step: rig, cameras, intrinsics, points, fit, and the live view.
@@ -209,6 +182,33 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
                 remarks.print(bug, markup=False, highlight=False)
     if page.session.jobs.bugs:
         raise typer.Exit(1)
+
+
+def _simulate_command() -> Callable[..., None]:
+    """Build the command of :func:`simulate` with an option for each setting."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    parameters = [
+        inspect.Parameter("context", keyword, annotation=typer.Context),
+        inspect.Parameter("output", keyword, annotation=NewLog),
+        inspect.Parameter("cameras", keyword, default=None, annotation=_Grid),
+    ]
+    for name, (default, text) in SETTINGS.items():
+        annotation = Annotated[type(default), typer.Option(help=text)]  # type: ignore[valid-type]
+        parameters.append(inspect.Parameter(name, keyword, default=default, annotation=annotation))
+
+    def command(context: typer.Context, **given: Any) -> None:
+        # A hall has other defaults than the lab of the paper, so only options of the user count.
+        chosen = {name: given[name] for name in SETTINGS if _is_chosen(context, name)}
+        simulate(given["output"], given["cameras"], **chosen)
+
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
+    return command
+
+
+def _is_chosen(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"
 
 
 def _command(folder: Path, host: str | None, port: int) -> str:

@@ -109,22 +109,6 @@ def locate_markers(
     return Positions(points_m, headings_rad, covariances, chi2, modes_m, noise_m2, np.sqrt(spread[:, 2, 2]))
 
 
-def _start(
-    model: JointModel, corners_px: Array, inward: Array, heights_m: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return points (n, 3) and headings (n,) from the rays of the corners; slopes and modes of the floor."""
-    uv = undistort((corners_px - model.edge_offset_px * inward).reshape(-1, 2), model.calibration)
-    rays = (np.column_stack([uv, np.ones(len(uv))]) @ model.camera_from_world).reshape(-1, 4, 3)
-    origin_m = model.origin_m
-    rays = rays / np.where(rays[..., 2:] < 0, rays[..., 2:], np.nan)
-    away = rays.mean(axis=1)
-    middle_m = origin_m + (heights_m - origin_m[2])[:, None] * away
-    floor_m, slopes, modes = model.floor.evaluate(np.nan_to_num(middle_m), model.amplitudes)
-    points_m = middle_m + floor_m[:, None] * away
-    side = rays[:, 2] + rays[:, 3] - rays[:, 0] - rays[:, 1]
-    return points_m, np.arctan2(side[:, 1], side[:, 0]), slopes, modes
-
-
 class CornerSlopes(NamedTuple):
     """Residuals (n, 8) of corners in px, and their slopes (n, 8, ...).
 
@@ -187,3 +171,19 @@ def linearise_corners(
     return CornerSlopes(
         misses.reshape(count, 8), by_pose.reshape(count, 8, 6), by_camera.reshape(count, 8, -1)
     )
+
+
+def _start(
+    model: JointModel, corners_px: Array, inward: Array, heights_m: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return points (n, 3) and headings (n,) from the rays of the corners; slopes and modes of the floor."""
+    uv = undistort((corners_px - model.edge_offset_px * inward).reshape(-1, 2), model.calibration)
+    rays = (np.column_stack([uv, np.ones(len(uv))]) @ model.camera_from_world).reshape(-1, 4, 3)
+    origin_m = model.origin_m
+    rays = rays / np.where(rays[..., 2:] < 0, rays[..., 2:], np.nan)
+    away = rays.mean(axis=1)
+    middle_m = origin_m + (heights_m - origin_m[2])[:, None] * away
+    floor_m, slopes, modes = model.floor.evaluate(np.nan_to_num(middle_m), model.amplitudes)
+    points_m = middle_m + floor_m[:, None] * away
+    side = rays[:, 2] + rays[:, 3] - rays[:, 0] - rays[:, 1]
+    return points_m, np.arctan2(side[:, 1], side[:, 0]), slopes, modes

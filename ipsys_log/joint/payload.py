@@ -75,23 +75,6 @@ def restore_joint(payload: Model) -> dict[str, JointModel]:
     return {camera.camera: _restore(camera, payload.shared) for camera in payload.cameras}
 
 
-def _restore(camera: CameraModel, shared: Sequence[Parameter]) -> JointModel:
-    try:
-        arrays = {
-            p.name: np.asarray(p.values, dtype=np.float64).reshape(p.shape)
-            for p in (*shared, *camera.parameters)
-        }
-        # The number of coefficients names the lens model.
-        name = _LENSES[len(arrays["lens"]) - 4]
-        return JointModel.from_arrays(
-            arrays, CameraCalibration(0, camera.camera, 0, 0, name, arrays["lens"][4:], np.eye(3))
-        )
-    except (KeyError, ValueError, TypeError) as error:
-        raise IpsysError(
-            f"camera {camera.camera}: the stored model {JOINT} is not complete ({error}); fit it again"
-        ) from error
-
-
 class PoseChange(NamedTuple):
     """The motion (6,) of a camera, a turn about its axes and a shift in the world, with its covariance."""
 
@@ -128,3 +111,20 @@ def mend_poses(model: Model, changes: Mapping[str, PoseChange], time_ns: int) ->
             joints[name] = replace(joint, camera_from_world=turned, origin_m=joint.origin_m + motion[3:])
         joints[name] = replace(joints[name], modes=np.hstack([joint.modes, more]))
     return replace(store_joint(model, joints), timestamp=time_ns)
+
+
+def _restore(camera: CameraModel, shared: Sequence[Parameter]) -> JointModel:
+    try:
+        arrays = {
+            p.name: np.asarray(p.values, dtype=np.float64).reshape(p.shape)
+            for p in (*shared, *camera.parameters)
+        }
+        # The number of coefficients names the lens model.
+        name = _LENSES[len(arrays["lens"]) - 4]
+        return JointModel.from_arrays(
+            arrays, CameraCalibration(0, camera.camera, 0, 0, name, arrays["lens"][4:], np.eye(3))
+        )
+    except (KeyError, ValueError, TypeError) as error:
+        raise IpsysError(
+            f"camera {camera.camera}: the stored model {JOINT} is not complete ({error}); fit it again"
+        ) from error

@@ -63,12 +63,6 @@ def tape_contradiction(
     return len(columns) * total / weight, total / float(np.sqrt(variance))
 
 
-def _free(layout: Layout) -> NDArray[np.intp]:
-    """Return the columns of the scales that the fit estimates."""
-    columns = np.arange(layout.tape.start, layout.tape.stop)
-    return columns[layout.sigma[columns] > 0]
-
-
 def most_likely_scale(amplitudes: Array, covariance: Array, spread: float) -> float:
     """Return the factor on the floor's standard deviation that makes the observations most likely.
 
@@ -106,3 +100,9 @@ def most_likely_scale(amplitudes: Array, covariance: Array, spread: float) -> fl
 
     solved = minimize_scalar(improbability, bounds=(_LEAST, _MOST), method="bounded")
     return float(np.exp(solved.x))
+
+
+def _free(layout: Layout) -> NDArray[np.intp]:
+    """Return the columns of the scales that the fit estimates."""
+    columns = np.arange(layout.tape.start, layout.tape.stop)
+    return columns[layout.sigma[columns] > 0]

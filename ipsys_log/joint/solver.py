@@ -125,6 +125,37 @@ def solve(
     raise ConvergenceError(_NOT_CONVERGED, problem, state)
 
 
+def anchor(problem: Problem, state: State) -> State:
+    """Return the state after the rigid motion over the floor that fits best to the readings of the tape.
+
+    The cameras of a hall fix each other much better than a few measured points fix all of them. A step of
+    the fit then cannot turn the hall far, because the motion of a far camera is an arc and not a line. This
+    motion is exact, and leaves all sightings as they are above a flat floor.
+
+    Parameters
+    ----------
+    problem : the readings.
+    state : cameras, points and paths that fit to each other.
+    """
+    from scipy.optimize import least_squares
+
+    if len(state.positions_m) < 2:
+        return state
+    middle_m = state.positions_m[:, :2].mean(axis=0)
+
+    def residuals(motion: Array) -> Array:
+        found = problem.points.residuals(_move(problem, state, motion, middle_m), problem.layout)
+        return np.concatenate([found.distances, found.places.ravel()])
+
+    if not len(residuals(np.zeros(3))):
+        return state
+    # Lengths of a motion: 1 m, and the turn that moves a far point by about as much.
+    reach_m = float(np.linalg.norm(state.positions_m[:, :2] - middle_m, axis=1).max())
+    scales = [1 / max(reach_m, 1.0), 1.0, 1.0]
+    best = least_squares(residuals, np.zeros(3), loss="cauchy", f_scale=_USUAL_SIGMAS, x_scale=scales)
+    return _move(problem, state, best.x, middle_m)
+
+
 def _follow_valley(
     problem: Problem,
     state: State,
@@ -255,37 +286,6 @@ def _return_to_bottom(
             return None
         state = state.moved(problem.layout, *steps)
     return None
-
-
-def anchor(problem: Problem, state: State) -> State:
-    """Return the state after the rigid motion over the floor that fits best to the readings of the tape.
-
-    The cameras of a hall fix each other much better than a few measured points fix all of them. A step of
-    the fit then cannot turn the hall far, because the motion of a far camera is an arc and not a line. This
-    motion is exact, and leaves all sightings as they are above a flat floor.
-
-    Parameters
-    ----------
-    problem : the readings.
-    state : cameras, points and paths that fit to each other.
-    """
-    from scipy.optimize import least_squares
-
-    if len(state.positions_m) < 2:
-        return state
-    middle_m = state.positions_m[:, :2].mean(axis=0)
-
-    def residuals(motion: Array) -> Array:
-        found = problem.points.residuals(_move(problem, state, motion, middle_m), problem.layout)
-        return np.concatenate([found.distances, found.places.ravel()])
-
-    if not len(residuals(np.zeros(3))):
-        return state
-    # Lengths of a motion: 1 m, and the turn that moves a far point by about as much.
-    reach_m = float(np.linalg.norm(state.positions_m[:, :2] - middle_m, axis=1).max())
-    scales = [1 / max(reach_m, 1.0), 1.0, 1.0]
-    best = least_squares(residuals, np.zeros(3), loss="cauchy", f_scale=_USUAL_SIGMAS, x_scale=scales)
-    return _move(problem, state, best.x, middle_m)
 
 
 def _move(problem: Problem, state: State, motion: Array, middle_m: Array) -> State:

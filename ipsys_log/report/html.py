@@ -82,6 +82,22 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     )
 
 
+def recording_values(session: Session) -> dict[str, Any]:
+    """Return the values of the templates on the recording of a session."""
+    cameras, events = read_cameras(session), group_events(session)
+    start_ns = session.start_ns
+    return {
+        "duration": format_duration((session.end_ns - start_ns) / NS_PER_S),
+        "sizes": [(reader.path.name, format_bytes(reader.size)) for reader in session.readers],
+        "cameras": [_camera_row(session, camera) for camera in cameras],
+        "gaps": _gap_rows(cameras, start_ns),
+        "gap_count": sum(len(camera.gaps.lengths_s) for camera in cameras),
+        "events": [_event_row(group, start_ns) for group in events],
+        "timeline_pictures": _timeline(session, cameras, events),
+        **_latency(session),
+    }
+
+
 def _plain(value: Any) -> Any:
     """Return the displayed form of a value: text without control characters, our own HTML unchanged."""
     if not isinstance(value, str) or hasattr(value, "__html__"):
@@ -204,22 +220,6 @@ def _sources(records: Sequence[Run], names: Sequence[str]) -> list[Run]:
     earlier = stages_until(writer_of(EVALUATION).name)
     later = {stage.name for stage in stages_until(None) if stage not in earlier}
     return [record for record in records if record.run in collected and record.stage not in later]
-
-
-def recording_values(session: Session) -> dict[str, Any]:
-    """Return the values of the templates on the recording of a session."""
-    cameras, events = read_cameras(session), group_events(session)
-    start_ns = session.start_ns
-    return {
-        "duration": format_duration((session.end_ns - start_ns) / NS_PER_S),
-        "sizes": [(reader.path.name, format_bytes(reader.size)) for reader in session.readers],
-        "cameras": [_camera_row(session, camera) for camera in cameras],
-        "gaps": _gap_rows(cameras, start_ns),
-        "gap_count": sum(len(camera.gaps.lengths_s) for camera in cameras),
-        "events": [_event_row(group, start_ns) for group in events],
-        "timeline_pictures": _timeline(session, cameras, events),
-        **_latency(session),
-    }
 
 
 def _camera_row(session: Session, recorded: CameraRecording) -> dict[str, str]:

@@ -51,6 +51,71 @@ def message_json(raw: RawMessage, message: Message | LogError, channel: StoredCh
     return json.dumps({key: value for key, value in row.items() if value is not None}, allow_nan=False)
 
 
+def sizes_json(path: str, file_bytes: int, sizes: Sequence[ChannelSize]) -> dict[str, Any]:
+    """Return the sizes of a log as plain data, in bytes; ``share`` is of the file."""
+    stored_bytes = sum(size.stored_bytes for size in sizes)
+    return {
+        "path": path,
+        "bytes": file_bytes,
+        "channels": [
+            {
+                "topic": size.topic,
+                "messages": size.messages,
+                "payload_bytes": size.payload_bytes,
+                "stored_bytes": size.stored_bytes,
+                "share": size.stored_bytes / file_bytes,
+            }
+            for size in sizes
+        ],
+        "other_bytes": file_bytes - stored_bytes,
+    }
+
+
+def sizes_table(sizes: dict[str, Any]) -> Table:
+    """Return the sizes of :func:`sizes_json` as a table, in 80 columns if the topics are short enough."""
+    title = f"{plain_text(sizes['path'])}, {format_bytes(sizes['bytes'])}"
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    table.add_column("topic", overflow="fold")
+    for name in _NUMBERS:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in sizes["channels"]:
+        table.add_row(
+            Text(plain_text(row["topic"])), str(row["messages"]), format_bytes(row["payload_bytes"]),
+            format_bytes(row["stored_bytes"]), _percent(row["share"]),
+        )  # fmt: skip
+    share = sizes["other_bytes"] / sizes["bytes"]
+    table.add_row("(definitions, indexes)", "", "", format_bytes(sizes["other_bytes"]), _percent(share))
+    return table
+
+
+def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
+    """Return the results as plain data; notes are included, and missing values are left out."""
+    return {
+        "state": LogCheck.worst(checks),
+        "logs": [
+            {
+                "path": str(check.path),
+                "state": check.state,
+                "findings": [_finding_json(finding) for finding in check.findings],
+            }
+            for check in checks
+        ],
+    }
+
+
+def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
+    """Yield the answer for a log, then a line for each finding; notes only with ``details``."""
+    findings = check.findings if details else check.remarks
+    yield f"{check.path}: {_answer(check)}"
+    for finding in findings[:_MOST_LINES]:
+        if finding is not _first_fault(check):
+            yield f"  {_finding_line(finding)}"
+        elif finding.advice:
+            yield f"  {finding.advice}"
+    if len(findings) > _MOST_LINES:
+        yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
+
+
 def _data(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> dict[str, Any]:
     """Return the content of a message as plain data; its size if it cannot be decoded."""
     if isinstance(message, Message):
@@ -95,77 +160,12 @@ def _short(key: str, value: Any) -> str:
     return f"{key}={text[:_LONGEST_VALUE]}"
 
 
-def sizes_json(path: str, file_bytes: int, sizes: Sequence[ChannelSize]) -> dict[str, Any]:
-    """Return the sizes of a log as plain data, in bytes; ``share`` is of the file."""
-    stored_bytes = sum(size.stored_bytes for size in sizes)
-    return {
-        "path": path,
-        "bytes": file_bytes,
-        "channels": [
-            {
-                "topic": size.topic,
-                "messages": size.messages,
-                "payload_bytes": size.payload_bytes,
-                "stored_bytes": size.stored_bytes,
-                "share": size.stored_bytes / file_bytes,
-            }
-            for size in sizes
-        ],
-        "other_bytes": file_bytes - stored_bytes,
-    }
-
-
-def sizes_table(sizes: dict[str, Any]) -> Table:
-    """Return the sizes of :func:`sizes_json` as a table, in 80 columns if the topics are short enough."""
-    title = f"{plain_text(sizes['path'])}, {format_bytes(sizes['bytes'])}"
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    table.add_column("topic", overflow="fold")
-    for name in _NUMBERS:
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in sizes["channels"]:
-        table.add_row(
-            Text(plain_text(row["topic"])), str(row["messages"]), format_bytes(row["payload_bytes"]),
-            format_bytes(row["stored_bytes"]), _percent(row["share"]),
-        )  # fmt: skip
-    share = sizes["other_bytes"] / sizes["bytes"]
-    table.add_row("(definitions, indexes)", "", "", format_bytes(sizes["other_bytes"]), _percent(share))
-    return table
-
-
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
-    """Return the results as plain data; notes are included, and missing values are left out."""
-    return {
-        "state": LogCheck.worst(checks),
-        "logs": [
-            {
-                "path": str(check.path),
-                "state": check.state,
-                "findings": [_finding_json(finding) for finding in check.findings],
-            }
-            for check in checks
-        ],
-    }
-
-
 def _finding_json(finding: LogFinding) -> dict[str, Any]:
     return {key: value for key, value in asdict(finding).items() if value not in (None, "")}
-
-
-def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
-    """Yield the answer for a log, then a line for each finding; notes only with ``details``."""
-    findings = check.findings if details else check.remarks
-    yield f"{check.path}: {_answer(check)}"
-    for finding in findings[:_MOST_LINES]:
-        if finding is not _first_fault(check):
-            yield f"  {_finding_line(finding)}"
-        elif finding.advice:
-            yield f"  {finding.advice}"
-    if len(findings) > _MOST_LINES:
-        yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
 
 
 def _first_fault(check: LogCheck) -> LogFinding | None:

@@ -107,6 +107,48 @@ def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table | Group]:
 _Line = tuple[str, str, str, list[str]]
 
 
+def trajectory_lines(accuracy: Accuracy) -> Iterator[str]:
+    """Yield the RMSE of the absolute trajectory error and of the relative pose errors of all robots."""
+    if not accuracy.trajectories:
+        return
+    pooled = pool_trajectories(accuracy.trajectories)
+    space_cm, floor_cm = (errors.rmse_m * CM_PER_M for errors in (pooled.absolute_3d, pooled.absolute_2d))
+    text = f"Absolute trajectory error (ATE): RMSE {space_cm:.2f} cm in 3D, {floor_cm:.2f} cm on the floor"
+    relative = [
+        f"{errors.summary.rmse_m * CM_PER_M:.2f} cm over {errors.delta:g} {errors.unit}"
+        for errors in pooled.relative
+    ]
+    yield f"{text}; relative pose error (RPE): RMSE {', '.join(relative)}." if relative else f"{text}."
+
+
+def trajectory_rows(accuracies: Sequence[Accuracy]) -> list[tuple[str, str, list[str]]]:
+    """Return model, robot and cells of each robot in cm, and of all robots together if there are several."""
+    return [row for one in accuracies for row in rows_of_run(label(one.model), one.trajectories)]
+
+
+def rows_of_run(name: str, trajectories: Sequence[TrajectoryErrors]) -> list[tuple[str, str, list[str]]]:
+    """Return the same rows for one run; the first has its name or that of its model."""
+    rows = [*trajectories]
+    if len(rows) > 1:
+        rows.append(pool_trajectories(rows)._replace(robot=_ALL_ROBOTS))
+    return [("" if number else name, row.robot, _trajectory_cells(row)) for number, row in enumerate(rows)]
+
+
+def trajectory_table(accuracies: Sequence[Accuracy]) -> Table | None:
+    """Return the table of the metrics in 3D; None without ground truth."""
+    rows = trajectory_rows(accuracies)
+    if not rows:
+        return None
+    several = len({model for model, _, _ in rows if model}) > 1
+    names = ("model", "robot") if several else ("robot",)
+    table = plain_table("Tracks against the ground truth, 3D errors in cm", names, TRAJECTORY_COLUMNS)
+    for model, robot, cells in rows:
+        table.add_row(*([name_cell(model)] if several else []), name_cell(robot), *cells)
+    table.caption = "RPE: RMSE over this distance or time"
+    table.caption_justify, table.caption_style = "left", ""
+    return table
+
+
 def _held_out_table(accuracies: Sequence[Accuracy]) -> Table:
     lines: list[_Line] = []
     for accuracy in accuracies:
@@ -239,48 +281,6 @@ def _choice(choice: Choice) -> str:
     other = choice.lowest != choice.model
     lowest = f"\n({choice.lowest} {choice.lowest_mean_m * CM_PER_M:.2f})" if other else ""
     return f"{choice.model} {choice.mean_m * CM_PER_M:.2f}{lowest}"
-
-
-def trajectory_lines(accuracy: Accuracy) -> Iterator[str]:
-    """Yield the RMSE of the absolute trajectory error and of the relative pose errors of all robots."""
-    if not accuracy.trajectories:
-        return
-    pooled = pool_trajectories(accuracy.trajectories)
-    space_cm, floor_cm = (errors.rmse_m * CM_PER_M for errors in (pooled.absolute_3d, pooled.absolute_2d))
-    text = f"Absolute trajectory error (ATE): RMSE {space_cm:.2f} cm in 3D, {floor_cm:.2f} cm on the floor"
-    relative = [
-        f"{errors.summary.rmse_m * CM_PER_M:.2f} cm over {errors.delta:g} {errors.unit}"
-        for errors in pooled.relative
-    ]
-    yield f"{text}; relative pose error (RPE): RMSE {', '.join(relative)}." if relative else f"{text}."
-
-
-def trajectory_rows(accuracies: Sequence[Accuracy]) -> list[tuple[str, str, list[str]]]:
-    """Return model, robot and cells of each robot in cm, and of all robots together if there are several."""
-    return [row for one in accuracies for row in rows_of_run(label(one.model), one.trajectories)]
-
-
-def rows_of_run(name: str, trajectories: Sequence[TrajectoryErrors]) -> list[tuple[str, str, list[str]]]:
-    """Return the same rows for one run; the first has its name or that of its model."""
-    rows = [*trajectories]
-    if len(rows) > 1:
-        rows.append(pool_trajectories(rows)._replace(robot=_ALL_ROBOTS))
-    return [("" if number else name, row.robot, _trajectory_cells(row)) for number, row in enumerate(rows)]
-
-
-def trajectory_table(accuracies: Sequence[Accuracy]) -> Table | None:
-    """Return the table of the metrics in 3D; None without ground truth."""
-    rows = trajectory_rows(accuracies)
-    if not rows:
-        return None
-    several = len({model for model, _, _ in rows if model}) > 1
-    names = ("model", "robot") if several else ("robot",)
-    table = plain_table("Tracks against the ground truth, 3D errors in cm", names, TRAJECTORY_COLUMNS)
-    for model, robot, cells in rows:
-        table.add_row(*([name_cell(model)] if several else []), name_cell(robot), *cells)
-    table.caption = "RPE: RMSE over this distance or time"
-    table.caption_justify, table.caption_style = "left", ""
-    return table
 
 
 def _trajectory_cells(trajectory: TrajectoryErrors) -> list[str]:

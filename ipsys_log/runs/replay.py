@@ -151,11 +151,6 @@ class Replay:
             yield from self.one_pass.follow(messages, session, task, name, following, model)
 
 
-def _name_run(progress: Progress, run: str) -> Progress:
-    """Return a progress function whose steps name their run: with several models, a stage has several."""
-    return lambda stage, done, total: progress(f"{stage} {run}", done, total)
-
-
 def preload(messages: Iterable[Message], models: Sequence[str]) -> Iterator[Message]:
     """Yield the messages of a stage, and load the libraries of models meanwhile: scikit-learn takes a second.
 
@@ -170,6 +165,11 @@ def preload(messages: Iterable[Message], models: Sequence[str]) -> Iterator[Mess
             thread.start()
     if thread is not None:
         thread.join()
+
+
+def _name_run(progress: Progress, run: str) -> Progress:
+    """Return a progress function whose steps name their run: with several models, a stage has several."""
+    return lambda stage, done, total: progress(f"{stage} {run}", done, total)
 
 
 def _load_models(models: Sequence[str]) -> None:

@@ -133,19 +133,6 @@ def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
     return replace(empty, ahead_s=ahead_s)
 
 
-def _timetable(path: DrivePath, speed_m_s: float) -> tuple[Array, Array]:
-    """Return times in s, and the angles of the path at these times in rad.
-
-    The path starts at the wall at the first camera.
-    """
-    phases_rad = -np.pi / 2 + np.linspace(0, 2 * np.pi, 20_001)
-    (x_m, y_m), (dx, dy) = path.at(phases_rad)
-    step_m = np.hypot(np.diff(x_m), np.diff(y_m))
-    turn_rad = np.abs(np.diff(np.unwrap(np.arctan2(dy, dx))))
-    step_s = np.hypot(step_m / speed_m_s, turn_rad / _TURN_RAD_S)
-    return np.concatenate([[0.0], np.cumsum(step_s)]), phases_rad
-
-
 @dataclass(frozen=True, slots=True)
 class StarPath:
     """A star with five rounded arms in a lab of 4.88 m."""
@@ -233,6 +220,19 @@ class LanePath:
 
 
 DrivePath = StarPath | LanePath
+
+
+def _timetable(path: DrivePath, speed_m_s: float) -> tuple[Array, Array]:
+    """Return times in s, and the angles of the path at these times in rad.
+
+    The path starts at the wall at the first camera.
+    """
+    phases_rad = -np.pi / 2 + np.linspace(0, 2 * np.pi, 20_001)
+    (x_m, y_m), (dx, dy) = path.at(phases_rad)
+    step_m = np.hypot(np.diff(x_m), np.diff(y_m))
+    turn_rad = np.abs(np.diff(np.unwrap(np.arctan2(dy, dx))))
+    step_s = np.hypot(step_m / speed_m_s, turn_rad / _TURN_RAD_S)
+    return np.concatenate([[0.0], np.cumsum(step_s)]), phases_rad
 
 
 def _choose_path(settings: LabSettings, mirrored: bool) -> DrivePath:

@@ -190,40 +190,6 @@ class LabSettings:
         return self.grid[0] * _HALL_SPACING_M[0], self.grid[1] * _HALL_SPACING_M[1]
 
 
-def _check_range(name: str, value: float, low: float, high: float) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
-        raise IpsysError(f"simulator setting {name} is {value!r}; give a value between {low:g} and {high:g}")
-
-
-def _check_tilt(tilt_deg: tuple[float, float]) -> None:
-    low, high = tilt_deg
-    if not (0.0 <= low <= high <= 45.0):
-        raise IpsysError(
-            f"simulator setting tilt_deg is {tilt_deg!r}; give the least and the most tilt, "
-            "each between 0 and 45 degrees"
-        )
-
-
-def _check_cameras(cameras: tuple[str, ...]) -> None:
-    if not cameras:
-        raise IpsysError("simulator setting cameras is empty; name at least one camera")
-    for camera in cameras:
-        check_name(camera, "simulator: camera name")
-    if len(set(cameras)) < len(cameras):
-        raise IpsysError(
-            f"simulator: two cameras have the same name in {', '.join(cameras)}; give each its own"
-        )
-
-
-def _check_dictionary(name: str, markers: int) -> None:
-    known = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
-    if not isinstance(known, int):
-        raise IpsysError(f"simulator: OpenCV has no marker dictionary {name!r}; use one such as DICT_4X4_100")
-    size = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
-    if markers > size:
-        raise IpsysError(f"simulator: {name} has {size} markers, but markers = {markers}; set fewer markers")
-
-
 def parse_grid(text: str) -> tuple[int, int]:
     """Return the columns and rows of a grid of cameras from text such as ``6x4``.
 
@@ -275,3 +241,37 @@ def hall_settings(columns: int, rows: int, **settings: Any) -> LabSettings:
     """
     settings = {"mount_height_m": _MOUNT_HEIGHT_M, **settings}
     return LabSettings(cameras=grid_names(columns, rows), grid=(columns, rows), **settings)
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise IpsysError(f"simulator setting {name} is {value!r}; give a value between {low:g} and {high:g}")
+
+
+def _check_tilt(tilt_deg: tuple[float, float]) -> None:
+    low, high = tilt_deg
+    if not (0.0 <= low <= high <= 45.0):
+        raise IpsysError(
+            f"simulator setting tilt_deg is {tilt_deg!r}; give the least and the most tilt, "
+            "each between 0 and 45 degrees"
+        )
+
+
+def _check_cameras(cameras: tuple[str, ...]) -> None:
+    if not cameras:
+        raise IpsysError("simulator setting cameras is empty; name at least one camera")
+    for camera in cameras:
+        check_name(camera, "simulator: camera name")
+    if len(set(cameras)) < len(cameras):
+        raise IpsysError(
+            f"simulator: two cameras have the same name in {', '.join(cameras)}; give each its own"
+        )
+
+
+def _check_dictionary(name: str, markers: int) -> None:
+    known = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if not isinstance(known, int):
+        raise IpsysError(f"simulator: OpenCV has no marker dictionary {name!r}; use one such as DICT_4X4_100")
+    size = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
+    if markers > size:
+        raise IpsysError(f"simulator: {name} has {size} markers, but markers = {markers}; set fewer markers")

@@ -281,11 +281,6 @@ class FoxgloveStream:
                 client.put(pack_time(time_ns))
 
 
-def _is_closed(connection: ServerConnection) -> bool:
-    # A connection gets its transport in the next turn of the loop.
-    return hasattr(connection, "transport") and connection.transport.is_closing()
-
-
 class Client:
     """A client, used in the thread of the server only. A slow client loses messages, images first.
 
@@ -312,3 +307,8 @@ class Client:
             return
         # A coroutine would send in the next turn of the loop, which has to wait for the GIL again.
         broadcast([self._connection], data)
+
+
+def _is_closed(connection: ServerConnection) -> bool:
+    # A connection gets its transport in the next turn of the loop.
+    return hasattr(connection, "transport") and connection.transport.is_closing()

@@ -149,30 +149,6 @@ def encode_diagnostics(
     return encode(message, DIAGNOSTICS)
 
 
-def _status(robot: str, pose: StreamPose | None, session: int, now_ns: int, stale_s: float) -> Any:
-    status: Any = message_class("diagnostic_msgs/msg/DiagnosticStatus")
-    values = {"session": str(session)}
-    level, text = status.STALE, "no camera has seen the robot"
-    if pose is not None:
-        age_s = (now_ns - pose.time_ns) / NS_PER_S
-        values |= {"age_s": f"{age_s:.3f}", "cameras": " ".join(pose.track.cameras)}
-        if pose.covariance_m2 is not None:
-            values["sigma_m"] = f"{sqrt(max(np.trace(pose.covariance_m2) / 3, 0.0)):.4f}"
-        level, text = _judge(pose, age_s, stale_s, status)
-    rows = [make("diagnostic_msgs/KeyValue", key, value) for key, value in values.items()]
-    return status(level, f"ipsys: {robot}", text, robot, rows)
-
-
-def _judge(pose: StreamPose, age_s: float, stale_s: float, status: Any) -> tuple[int, str]:
-    if age_s > stale_s:
-        return status.STALE, f"no position for {age_s:.1f} s"
-    if pose.is_outside:
-        return status.WARN, "outside the calibrated volume; the position is withheld"
-    if pose.track.heading_rad is None:
-        return status.WARN, "without heading; the position is withheld"
-    return status.OK, "position is current"
-
-
 def encode_image(camera: str, image: CompressedImage | RawImage | CompressedVideo) -> tuple[str, bytes]:
     """Return the type and the bytes of the message of an image; its data stay as they are.
 
@@ -213,3 +189,27 @@ def encode_camera_info(camera: str, lens: CameraCalibration, time_ns: int) -> by
         make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False),
     )
     return encode(message, CAMERA_INFO)
+
+
+def _status(robot: str, pose: StreamPose | None, session: int, now_ns: int, stale_s: float) -> Any:
+    status: Any = message_class("diagnostic_msgs/msg/DiagnosticStatus")
+    values = {"session": str(session)}
+    level, text = status.STALE, "no camera has seen the robot"
+    if pose is not None:
+        age_s = (now_ns - pose.time_ns) / NS_PER_S
+        values |= {"age_s": f"{age_s:.3f}", "cameras": " ".join(pose.track.cameras)}
+        if pose.covariance_m2 is not None:
+            values["sigma_m"] = f"{sqrt(max(np.trace(pose.covariance_m2) / 3, 0.0)):.4f}"
+        level, text = _judge(pose, age_s, stale_s, status)
+    rows = [make("diagnostic_msgs/KeyValue", key, value) for key, value in values.items()]
+    return status(level, f"ipsys: {robot}", text, robot, rows)
+
+
+def _judge(pose: StreamPose, age_s: float, stale_s: float, status: Any) -> tuple[int, str]:
+    if age_s > stale_s:
+        return status.STALE, f"no position for {age_s:.1f} s"
+    if pose.is_outside:
+        return status.WARN, "outside the calibrated volume; the position is withheld"
+    if pose.track.heading_rad is None:
+        return status.WARN, "without heading; the position is withheld"
+    return status.OK, "position is current"

@@ -75,14 +75,14 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **_figure_values(findings),
         **_overlap(session, findings),
         **_tracks(session),
-        **recording_values(session),
+        **_recording_values(session),
         **_provenance(session, findings),
         commands=_commands(session, findings),
         most_cameras=MOST_IN_LEGEND,
     )
 
 
-def recording_values(session: Session) -> dict[str, Any]:
+def _recording_values(session: Session) -> dict[str, Any]:
     """Return the values of the templates on the recording of a session."""
     cameras, events = read_cameras(session), group_events(session)
     start_ns = session.start_ns

@@ -31,7 +31,6 @@ from scenes import CACHE, drawn
 
 from ipsys_log.batch.execution import run_batch
 from ipsys_log.batch.log_work import check_log, replay_log
-from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import (
     BatchTask,
     LogPieces,
@@ -41,7 +40,7 @@ from ipsys_log.batch.tasks import (
     perform_or_divide,
     perform_piece,
 )
-from ipsys_log.batch.workers import Workers, open_workers
+from ipsys_log.batch.workers import Workers, WorkerSettings, open_workers
 from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["Spent", "lap", "measure", "ratios"]

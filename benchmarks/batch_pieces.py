@@ -30,9 +30,8 @@ from rounds import Row
 from scenes import CACHE, drawn, lengthened
 
 from ipsys_log.batch.log_work import replay_log
-from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import BatchTask
-from ipsys_log.batch.workers import Workers, open_workers
+from ipsys_log.batch.workers import Workers, WorkerSettings, open_workers
 from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]

@@ -40,7 +40,7 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.start import PlacedCamera, place_cameras
 from ipsys_log.log.codec import encode
-from ipsys_log.simulation.hall import hall_settings
+from ipsys_log.simulation.settings import hall_settings
 from tests.geometric.lab import GeometricLab, GeometricSettings
 
 __all__ = ["measure"]

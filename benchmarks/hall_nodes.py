@@ -51,7 +51,7 @@ from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log, write_message
 from ipsys_log.runs.stream import run
-from ipsys_log.simulation.hall import hall_settings, parse_grid
+from ipsys_log.simulation.settings import hall_settings, parse_grid
 from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import MARKERS_RUN, simulate_session

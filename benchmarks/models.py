@@ -21,9 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.calibration_points import measured
-from ipsys_log.analysis.cross_validation import cross_validate, gather_points, labelled_subsets
+from ipsys_log.analysis.cross_validation import Study, cross_validate, gather_points, labelled_subsets
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings
-from ipsys_log.analysis.study import Study
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session

@@ -14,9 +14,8 @@ from ipsys_log.messages import Message, Position, Track, Tracks
 from ipsys_log.stages.fuse import Fuse
 from ipsys_log.tracking.interpolation import TrackRows, interpolate
 from ipsys_log.tracking.motion import MotionNoise
-from ipsys_log.tracking.robot_rows import gather_rows
 from ipsys_log.tracking.smoothed_poses import Frame, smooth_positions
-from ipsys_log.tracking.track_rows import make_track
+from ipsys_log.tracking.track_messages import gather_rows, make_track
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["COASTING", "CONTENDERS", "RobotTrack"]

@@ -39,7 +39,7 @@ from pathlib import Path
 from ipsys_log.analysis.latency import Ledger
 from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.frames import SourceError
-from ipsys_log.capture.knock_events import KnockEvents
+from ipsys_log.capture.live_check import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames

@@ -1,7 +1,8 @@
-"""Untrusted text as text that is safe to print, and lists of names in a line."""
+"""Text that is safe to print: without control characters, without passwords, and names in one line."""
 
 from __future__ import annotations
 
+import re
 import shlex
 import unicodedata
 from collections.abc import Sequence
@@ -10,6 +11,17 @@ from collections.abc import Sequence
 # UTF-8, and separators of lines.
 _UNSAFE = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 _LONGEST = 2_000
+# Text that replaces a password in public texts.
+HIDDEN = "***"
+# A host with a dot and its port, and then a path or query: no user and password.
+_PORT = r"(?![^/?@:\[]*\.[^/?@:\[]*:[0-9]+(?:/[^@?]*)?(?:\?|$))"
+# A password ends at the last @, because it may contain any character. A name without a password may be a
+# token. A password may also be a part of the query.
+_PASSWORDS = (
+    re.compile(rf"(?<=://){_PORT}(?P<before>[^/?@:\[]*:).*(?=@)"),
+    re.compile(r"(?<=://)(?P<before>)[^/?@:\[]+(?=@)"),
+    re.compile(r"(?P<before>(?:(?:pas|pw|psw|token|auth|secret)[\w-]*|key)=)[^&]+", re.IGNORECASE),
+)
 
 
 def plain_text(text: str, *, keep: str = "", longest: int = _LONGEST) -> str:
@@ -68,3 +80,18 @@ def join_names(names: Sequence[str], most: int = 5) -> str:
     """
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def hide_password(address: str) -> str:
+    """Return an address without its password, for messages and logs.
+
+    Examples
+    --------
+    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
+    'rtsp://admin:***@10.0.0.7:554/live'
+    >>> hide_password("http://10.0.0.7:80/video?user=admin&pwd=secret")
+    'http://10.0.0.7:80/video?user=admin&pwd=***'
+    """
+    for password in _PASSWORDS:
+        address = password.sub(rf"\g<before>{HIDDEN}", address)
+    return address

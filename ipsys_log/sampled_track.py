@@ -15,7 +15,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS, Channel
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.tracking.interpolation import interpolate
-from ipsys_log.tracking.robot_rows import gather_rows
+from ipsys_log.tracking.track_messages import gather_rows
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
     ("errors", "interrupts", "piped_process"),
-    ("arrays", "units", "plain_text", "passwords", "extras", "atomic_files"),
+    ("arrays", "units", "plain_text", "extras", "atomic_files"),
     ("messages",),
     ("geometry", "rig"),
     ("images",),

@@ -12,7 +12,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers, Message
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.resets import Resets
+from ipsys_log.messages.stage import Resets
 from ipsys_log.runs.merge import merge
 from ipsys_log.runs.merge_plan import LogOffset
 from ipsys_log.runs.options import Request

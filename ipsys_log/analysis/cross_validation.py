@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.messages import LearningPoint, Measurement, Pair
@@ -176,6 +179,8 @@ def _each_left_out(
 
 
 _SIZES = (5, 7, 10, 15, 20, 30, 40, 60, 80, 120, 160, 240)
+
+
 # Least number of held-out points for an error.
 _LEAST_REST = 5
 
@@ -251,6 +256,28 @@ def published_curve(
             count = sum(place in used for place in cameras[camera].names)
             points.append(LearningPoint(camera, count, *means_m, subsets=1, label=label))
     return points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Study:
+    """The data for an evaluation.
+
+    Attributes
+    ----------
+    places : the measurements that count.
+    pairs : pairs of all measurements that a camera saw, by camera.
+    held_out : ids of the held-out measurements.
+    subsets : ids by the label of a published subset for fitting.
+    truth : ground-truth world points (3,) in m by id; empty outside a simulated lab.
+    seed : of folds and random subsets; None for a model of another log, which is not fitted again.
+    """
+
+    places: Sequence[RiggedMeasurement]
+    pairs: Mapping[str, Sequence[Pair]]
+    held_out: set[str]
+    subsets: Mapping[str, set[str]]
+    truth: Mapping[str, NDArray[np.float64]]
+    seed: int | None
 
 
 def _first(places: CalibrationPoints, order: list[str], size: int) -> list[str]:

@@ -15,9 +15,8 @@ from ipsys_log.joint.diagnosis import find_faults
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.hypotheses import fit_hypotheses
-from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.observations import Observations, seeing_cameras, without_points
 from ipsys_log.joint.payload import joint_payload
-from ipsys_log.joint.selection import seeing_cameras, without_points
 from ipsys_log.messages import CameraCalibration, Markers, Model
 from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import Progress, StageView

@@ -1,19 +1,46 @@
-"""Next points to measure, and the next drive, for a joint calibration."""
+"""Next points to measure, and the next drive, for a joint calibration.
+
+A sighting of a robot has eight coordinates of corners and three unknowns: its place and its heading. The rest
+is information about the cameras and the floor. The information of all sightings of a drive, and the known
+modes of the calibration, give the expected error after the drive, without a fit.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ipsys_log.analysis.expected_error import ExpectedErrors, FloorGrid, expect_errors, mean_lengths
+from ipsys_log.analysis.expected_error import (
+    ExpectedErrors,
+    FloorGrid,
+    expect_errors,
+    mean_lengths,
+    see_markers,
+)
 from ipsys_log.analysis.plan import MeasurementPlan, PlannedPlace
 from ipsys_log.analysis.tape import TapeCovariances
-from ipsys_log.analysis.taped_points import choose_points
+from ipsys_log.analysis.taped_points import choose_points, mean_error, some_modes
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
+from ipsys_log.joint.locate import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
+from ipsys_log.joint.settings import JointSettings
+
+# A drive lasts this time, and a camera sees the robot so often per second.
+DRIVE_S, _RATE_HZ = 30.0, 10.0
+# Places of the robot are this far apart; a drive covers a square of so many places.
+_STEP_M, _SQUARE = 0.3, 4
+# Usual noise of a detected corner.
+_CORNER_SIGMA_PX = 0.02
+# Two successive places have headings that differ by the golden angle, so that all headings occur.
+_GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
+# A smaller reduction is not worth a drive.
+_LITTLE = 0.05
+_FLAT = np.array([0, 1, 5])
 
 
 def expect_on_floor(
@@ -75,6 +102,74 @@ def plan_joint_points(
     return MeasurementPlan(places, maps_m[0], maps_m[-1], {one.camera: one.seen for one in expected})
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedDrive:
+    """A drive in curves through a rectangle of the floor, and its effect.
+
+    ``low_m`` and ``high_m`` (2,) are the corners of the rectangle. ``cameras`` see the robot in it.
+    ``mean_before_m`` and ``mean_after_m`` are the mean expected errors over the floor, without new points.
+    """
+
+    low_m: Array
+    high_m: Array
+    cameras: tuple[str, ...]
+    mean_before_m: float
+    mean_after_m: float
+
+    @property
+    def is_useful(self) -> bool:
+        """True if the drive reduces the error noticeably: no drive reduces the error of the tape."""
+        return self.mean_after_m < (1 - _LITTLE) * self.mean_before_m
+
+
+def choose_drive(
+    models: Mapping[str, JointModel],
+    sizes_px: Mapping[str, tuple[int, int]],
+    expected: Sequence[ExpectedErrors],
+    low_m: Array,
+    high_m: Array,
+    height_m: float,
+    length_m: float,
+) -> PlannedDrive | None:
+    """Choose the square of the floor in which a drive of 30 s reduces the mean expected error most.
+
+    Parameters
+    ----------
+    models, sizes_px : by camera.
+    expected : expected errors of all cameras.
+    low_m, high_m : (2,), corners of the floor.
+    height_m, length_m : height and side of the robot's marker.
+
+    Returns
+    -------
+    The drive; None if no camera sees a robot.
+    """
+    modes_m = some_modes(expected)
+    xs_m, ys_m = (np.arange(a + _STEP_M / 2, b, _STEP_M) for a, b in zip(low_m, high_m, strict=True))
+    if not len(modes_m) or not len(xs_m) or not len(ys_m):
+        return None
+    places_m = np.stack(np.meshgrid(xs_m, ys_m), axis=-1)
+    seen, rows = _information(models, sizes_px, places_m.reshape(-1, 2), height_m, length_m)
+    shape = places_m.shape[:2]
+    seen, rows = seen.reshape(len(models), *shape), rows.reshape(*shape, *rows.shape[1:])
+    best: tuple[float, slice, slice] | None = None
+    for y in range(0, max(1, shape[0] - _SQUARE + 1), _SQUARE // 2):
+        for x in range(0, max(1, shape[1] - _SQUARE + 1), _SQUARE // 2):
+            square = slice(y, y + _SQUARE), slice(x, x + _SQUARE)
+            if not seen[:, *square].any():
+                continue
+            after_m = mean_error(modes_m @ _update(rows[square], seen[:, *square]))
+            if best is None or after_m < best[0]:
+                best = after_m, *square
+    if best is None:
+        return None
+    after_m, rows_y, rows_x = best
+    inside_m, half_m = places_m[rows_y, rows_x].reshape(-1, 2), _STEP_M / 2
+    cameras = tuple(camera for camera, own in zip(models, seen[:, rows_y, rows_x], strict=True) if own.any())
+    drive_m = inside_m.min(axis=0) - half_m, np.minimum(inside_m.max(axis=0) + half_m, high_m)
+    return PlannedDrive(*drive_m, cameras, mean_error(modes_m), after_m)
+
+
 def _least(expected: Sequence[ExpectedErrors], updates: Sequence[Array | None]) -> list[Array]:
     """Return the least expected error of the cameras at each node, (n,), after each update of the modes.
 
@@ -88,3 +183,64 @@ def _least(expected: Sequence[ExpectedErrors], updates: Sequence[Array | None]) 
             errors_m = mean_lengths(updated_m @ updated_m.swapaxes(1, 2))
             least_m[one.seen] = np.fmin(least_m[one.seen], errors_m)
     return maps_m
+
+
+def _update(rows: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return a root (m, m) of the covariance of the modes after a drive.
+
+    ``rows`` (..., k, m + 1) is the information of one sighting at each place, ``seen`` (c, ...) tells which
+    cameras see the place. The robot spends the same time at each seen place.
+    """
+    places = int(seen.any(axis=0).sum())
+    weighted = rows.reshape(-1, rows.shape[-1]) * np.sqrt(DRIVE_S * _RATE_HZ / places)
+    # The last unknown is the height of the marker on its robot.
+    covariance = np.linalg.inv(np.eye(rows.shape[-1]) + weighted.T @ weighted)[:-1, :-1]
+    return np.asarray(np.linalg.cholesky((covariance + covariance.T) / 2))
+
+
+def _information(
+    models: Mapping[str, JointModel],
+    sizes_px: Mapping[str, tuple[int, int]],
+    places_m: Array,
+    height_m: float,
+    length_m: float,
+) -> tuple[NDArray[np.bool_], Array]:
+    """Return a mask (c, p) of the cameras that see a robot at p places, and slopes (p, 8 c, m + 1).
+
+    The slopes are those of whitened corners by the modes and by the height of the robot, without the part
+    that the place and the heading of the robot explain.
+    """
+    headings_rad = np.arange(len(places_m)) * _GOLDEN_RAD
+    count = next(iter(models.values())).modes.shape[1] + 1
+    seen = np.zeros((len(models), len(places_m)), dtype=np.bool_)
+    slopes = np.zeros((len(places_m), 8 * len(models), count))
+    by_pose = np.zeros((len(places_m), 8 * len(models), 3))
+    for number, (camera, model) in enumerate(models.items()):
+        view = see_markers(model, sizes_px[camera], places_m, height_m, length_m, headings_rad)
+        seen[number] = view.seen
+        own = slice(8 * number, 8 * number + 8)
+        if view.seen.any():
+            slopes[view.seen, own], by_pose[view.seen, own] = _whitened_slopes(model, *view[1:4], length_m)
+    visible = seen.any(axis=0)
+    axes = np.linalg.qr(by_pose[visible])[0]
+    slopes[visible] -= axes @ (axes.swapaxes(1, 2) @ slopes[visible])
+    return seen, slopes
+
+
+def _whitened_slopes(
+    model: JointModel, corners_px: Array, centres_m: Array, turns: Array, length_m: float
+) -> tuple[Array, Array]:
+    """Return slopes of whitened corners (n, 8, ...): by modes and height (m + 1), and by x, y and heading."""
+    settings = JointSettings()
+    sizes_m = np.full(len(corners_px), length_m * model.scale)
+    now = linearise_corners(model, corners_px, edge_motion(corners_px), centres_m, turns, sizes_m)
+    _, floor_slopes, floor_modes = model.floor.evaluate(centres_m, model.amplitudes)
+    by_height = now.by_pose[:, :, 2:3]
+    by_pose = now.by_pose[:, :, _FLAT]
+    by_pose[:, :, :2] += by_height * floor_slopes[:, None]
+    by_modes = model.error_modes(now.by_camera, by_height, floor_modes)
+    tilts = now.by_pose[:, :, 3:5] * settings.wobble_sigma_rad
+    noise_px2 = _CORNER_SIGMA_PX**2 * np.eye(8)
+    whitening = np.linalg.inv(np.linalg.cholesky(noise_px2 + tilts @ tilts.swapaxes(1, 2)))
+    slopes = np.concatenate([by_modes, by_height * settings.robot_height_sigma_m], axis=2)
+    return whitening @ slopes, whitening @ by_pose

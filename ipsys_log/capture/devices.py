@@ -28,12 +28,12 @@ from ipsys_log.capture.nodes.centre import is_of_node, node_of
 from ipsys_log.capture.nodes.network import read_network
 from ipsys_log.capture.nodes.receiver import Receiver
 from ipsys_log.capture.simulated import open_simulated, parse_source
-from ipsys_log.capture.usb_bandwidth import advise, list_demands
+from ipsys_log.capture.usb_bus import advise_bandwidth, list_demands
 from ipsys_log.capture.video_files import check_playback_source, open_playback
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import Rig, RigCamera
-from ipsys_log.passwords import HIDDEN, hide_password
+from ipsys_log.plain_text import HIDDEN, hide_password
 
 _QUALITY = 92
 
@@ -239,7 +239,7 @@ def usb_advice(rig: Rig) -> list[str]:
         return []
     from ipsys_log.capture.usb_bus import find_cameras
 
-    return advise(list_demands(find_cameras(), rig))
+    return advise_bandwidth(list_demands(find_cameras(), rig))
 
 
 def open_source(

@@ -1,4 +1,4 @@
-"""The live check of the cameras: it analyses one frame of each camera about once a second."""
+"""The live check of the cameras: a frame of each about once a second, and events for knocked cameras."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from types import TracebackType
 import cv2
 import numpy as np
 
+from ipsys_log.analysis.knocks import KnockMonitor
+from ipsys_log.capture.recorder import Source
 from ipsys_log.errors import FrameError
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
-from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
+from ipsys_log.messages import CAMERA_MOVED, CompressedImage, CompressedVideo, Message, Rig
 from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
 
@@ -113,6 +115,31 @@ class CameraMonitor:
         elif unknown:
             warnings.append(_unknown(unknown))
         return FrameCheck(tuple(sorted(counts)), unknown, brightness, sharpness, tuple(warnings))
+
+
+class KnockEvents:
+    """A consumer of live results that adds an event, and prints its text, when a camera has moved.
+
+    The event is recorded and never derived: a replay does not repeat it, and no stage reads it.
+
+    Parameters
+    ----------
+    cameras : the source of the recording; it gets the events.
+    """
+
+    def __init__(self, cameras: Source) -> None:
+        self._cameras = cameras
+        self._monitor: KnockMonitor | None = None
+
+    def __call__(self, message: Message | None) -> None:
+        """Handle one message; the rig comes first."""
+        if message is None:
+            return
+        if isinstance(message.payload, Rig):
+            self._monitor = KnockMonitor(message.payload)
+        elif self._monitor is not None:
+            for knock in self._monitor(message):
+                self._cameras.add_event(CAMERA_MOVED, knock.text, knock.camera)
 
 
 def _unknown(ids: tuple[int, ...]) -> str:

@@ -7,18 +7,21 @@ the queue.
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from ipsys_log.capture.camera_thread import Arrival, CameraReader, ReaderContext, imported_run
-from ipsys_log.capture.camera_threads import reader_threads
+from ipsys_log.capture.camera_thread import Arrival, CameraReader, Pause, ReaderContext, imported_run
 from ipsys_log.capture.frames import Clock, Open, Say, SourceError
+from ipsys_log.capture.nodes.centre import is_of_node
+from ipsys_log.capture.nodes.receiver import passing_period_s
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
+from ipsys_log.units import NS_PER_S
 
 # Most bytes of frames that wait to be written: some seconds of three cameras.
 _LIMIT_BYTES = 256 << 20
@@ -81,7 +84,7 @@ class LiveCameras:
             open_source, clock, self._put, say, self._started, self._taken, self._stopped, self._heartbeat
         )
         self._readers = [CameraReader(camera, shared) for camera in cameras]
-        self._threads = reader_threads(self._readers)
+        self._threads = _reader_threads(self._readers)
         self.states = {
             camera.name: reader.state for camera, reader in zip(cameras, self._readers, strict=True)
         }
@@ -295,3 +298,59 @@ def _bytes_of(arrival: Arrival | None) -> int:
 
 def _has(arrivals: Iterable[Arrival], arrival: Arrival) -> bool:
     return any(other is arrival for other in arrivals)
+
+
+def _reader_threads(readers: Sequence[CameraReader]) -> list[threading.Thread]:
+    """Return the threads that read some cameras, not started: one for each device, and one for all nodes.
+
+    Each switch between threads of Python takes time of the thread that computes positions: with a thread for
+    each of 24 nodes, more time than the positions.
+    """
+    nodes = [reader for reader in readers if is_of_node(reader.camera)]
+    # The thread of a device is a daemon, because a driver can block for ever.
+    threads = [
+        threading.Thread(target=_read_device, args=(reader,), name=reader.camera.name, daemon=True)
+        for reader in readers
+        if reader not in nodes
+    ]
+    if nodes:
+        # Zenoh's threads are daemons if their caller is one. Python ends a daemon within a call of Zenoh, and
+        # the program aborts.
+        threads.append(threading.Thread(target=_read_nodes, args=(nodes,), name="nodes", daemon=False))
+    return threads
+
+
+def _read_device(reader: CameraReader) -> None:
+    for pause in reader.read():
+        if pause is not None:
+            pause.until.wait(pause.seconds)
+
+
+def _read_nodes(readers: Sequence[CameraReader]) -> None:
+    """Read nodes in turn. A node whose reader pauses misses its turns."""
+    period_s, clock = passing_period_s(len(readers)), Clock()
+    turns = [_Turn(reader) for reader in readers]
+    while turns:
+        now_s = clock.now_ns() / NS_PER_S
+        turns = [turn for turn in turns if turn.take(now_s)]
+        time.sleep(period_s)
+
+
+class _Turn:
+    """The turns of one node."""
+
+    def __init__(self, reader: CameraReader) -> None:
+        self._steps: Iterator[Pause | None] = reader.read()
+        self._pause: Pause | None = None
+        self._paused_s = 0.0
+
+    def take(self, now_s: float) -> bool:
+        """Read all that has arrived, unless the reader pauses; return False after the end."""
+        pause = self._pause
+        if pause is not None and now_s - self._paused_s < pause.seconds and not pause.until.is_set():
+            return True
+        try:
+            self._pause, self._paused_s = next(self._steps), now_s
+        except StopIteration:
+            return False
+        return True

@@ -12,6 +12,7 @@ from typing import Protocol
 
 from ipsys_log.capture.disk import (
     Confirm,
+    RecordedFile,
     Syncer,
     describe_disk_failure,
     describe_disk_fault,
@@ -19,7 +20,6 @@ from ipsys_log.capture.disk import (
     reserve,
 )
 from ipsys_log.capture.frames import Clock, Say
-from ipsys_log.capture.recorded_file import RecordedFile
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked

@@ -10,6 +10,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
 from ipsys_log.capture import v4l2
 from ipsys_log.capture.frames import (
     ActualSettings,
@@ -20,7 +24,6 @@ from ipsys_log.capture.frames import (
     device_path,
     report_refused_settings,
 )
-from ipsys_log.capture.raw_images import RAW_FORMATS, ImageLayout, encode_raw
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
@@ -49,6 +52,11 @@ _FAULTS = {
     errno.ENOSPC: "its USB bus has too little bandwidth; for advice: ipsys cameras --rig lab.toml",
     errno.EPROTO: "does not answer like a camera; plug it in again",
 }
+_Plane = NDArray[np.uint8]
+
+# The driver's names of raw formats, in order of preference. The colour format with the fewest bytes is first.
+_RAW_FORMATS = ("NV12", "YUYV", "UYVY", "GREY")
+_QUALITY = 95
 
 
 @contextmanager
@@ -88,10 +96,10 @@ def _faults(label: str) -> Iterator[None]:
         raise SourceError(f"{label}: {message}") from error
 
 
-def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings, ImageLayout | None]:
+def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings, _ImageLayout | None]:
     """Set a camera to the settings of the rig; return its actual settings, and the layout of raw images."""
     offers = v4l2.list_formats(device)
-    name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
+    name = next((name for name in (*_JPEG, *_RAW_FORMATS) if name in offers), None)
     if name is None:
         raise SourceError(f"{label}: has only {', '.join(offers)}; use a camera with MJPG")
     requested = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
@@ -119,7 +127,7 @@ def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings,
     if name in _JPEG:
         return actual, None
     least = format.width * (2 if name in ("YUYV", "UYVY") else 1)
-    return actual, ImageLayout(name, format.width, format.height, max(format.bytesperline, least))
+    return actual, _ImageLayout(name, format.width, format.height, max(format.bytesperline, least))
 
 
 def _set_rate(device: int, rate_hz: float | None) -> float | None:
@@ -189,7 +197,7 @@ class _Capture(NamedTuple):
     label: str
     device: int
     buffers: list[mmap.mmap]
-    layout: ImageLayout | None
+    layout: _ImageLayout | None
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
@@ -212,7 +220,7 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             v4l2.send_request(capture.device, v4l2.QBUF, buffer)
         # The driver returns a frame that it cannot decode as an empty buffer.
         if data and capture.layout is not None:
-            data = encode_raw(data, capture.layout) or b""
+            data = _encode_raw(data, capture.layout) or b""
             if not data:
                 say(f"camera {capture.camera.name}: sends incomplete images; they are not recorded")
         if not data:
@@ -255,3 +263,52 @@ def _say_stamps(camera: RigCamera, flags: int, say: Say) -> None:
         say(f'{head} the {meaning} of a frame; write into the rig: stamp = "{meaning}"')
     elif camera.stamp != meaning:
         say(f"{head} the {meaning} of a frame, but the rig has {camera.stamp!r}")
+
+
+class _ImageLayout(NamedTuple):
+    """The layout of an image in memory; ``stride`` is the number of bytes from one row to the next."""
+
+    format: str
+    width: int
+    height: int
+    stride: int
+
+    @property
+    def size(self) -> int:
+        """The size of an image, in bytes."""
+        rows = self.height + self.height // 2 if self.format == "NV12" else self.height
+        return self.stride * rows
+
+
+def _encode_raw(data: bytes, layout: _ImageLayout) -> bytes | None:
+    """Encode an image as JPEG, with the grey levels of the camera; return None if data is missing.
+
+    Examples
+    --------
+    >>> _encode_raw(bytes(64), _ImageLayout("GREY", 8, 8, 8))[:2].hex()
+    'ffd8'
+
+    References
+    ----------
+    https://docs.kernel.org/userspace-api/media/v4l/pixfmt.html
+    """
+    if len(data) < layout.size:
+        return None
+    rows = np.frombuffer(data, np.uint8, layout.size).reshape(-1, layout.stride)
+    grey, *colour = map(np.ascontiguousarray, _planes(rows, layout))
+    encoded: bytes = simplejpeg.encode_jpeg_yuv_planes(grey, *(colour or (None, None)), quality=_QUALITY)
+    return encoded
+
+
+def _planes(rows: _Plane, layout: _ImageLayout) -> list[_Plane]:
+    """Return the brightness plane and, for colour formats, the two smaller colour planes."""
+    width, height = layout.width, layout.height
+    if layout.format == "GREY":
+        return [rows[:, :width]]
+    if layout.format == "NV12":
+        colour = rows[height:, :width]
+        return [rows[:height, :width], colour[:, 0::2], colour[:, 1::2]]
+    pairs = rows[:, : 2 * width]
+    if layout.format == "UYVY":
+        return [pairs[:, 1::2], pairs[:, 0::4], pairs[:, 2::4]]
+    return [pairs[:, 0::2], pairs[:, 1::4], pairs[:, 3::4]]

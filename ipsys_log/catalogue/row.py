@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.analysis.frame_gaps import find_gaps
+from ipsys_log.analysis.recording import find_gaps
 from ipsys_log.api import ModelEvaluation
 from ipsys_log.errors import IpsysError, os_error_text, reason_without
 from ipsys_log.exchange.parquet_rows import Columns, escape_surrogates

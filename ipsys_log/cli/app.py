@@ -16,20 +16,16 @@ from ipsys_log.cli import (
     calibrate_lab,
     cameras,
     catalogue,
-    compact,
     compare,
     contents,
-    cut,
     drift,
     drive,
-    exclude,
     export,
-    first_day,
     imports,
     inspect,
+    log_copies,
     markers,
     measure,
-    merge,
     node,
     plan,
     publish,
@@ -284,9 +280,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _MODULES = (
-    *(first_day, setup, markers, cameras, calibrate, align, imports, record, measure),
+    *(setup, markers, cameras, calibrate, align, imports, record, measure),
     *(calibrate_lab, stages),
-    *(exclude, plan, drift, inspect, contents, export, stream, cut, compact, merge, compare, publish, drive),
+    *(plan, drift, inspect, contents, export, stream, log_copies, compare, publish, drive),
     *(batch, catalogue, node),
 )
 for module in _MODULES:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +12,16 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ipsys_log.cli.batch_options import DERIVED, EXPORT, FOLDER, LOGS, OUTDATED, RUN, WORKERS
-from ipsys_log.cli.batch_progress import batch_bar
 from ipsys_log.cli.console import console, remarks, say
 from ipsys_log.cli.options import check_present
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.cli.stages import build_command, options_until, replay_options
 
 if TYPE_CHECKING:
-    from ipsys_log.batch.settings import WorkerSettings
+    from rich.progress import TaskID
+
     from ipsys_log.batch.tasks import BatchTask, LogResult
+    from ipsys_log.batch.workers import WorkerSettings
     from ipsys_log.log.location import LogLocation
 
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
@@ -29,6 +31,8 @@ _KEPT_BY_SCHEDULER = (
     "others"
 )
 _REPEAT = " After a failure or an interrupt, repeat the command: it computes only what is missing."
+# A task can take minutes: the rate is that of the last half hour.
+_RATE_PERIOD_S = 1800.0
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -116,7 +120,7 @@ def _export(
     overwrite: bool,
     **batch: Any,
 ) -> None:
-    from ipsys_log.batch.exports import export_log, plan_exports
+    from ipsys_log.batch.log_work import export_log, plan_exports
     from ipsys_log.batch.tasks import BatchTask
 
     wishes: dict[str, Any] = {"table": channel, "run": run, "robot": robot, "format": format_}
@@ -173,7 +177,7 @@ def _run(
     logs : as the user named them. Each must exist; a link without a file in a folder only fails itself.
     paths : the logs of the folders and patterns in ``logs``; None: they are searched here.
     """
-    from ipsys_log.batch.settings import WorkerSettings
+    from ipsys_log.batch.workers import WorkerSettings
     from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
     from ipsys_log.report.files import check_file, check_parquet_name
@@ -212,7 +216,7 @@ def _collect(task: BatchTask, paths: Sequence[LogLocation], settings: WorkerSett
     count = most_tasks(paths) if task.divides else len(paths)
     with say_kept(lambda _: kept), open_workers(settings, count) as workers:
         say(f"dashboard: {workers.dashboard}")
-        with batch_bar(len(paths)) as (show, show_pieces):
+        with _progress_bars(len(paths)) as (show, show_pieces):
             for result in run_batch(workers, task, paths, show_pieces):
                 by_log[result.log] = result
                 show(result)
@@ -233,3 +237,43 @@ def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> N
     if table is not None:
         write_results(table, results)
         say(f"{table} written: a row for each log")
+
+
+@contextmanager
+def _progress_bars(
+    count: int,
+) -> Iterator[tuple[Callable[[LogResult], None], Callable[[LogLocation, int, int], None]]]:
+    """Yield functions that show a result, and the pieces of a log, as bars with rate and remaining time."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    if not remarks.is_terminal:
+        yield lambda result: None, lambda log, done, total: None
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}", justify="right"),
+        TextColumn("{task.fields[failures]}", justify="right"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=remarks, transient=True, speed_estimate_period=_RATE_PERIOD_S) as bar:
+        task, failures = bar.add_task("logs", total=count, rate="", failures="0 failed"), 0
+        of_log: dict[str, TaskID] = {}
+
+        def show(result: LogResult) -> None:
+            nonlocal failures
+            failures += not result.good
+            speed = bar.tasks[0].speed
+            rate = f"{60 * speed:,.1f} logs/min" if speed else ""
+            bar.update(task, advance=1, rate=rate, failures=f"{failures} failed")
+            if result.log in of_log:
+                bar.remove_task(of_log.pop(result.log))
+
+        def show_pieces(log: LogLocation, done: int, total: int) -> None:
+            name = str(log)
+            if name not in of_log:
+                of_log[name] = bar.add_task(f"pieces of {log.name}", rate="", failures="")
+            bar.update(of_log[name], completed=done, total=total)
+
+        yield show, show_pieces

@@ -38,7 +38,7 @@ def cameras(
     """List the USB cameras with device, modes, bus and hub, and check that USB is fast enough for all.
 
     Without --rig, the check uses the largest mode of each camera. Network cameras are not listed."""
-    from ipsys_log.capture.usb_bandwidth import advise, list_demands
+    from ipsys_log.capture.usb_bus import advise_bandwidth, list_demands
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import load_rig
 
@@ -49,7 +49,7 @@ def cameras(
     from ipsys_log.capture.usb_bus import find_cameras
 
     attached = find_cameras()
-    advice = advise(list_demands(attached, load_rig(rig) if rig else None))
+    advice = advise_bandwidth(list_demands(attached, load_rig(rig) if rig else None))
     if as_json:
         print(json.dumps({"cameras": [_plain(camera) for camera in attached], "advice": advice}, indent=2))  # noqa: T201
         return

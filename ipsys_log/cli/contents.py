@@ -41,7 +41,7 @@ def check(
     The exit code is 0 if all logs are sound, 1 if they are readable with remarks, and 2 if one is broken.
     It is 3 if none is broken, but one could not be read, such as a URL without a connection. Runs may have
     their inputs in another of the given logs."""
-    from ipsys_log.report.soundness import check_json, check_lines
+    from ipsys_log.report.log_texts import check_json, check_lines
     from ipsys_log.soundness.check import check_logs
     from ipsys_log.soundness.finding import READABLE, SOUND, UNREAD, LogCheck
 
@@ -64,7 +64,7 @@ def du(logs: Logs, as_json: AsJson = False) -> None:
 
     The payload is counted before compression. A compressed chunk counts in proportion to the bytes of its
     messages."""
-    from ipsys_log.report.channel_sizes import sizes_table
+    from ipsys_log.report.log_texts import sizes_table
 
     results = [_sizes(path) for path in logs]
     if as_json:
@@ -78,7 +78,7 @@ def du(logs: Logs, as_json: AsJson = False) -> None:
 
 def _sizes(path: LogLocation) -> dict[str, Any]:
     from ipsys_log.log.reader import LogReader
-    from ipsys_log.report.channel_sizes import sizes_json
+    from ipsys_log.report.log_texts import sizes_json
 
     with LogReader(path) as reader, progress_bar(()) as progress:
         sizes = reader.sizes(lambda done: progress("chunks", done, reader.chunk_count))
@@ -114,7 +114,7 @@ def cat(
 
     With --json, each line is a JSON object with all values; images are given by their size."""
     from ipsys_log.log.dataset import Session
-    from ipsys_log.report.message_lines import message_json, message_line
+    from ipsys_log.report.log_texts import message_json, message_line
 
     draw = message_json if as_json else message_line
     with Session(logs) as session:

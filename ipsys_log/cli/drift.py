@@ -84,7 +84,7 @@ def drift(
 def _fix(reading: DriftReading) -> str | None:
     """Append the mended model to the last log; return its run, or None if no camera has moved."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.joint.mending import PoseChange
+    from ipsys_log.joint.payload import PoseChange
     from ipsys_log.runs.mended_model import append_mended_model
 
     moved = reading.moved()

@@ -1,4 +1,4 @@
-"""Entry of tape measurements into a log: ``ipsys measure``."""
+"""Tape measurements of a log, and their exclusion: ``ipsys measure`` and ``ipsys exclude``."""
 
 from __future__ import annotations
 
@@ -83,6 +83,7 @@ _MODEL, _GOOD = "poly", 40
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(measure)
+    app.command()(exclude)
 
 
 @runs_until_stopped
@@ -219,6 +220,46 @@ def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
             page.wait(lambda: bool(signals))
         finally:
             say_faults(page)
+
+
+def exclude(
+    log: Annotated[
+        Path,
+        appended_log_argument(help="A finished log with measurements, which gets the change."),
+    ],
+    points: Annotated[
+        list[str],
+        typer.Argument(metavar="POINT", help="Names of calibration points, such as p007."),
+    ],
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which is written into the log.")],
+    readmit: Annotated[
+        bool, typer.Option("--readmit", help="Use excluded points again, instead of excluding points.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Exclude calibration points of a log from all stages, or re-admit them. Nothing is erased.
+
+    The command appends a message for each point. Models of the log are then out of date, and ipsys replay
+    fits them again. A point that is excluded already causes no change.
+    """
+    from ipsys_log.survey import exclusion
+
+    result = (exclusion.readmit if readmit else exclusion.exclude)(log, points, reason)
+    done, before = ("re-admitted", "not excluded") if readmit else ("excluded", "excluded already")
+    for name, text in result.unchanged.items():
+        remarks.print(f"{name} is {before}{f': {text}' if text else ''}", style="yellow", markup=False)
+    if as_json:
+        key = "readmitted" if readmit else "excluded"
+        rows = {"log": str(log), key: result.changed, "unchanged": [*result.unchanged]}
+        print(json.dumps({**rows, "active": result.active}))  # noqa: T201
+        return
+    if not result.changed:
+        console.print(f"{log} is unchanged", markup=False)
+        return
+    console.print(
+        f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}", markup=False
+    )
+    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
 
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:

@@ -17,7 +17,7 @@ from ipsys_log.cli.stages import derive
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ipsys_log.analysis.drive_plan import PlannedDrive
+    from ipsys_log.analysis.joint_plan import PlannedDrive
     from ipsys_log.messages import Rig
     from ipsys_log.survey.floor_plan import PlannedFloor
 
@@ -153,7 +153,7 @@ def _headline(found: PlannedFloor) -> str:
 
 def _drive_line(drive: PlannedDrive) -> str:
     """Return the line of the drive that reduces the error most, with its effect without new points."""
-    from ipsys_log.analysis.drive_plan import DRIVE_S
+    from ipsys_log.analysis.joint_plan import DRIVE_S
     from ipsys_log.report.tables import means_cm
     from ipsys_log.units import CM_PER_M
 
@@ -224,7 +224,7 @@ def _plan_json(found: PlannedFloor) -> dict[str, Any]:
 
 
 def _drive_json(drive: PlannedDrive) -> dict[str, Any]:
-    from ipsys_log.analysis.drive_plan import DRIVE_S
+    from ipsys_log.analysis.joint_plan import DRIVE_S
     from ipsys_log.units import CM_PER_M
 
     return {

@@ -1,8 +1,9 @@
-"""Setup of a lab: ``ipsys init`` and ``ipsys simulate``."""
+"""Setup of a lab: ``ipsys setup`` on a page, ``ipsys init`` and ``ipsys simulate``."""
 
 from __future__ import annotations
 
 import inspect
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import NewLog, OtherLog, other_log_option
-from ipsys_log.cli.signals import say_kept
-from ipsys_log.plain_text import shell_words
+from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.measure_live import say_faults
+from ipsys_log.cli.options import Host, NewLog, OtherLog, Port, other_log_option
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
+from ipsys_log.plain_text import HIDDEN, shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
@@ -43,7 +45,6 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
     "tape_sigma_m": (0.003, "Standard deviation of the tape readings, in m."),
 }
 
-
 _Grid = Annotated[
     str | None,
     typer.Option(
@@ -51,9 +52,16 @@ _Grid = Annotated[
         help="Columns x rows of the cameras of a hall, such as 6x4; otherwise, the lab has three cameras.",
     ),
 ]
+_PORT = 8000
+
+_Folder = Annotated[
+    Path,
+    typer.Argument(metavar="FOLDER", help="The folder of the lab: it gets lab.toml, intrinsics and logs."),
+]
 
 
 def add_commands(app: typer.Typer) -> None:
+    app.command()(setup)
     app.command()(init)
     app.command("simulate", help=simulate.__doc__)(_simulate_command())
 
@@ -76,7 +84,6 @@ def init(
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.lab_files import write_new
-    from ipsys_log.passwords import HIDDEN
     from ipsys_log.rig.file import example_toml
 
     if simulated:
@@ -123,9 +130,8 @@ def simulate(output: Path, cameras: str | None, **settings: Any) -> None:
     The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m. With --cameras
     6x4, it is a hall: 24 cameras, 5 m above a floor of 20 x 15 m."""
     from ipsys_log.runs.output import write_log
-    from ipsys_log.simulation.hall import hall_settings, parse_grid
     from ipsys_log.simulation.lab import simulate
-    from ipsys_log.simulation.settings import LabSettings
+    from ipsys_log.simulation.settings import LabSettings, hall_settings, parse_grid
 
     lab = LabSettings(**settings) if cameras is None else hall_settings(*parse_grid(cameras), **settings)
     text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
@@ -133,6 +139,49 @@ def simulate(output: Path, cameras: str | None, **settings: Any) -> None:
         counts = write_log(output, simulate(lab, progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
     console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")
+
+
+@runs_until_stopped
+def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
+    """Set a lab up on a page, step by step: rig, cameras, intrinsics, points, fit, and the live view.
+
+    Each step does what its command does, and names it. The state comes from the files of FOLDER: you can
+    leave at any time, continue later, and use the commands in between. Ctrl-C ends the page."""
+    allow_interrupt("stopped; every finished step is in the folder")
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.extras import check_installed
+    from ipsys_log.report.files import check_folder
+
+    check_installed("setup needs", "starlette", "uvicorn")
+    check_folder(folder, "FOLDER")
+    from ipsys_log.first_day.lab_folder import LabFolder
+    from ipsys_log.web.first_day.app import SetupApp
+    from ipsys_log.web.server import check_port_free, qr_code, serve_app
+
+    check_port_free(host, port)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise IpsysError(f"{folder}: cannot be made: {error.strerror}") from error
+    page = SetupApp(LabFolder(folder))
+    signals: list[None] = []  # a list: an Event takes a lock that the interrupted thread may hold
+    with serve_app(page.app, host, port, has_viewers=True) as server:
+        stop_on_signal(lambda: signals.append(None))
+        if host is not None:
+            console.print(qr_code(server.url), style="#ffffff on #000000", markup=False)
+        console.print(f"open {server.url}", markup=False)
+        if server.view_url is not None:
+            remarks.print(f"to view only: {server.view_url}", markup=False)
+        remarks.print(f"Ctrl-C ends; to continue: {_command(folder, host, port)}", markup=False)
+        try:
+            server.wait(lambda: bool(signals))
+        finally:
+            page.session.close()
+            say_faults(server, "the setup page")
+            for bug in page.session.jobs.bugs:
+                remarks.print(bug, markup=False, highlight=False)
+    if page.session.jobs.bugs:
+        raise typer.Exit(1)
 
 
 def _simulate_command() -> Callable[..., None]:
@@ -160,3 +209,10 @@ def _simulate_command() -> Callable[..., None]:
 def _is_chosen(context: typer.Context, name: str) -> bool:
     source = context.get_parameter_source(name)
     return source is not None and source.name != "DEFAULT"
+
+
+def _command(folder: Path, host: str | None, port: int) -> str:
+    """Return the command that continues with the same options."""
+    options = [] if host is None else ["--host", host]
+    options += [] if port == _PORT else ["--port", str(port)]
+    return shlex.join(["ipsys", "setup", str(folder), *options])

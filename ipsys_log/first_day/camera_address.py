@@ -13,7 +13,7 @@ from ipsys_log.capture.nodes.centre import is_of_node, node_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.first_day.camera_choice import free_names
 from ipsys_log.messages import Rig, RigCamera
-from ipsys_log.passwords import hide_password
+from ipsys_log.plain_text import hide_password
 from ipsys_log.rig.file import check_name
 from ipsys_log.survey.entry import Fault
 

@@ -21,7 +21,7 @@ from ipsys_log.first_day.rig_text import replace_tables, write_rig
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedVideo, Rig, RigCamera
-from ipsys_log.passwords import hide_password
+from ipsys_log.plain_text import hide_password
 from ipsys_log.rig.file import check_name, check_rig, load_rig
 from ipsys_log.simulation.live_lab import LIVE_SETTINGS
 from ipsys_log.survey.entry import Fault

@@ -21,7 +21,7 @@ from ipsys_log.first_day.camera_choice import (
 )
 from ipsys_log.first_day.jobs import Job
 from ipsys_log.messages import Rig, RigCamera
-from ipsys_log.passwords import hide_password
+from ipsys_log.plain_text import hide_password
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import Fault
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
+from ipsys_log.extras import check_installed
 from ipsys_log.first_day import work
 from ipsys_log.first_day.alignment import AlignmentResult
 from ipsys_log.first_day.board_entry import BOARD_FIELDS, parse_board_entry
@@ -19,9 +20,9 @@ from ipsys_log.first_day.camera_pictures import CameraPictures
 from ipsys_log.first_day.jobs import Job, Jobs
 from ipsys_log.first_day.lab_folder import FitFacts, LabFolder
 from ipsys_log.first_day.outlier_points import exclude_outlier
-from ipsys_log.first_day.prints import print_board, print_markers
 from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
+from ipsys_log.report.prints import Print, board_print, rig_prints
 from ipsys_log.rig.file import load_rig
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.survey.entry import Fault
@@ -235,9 +236,9 @@ class SetupSession:
             There is no such print, or it cannot be drawn.
         """
         if name == "markers":
-            return print_markers(self._folder)
+            return _print_markers(self._folder)
         if name == "board":
-            return print_board(typed)
+            return _print_board(typed)
         raise IpsysError(f"the print {name!r} is not known; reload this page")
 
     def close(self) -> None:
@@ -297,3 +298,39 @@ def _describe_fit(fit: FitFacts) -> dict[str, Any]:
     """Return the result of the fit: one figure, the points to measure again, and the full answer."""
     figure = "" if fit.mean_cm is None else f"Mean distance to the tape points: {fit.mean_cm:.1f} cm"
     return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}
+
+
+def _print_markers(folder: LabFolder) -> bytes:
+    """Return the markers of the rig file as PDF (``ipsys markers --rig lab.toml``).
+
+    Raises
+    ------
+    IpsysError
+        The rig has a fault, or lists no markers. Or Matplotlib is not installed.
+    """
+    rig = load_rig(folder.rig_file)
+    if not rig.all_markers:
+        raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
+    return _draw_pages(rig_prints(rig))
+
+
+def _print_board(typed: Mapping[str, str]) -> bytes:
+    """Return a calibration board as PDF (``ipsys markers --board 6x4``); ``typed`` are texts by field.
+
+    Raises
+    ------
+    IpsysError
+        A field has a fault, or the board is larger than a page. Or Matplotlib is not installed.
+    """
+    entry = parse_board_entry(typed)
+    if isinstance(entry, Fault):
+        raise IpsysError(entry.text)
+    return _draw_pages([board_print(entry.parse(), entry.board)])
+
+
+def _draw_pages(prints: list[Print]) -> bytes:
+    """Return prints as PDF, at true size."""
+    check_installed("a print needs", "matplotlib")
+    from ipsys_log.report.print_pages import choose_paper, draw_pages, lay_out
+
+    return draw_pages(lay_out(prints, choose_paper(prints, None)))

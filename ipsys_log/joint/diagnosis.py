@@ -8,8 +8,8 @@ import numpy as np
 
 from ipsys_log.arrays import Array
 from ipsys_log.joint.fit import Finding, JointFit
+from ipsys_log.joint.prior_sigmas import tape_contradiction
 from ipsys_log.joint.robust import limit_of, robust_loss
-from ipsys_log.joint.tape_scale import tape_contradiction
 from ipsys_log.joint.trajectories import Kind
 from ipsys_log.units import CM_PER_M
 

@@ -8,20 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipsys_log.arrays import Array
+from ipsys_log.errors import FitError
 from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.floor_field import FloorField, make_floor_field
-from ipsys_log.joint.floor_unevenness import most_likely_scale
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import Layout, State, make_layout
 from ipsys_log.joint.path_start import start_paths
 from ipsys_log.joint.point_factors import make_point_factors
+from ipsys_log.joint.prior_sigmas import most_likely_scale, widen_tape
 from ipsys_log.joint.problem import Problem, find_blocks
-from ipsys_log.joint.refusals import check_observations, explain
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.sighting_factors import make_sighting_factors
 from ipsys_log.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
-from ipsys_log.joint.tape_scale import widen_tape
 from ipsys_log.joint.trajectories import Kind, Trajectories
 
 # The field of the floor reaches this far beyond the outermost place of a marker.
@@ -102,7 +101,7 @@ def fit_jointly(
         placed = place_cameras(observations) if placed is None else placed
         return _fit(observations, settings or JointSettings(), placed, progress)
     except ConvergenceError as error:
-        raise explain(error, observations) from error
+        raise explain_divergence(error, observations) from error
 
 
 def fit_shape(
@@ -139,6 +138,54 @@ def fit_shape(
     settings = replace(settings, floor_sigma_spread=0.0)
     held = max(range(len(placed)), key=lambda camera: len(observations.sightings[camera]))
     return _fit(untaped, settings, placed, progress, held)
+
+
+def check_observations(observations: Observations) -> None:
+    """Check that there are sightings, a length, and two measured points.
+
+    Raises
+    ------
+    FitError
+        Something of it is missing.
+    """
+    for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
+        if not len(sightings):
+            raise FitError(
+                f"camera {camera.name}: it saw no marker at a measured point or on a robot; leave it out"
+            )
+    measured = [point for point in observations.points if len(point.distances_m) or point.point_m is not None]
+    has_tape = any(len(point.distances_m) for point in measured) or len(measured) > 1
+    if not has_tape and all(np.isinf(body.scale_sigma) for body in observations.bodies):
+        raise FitError("no length is known; give the side of the markers, or measure distances with a tape")
+    if len(measured) < 2:
+        raise FitError(
+            f"{len(measured)} measured points; measure at least two with the tape, some metres apart: "
+            "they define the coordinates of the floor"
+        )
+
+
+def explain_divergence(error: ConvergenceError, observations: Observations) -> FitError:
+    """Return the error of a fit that did not converge, with the cameras that nothing holds.
+
+    A camera whose sightings all count as outliers can move without limit.
+    """
+    problem, state = error.problem, error.state
+    counts = {camera: [0, 0] for camera in range(len(observations.cameras))}
+    for factors in problem.sightings:
+        chi2 = (factors.residuals(state, problem.layout, problem.trajectories) ** 2).sum(axis=1)
+        counts[factors.camera][0] += len(chi2)
+        counts[factors.camera][1] += int((chi2 <= factors.limit).sum())
+    lost = [
+        f"{observations.cameras[camera].name} ({seen} sightings)"
+        for camera, (seen, fitting) in counts.items()
+        if not fitting
+    ]
+    if not lost:
+        return error
+    return FitError(
+        f"the joint fit did not converge: no sighting of camera {', '.join(lost)} fits to the other "
+        "cameras; drive a robot through its field of view, or leave the camera out"
+    )
 
 
 def _hold(layout: Layout, held: int, camera_from_world: Array) -> Layout:

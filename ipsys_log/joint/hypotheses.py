@@ -15,8 +15,13 @@ from ipsys_log.errors import FitError
 from ipsys_log.joint.diagnosis import point_covariances, standardise_readings
 from ipsys_log.joint.fit import Finding, JointFit, fit_jointly, fit_shape
 from ipsys_log.joint.moved_cameras import CameraMotion, find_motion, row_time_evidence, sum_squares
-from ipsys_log.joint.observations import CalibrationPoint, Observations
-from ipsys_log.joint.selection import divide_camera, without_cameras, without_points
+from ipsys_log.joint.observations import (
+    CalibrationPoint,
+    Observations,
+    divide_camera,
+    without_cameras,
+    without_points,
+)
 from ipsys_log.joint.settings import JointSettings
 from ipsys_log.joint.start import PlacedCamera, UnplacedError, place_cameras, place_freely, rough_points
 from ipsys_log.joint.tape_explanations import (

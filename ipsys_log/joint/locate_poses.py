@@ -11,7 +11,7 @@ from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import pixel_slopes
 from ipsys_log.geometry.rotations import rotate
 from ipsys_log.geometry.square_pose import fit_squares, tilt_cost
-from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
+from ipsys_log.joint.locate import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 
 _STEPS = 2

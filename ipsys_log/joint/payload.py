@@ -1,15 +1,20 @@
-"""The joint model as the payload of a log: named arrays of each camera, and of the floor."""
+"""The joint model as the payload of a log: named arrays of each camera, and of the floor.
+
+A model can get new poses of moved cameras without a new fit.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import DISTORTION_MODELS
+from ipsys_log.geometry.poses import rotation
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Pair, Parameter
@@ -27,6 +32,7 @@ _FLOOR = (
     "floor_pairs",
 )
 _LENSES = {count: name for name, count in DISTORTION_MODELS.items()}
+_POSE = 6
 
 
 def joint_payload(fit: JointFit, pairs: Mapping[str, Sequence[Pair]], time_ns: int) -> Model:
@@ -67,6 +73,44 @@ def restore_joint(payload: Model) -> dict[str, JointModel]:
         A parameter is missing, or has the wrong shape.
     """
     return {camera.camera: _restore(camera, payload.shared) for camera in payload.cameras}
+
+
+class PoseChange(NamedTuple):
+    """The motion (6,) of a camera, a turn about its axes and a shift in the world, with its covariance."""
+
+    motion: Array
+    covariance: Array
+
+
+def mend_poses(model: Model, changes: Mapping[str, PoseChange], time_ns: int) -> Model:
+    """Return a joint model whose moved cameras have their new poses.
+
+    Each motion adds six modes: its errors are independent of those of the calibration. For all other cameras,
+    these modes are 0, so the covariance of any two cameras stays the product of their modes.
+
+    Parameters
+    ----------
+    model : the joint model before the motions.
+    changes : motions by camera; a camera that is not in the model has no effect.
+    time_ns : time of the new model.
+
+    Raises
+    ------
+    IpsysError
+        The model is not complete.
+    """
+    moved = [camera.camera for camera in model.cameras if camera.camera in changes]
+    joints = restore_joint(model)
+    for name, joint in joints.items():
+        more = np.zeros((len(joint.modes), _POSE * len(moved)))
+        if name in changes:
+            motion, covariance = changes[name]
+            first = _POSE * moved.index(name)
+            more[:_POSE, first : first + _POSE] = np.linalg.cholesky(covariance)
+            turned = rotation(motion[:3]) @ joint.camera_from_world
+            joints[name] = replace(joint, camera_from_world=turned, origin_m=joint.origin_m + motion[3:])
+        joints[name] = replace(joints[name], modes=np.hstack([joint.modes, more]))
+    return replace(store_joint(model, joints), timestamp=time_ns)
 
 
 def _restore(camera: CameraModel, shared: Sequence[Parameter]) -> JointModel:

@@ -1,15 +1,17 @@
-"""Levenberg-Marquardt method for the joint calibration, with a robust loss that becomes strict in steps."""
+"""Levenberg-Marquardt method for the joint calibration, with a robust loss that becomes strict in steps.
+
+In a hall, motions of the whole lab over its floor fit its points to the tape.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
-from ipsys_log.joint.anchoring import anchor
-from ipsys_log.joint.curved_valley import leap_along_valley
 from ipsys_log.joint.normal import Factorisation, NormalEquations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
@@ -32,6 +34,15 @@ _NOT_CONVERGED = (
     f"the joint fit did not converge in {_MOST_STEPS} steps; look at the residuals of the sightings, and "
     "remove wrong measurements"
 )
+# The strict loss; before it, fits move fast.
+_STRICT = 1.0
+_LEAST_LEAP_DAMPING, _MOST_LEAP_DAMPING, _MORE_LEAP_DAMPING = 1e-12, 1e-2, 10.0
+# Steps back to the bottom of the valley. Each must halve the excess of the cost.
+_RETURN_STEPS, _RETURNING = 5, 0.5
+# A decrease of this size is that of rounding errors.
+_ROUNDING = 1e-6
+# Residuals of readings above this many standard deviations get less weight.
+_USUAL_SIGMAS = 3.0
 
 
 class ConvergenceError(FitError):
@@ -114,6 +125,37 @@ def solve(
     raise ConvergenceError(_NOT_CONVERGED, problem, state)
 
 
+def anchor(problem: Problem, state: State) -> State:
+    """Return the state after the rigid motion over the floor that fits best to the readings of the tape.
+
+    The cameras of a hall fix each other much better than a few measured points fix all of them. A step of
+    the fit then cannot turn the hall far, because the motion of a far camera is an arc and not a line. This
+    motion is exact, and leaves all sightings as they are above a flat floor.
+
+    Parameters
+    ----------
+    problem : the readings.
+    state : cameras, points and paths that fit to each other.
+    """
+    from scipy.optimize import least_squares
+
+    if len(state.positions_m) < 2:
+        return state
+    middle_m = state.positions_m[:, :2].mean(axis=0)
+
+    def residuals(motion: Array) -> Array:
+        found = problem.points.residuals(_move(problem, state, motion, middle_m), problem.layout)
+        return np.concatenate([found.distances, found.places.ravel()])
+
+    if not len(residuals(np.zeros(3))):
+        return state
+    # Lengths of a motion: 1 m, and the turn that moves a far point by about as much.
+    reach_m = float(np.linalg.norm(state.positions_m[:, :2] - middle_m, axis=1).max())
+    scales = [1 / max(reach_m, 1.0), 1.0, 1.0]
+    best = least_squares(residuals, np.zeros(3), loss="cauchy", f_scale=_USUAL_SIGMAS, x_scale=scales)
+    return _move(problem, state, best.x, middle_m)
+
+
 def _follow_valley(
     problem: Problem,
     state: State,
@@ -123,7 +165,7 @@ def _follow_valley(
 ) -> Solution:
     """Continue with long steps along a curved valley of the cost, where the usual steps are too short."""
     for step in range(_MOST_STEPS, _MOST_STEPS + _MOST_LEAPS):
-        leap = leap_along_valley(problem, state, normal)
+        leap = _leap_along_valley(problem, state, normal)
         if leap is None:
             break
         state, cost, decrement = leap
@@ -180,3 +222,92 @@ def _factorise(problem: Problem, normal: NormalEquations) -> Factorisation:
         raise FitError(
             "the observations do not determine the cameras; add calibration points, spread over the floor"
         ) from error
+
+
+def _leap_along_valley(
+    problem: Problem, state: State, normal: NormalEquations
+) -> tuple[State, float, float] | None:
+    """Take a long step, and return to the bottom of the valley by a few more.
+
+    The cost rises in between, but it is smaller at the end. With nominal intrinsics and a short drive, focal
+    length, lens distortion and height of a camera have such a valley: they compensate each other along a
+    curve. A straight step is exact only near its start, so the damping keeps the usual steps short.
+
+    Parameters
+    ----------
+    problem : factors and unknowns.
+    state : the start.
+    normal : its normal equations.
+
+    Returns
+    -------
+    The next state, its cost, and the decrease of twice the cost that the first step would have in a straight
+    valley, with the least damping. None if no step decreases the cost.
+
+    References
+    ----------
+    Grippo, Lampariello and Lucidi, A nonmonotone line search technique for Newton's method, 1986.
+    """
+    decrement, damping = None, _LEAST_LEAP_DAMPING
+    while damping < _MOST_LEAP_DAMPING:
+        try:
+            steps = Factorisation(normal, problem.layout.free, damping).step(normal)
+        except np.linalg.LinAlgError:
+            damping *= _MORE_LEAP_DAMPING
+            continue
+        decrement = normal.expect(*steps) if decrement is None else decrement
+        end = _return_to_bottom(problem, state.moved(problem.layout, *steps), normal.cost, damping)
+        if end is not None:
+            return *end, decrement
+        if decrement <= _ROUNDING:
+            return state, normal.cost, 0.0
+        damping *= _MORE_LEAP_DAMPING
+    return None
+
+
+def _return_to_bottom(
+    problem: Problem, state: State, below: float, damping: float
+) -> tuple[State, float] | None:
+    """Return a state of at most the cost ``below``, and its cost; None if a few steps do not reach it."""
+    excess = np.inf
+    for _ in range(_RETURN_STEPS):
+        if not problem.permits(state):
+            return None
+        with np.errstate(all="ignore"):
+            normal = problem.linearise(state, _STRICT)
+        if normal.cost <= below:
+            return state, normal.cost
+        if not normal.cost - below < _RETURNING * excess:
+            return None
+        excess = normal.cost - below
+        try:
+            steps = Factorisation(normal, problem.layout.free, damping).step(normal)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        state = state.moved(problem.layout, *steps)
+    return None
+
+
+def _move(problem: Problem, state: State, motion: Array, middle_m: Array) -> State:
+    """Return the state turned by ``motion[0]`` about a point, and shifted by ``motion[1:]``."""
+    cos, sin = np.cos(motion[0]), np.sin(motion[0])
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+    def move(points: Array) -> Array:
+        moved = points.copy()
+        moved[:, :2] = (points[:, :2] - middle_m) @ turn[:2, :2].T + middle_m + motion[1:]
+        return moved
+
+    values, knots = state.values.copy(), move(state.knots)
+    knots[:, 2] += motion[0]
+    for block in problem.layout.cameras:
+        origin = slice(block.start + 3, block.start + 6)
+        values[origin] = move(values[origin][None])[0]
+    return replace(
+        state,
+        values=values,
+        camera_turns=state.camera_turns @ turn.T,
+        positions_m=move(state.positions_m),
+        turns=turn @ state.turns,
+        knots=knots,
+    )

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from ipsys_log.passwords import hide_password
-from ipsys_log.plain_text import plain_text
+from ipsys_log.plain_text import hide_password, plain_text
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)")
 _LOCAL = ("file", "local")

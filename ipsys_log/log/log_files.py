@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import takewhile
 from pathlib import Path, PurePath, PurePosixPath
+from typing import Any
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import IpsysError, UnreadError
 from ipsys_log.log.location import LogLocation, LogState, LogUrl, parse_location
+from ipsys_log.log.remote_requests import (
+    changed_ns_of,
+    check_protocol,
+    open_filesystem,
+    repeat_request,
+    version_of,
+)
 
 _ALL_BELOW = "**/*.mcap"
+_FLAT = ("s3", "s3a", "gs", "gcs")  # stores without folders, whose file systems list by a prefix
 
 
 def read_log_state(log: LogLocation) -> LogState:
@@ -42,9 +52,7 @@ def find_logs(texts: Iterable[str | os.PathLike[str] | LogUrl]) -> list[LogLocat
     found: list[LogLocation] = []
     for location in map(parse_location, texts):
         if isinstance(location, LogUrl) and location.is_pattern:
-            from ipsys_log.log.remote_listing import list_objects
-
-            found += list_objects(location)
+            found += _list_objects(location)
         else:
             found.append(location)
     return found
@@ -171,10 +179,8 @@ def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogSta
         for path in logs_below(folder):
             yield str(path.relative_to(folder)), path, _state_of_file(path)
         return
-    from ipsys_log.log.remote_listing import list_states
-
     pattern = folder if folder.is_pattern else _all_below(folder)
-    for log, state in list_states(pattern).items():
+    for log, state in _list_states(pattern).items():
         yield str(log.below_pattern), log, state or read_log_state(log)
 
 
@@ -192,11 +198,8 @@ def _all_below(folder: LogUrl) -> LogUrl:
 
 def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
     if isinstance(location, LogUrl):
-        from ipsys_log.log.remote_listing import list_objects
-        from ipsys_log.log.remote_requests import check_protocol
-
         if location.is_pattern or location.is_folder:
-            yield from list_objects(location if location.is_pattern else _all_below(location))
+            yield from _list_objects(location if location.is_pattern else _all_below(location))
         else:
             check_protocol(location)
             yield location
@@ -208,3 +211,62 @@ def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
     if not logs:
         raise IpsysError(f"{location}: has no file that ends in .mcap; name another folder")
     yield from logs
+
+
+def _list_objects(pattern: LogUrl) -> list[LogUrl]:
+    """Return the objects that match a pattern, by name.
+
+    Raises
+    ------
+    LogError
+        Nothing matches, or the store cannot be listed.
+    """
+    return list(_list_entries(pattern))
+
+
+def _list_states(pattern: LogUrl) -> dict[LogUrl, LogState | None]:
+    """Return the objects that match a pattern, by name, with their states; None if the list has no sizes.
+
+    Raises
+    ------
+    LogError
+        Nothing matches, or the store cannot be listed.
+    """
+    return {url: _state_of_entry(entry) for url, entry in _list_entries(pattern).items()}
+
+
+def _list_entries(pattern: LogUrl) -> dict[LogUrl, Mapping[str, Any]]:
+    filesystem, path = open_filesystem(pattern)
+    find = _find_flat if pattern.scheme in _FLAT else _find_by_folder
+    matches = repeat_request(pattern, lambda: find(filesystem, path))
+    if not matches:
+        raise UnreadError(f"{pattern}: no object matches; check the pattern and the permission to list")
+    return {LogUrl(pattern.url, name): entry for name, entry in sorted(matches.items())}
+
+
+def _find_by_folder(filesystem: Any, path: str) -> dict[str, Mapping[str, Any]]:
+    return _object_entries(filesystem.glob(path, detail=True))
+
+
+def _find_flat(filesystem: Any, path: str) -> dict[str, Mapping[str, Any]]:
+    """List all objects that begin as the pattern does, page by page, and select those that match.
+
+    A glob of fsspec would list each folder of such a store, with three requests for each of them.
+    """
+    from fsspec.utils import glob_translate
+
+    folder, _, start = re.split(r"[*?\[]", path, maxsplit=1)[0].rpartition("/")
+    matches = re.compile(glob_translate(path)).fullmatch
+    entries = _object_entries(filesystem.find(folder, prefix=start, detail=True))
+    return {name: entry for name, entry in entries.items() if matches(name)}
+
+
+def _object_entries(found: Mapping[Any, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    return {str(name): entry for name, entry in found.items() if entry.get("type") != "directory"}
+
+
+def _state_of_entry(entry: Mapping[str, Any]) -> LogState | None:
+    size = entry.get("size")
+    if size is None:
+        return None
+    return LogState(int(size), changed_ns_of(entry), "; ".join(version_of(entry)))

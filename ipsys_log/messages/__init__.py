@@ -17,22 +17,12 @@ from ipsys_log.messages.channels import (
     clock_topic,
     image_topic,
 )
-from ipsys_log.messages.clocks import ClockEstimate
-from ipsys_log.messages.commands import (
-    DRIVING,
-    FINISHED,
-    HOLDING,
-    STOPPED,
-    RobotPath,
-    Waypoint,
-    WheelCommand,
-)
-from ipsys_log.messages.cuts import ChannelCut, Cut
 from ipsys_log.messages.events import (
     ASSUMED_MODEL,
     CAMERA_MOVED,
     FRAME_SKIPPED,
     STAMP_UNRELIABLE,
+    ClockEstimate,
     Event,
     Latency,
 )
@@ -49,7 +39,6 @@ from ipsys_log.messages.images import (
 )
 from ipsys_log.messages.markers import CameraPoint, CameraPoints, Marker, MarkerPose, Markers
 from ipsys_log.messages.measurements import Distance, Interval, Measurement, WorldPoint
-from ipsys_log.messages.merges import Merge, MergedLog
 from ipsys_log.messages.message import (
     Corners,
     Encoded,
@@ -86,16 +75,33 @@ from ipsys_log.messages.rig import (
     RigNodes,
     RigStream,
 )
-from ipsys_log.messages.runs import IMPORTED, ChannelRead, ChannelWritten, Lens, Run
+from ipsys_log.messages.runs import (
+    IMPORTED,
+    ChannelCut,
+    ChannelRead,
+    ChannelWritten,
+    Cut,
+    Lens,
+    Merge,
+    MergedLog,
+    Run,
+)
 from ipsys_log.messages.tracks import (
+    DRIVING,
+    FINISHED,
+    HOLDING,
+    STOPPED,
     FrameTransform,
     FrameTransforms,
     Position,
     Positions,
     Quaternion,
+    RobotPath,
     Track,
     Tracks,
     Vector3,
+    Waypoint,
+    WheelCommand,
 )
 
 __all__ = [

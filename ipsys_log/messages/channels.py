@@ -6,10 +6,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from ipsys_log.messages.clocks import ClockEstimate
-from ipsys_log.messages.commands import RobotPath, WheelCommand
-from ipsys_log.messages.cuts import Cut
-from ipsys_log.messages.events import Event, Latency
+from ipsys_log.messages.events import ClockEstimate, Event, Latency
 from ipsys_log.messages.images import (
     CompressedImage,
     CompressedVideo,
@@ -19,11 +16,10 @@ from ipsys_log.messages.images import (
 )
 from ipsys_log.messages.markers import CameraPoints, Markers
 from ipsys_log.messages.measurements import Measurement
-from ipsys_log.messages.merges import Merge
 from ipsys_log.messages.models import Evaluation, Model
 from ipsys_log.messages.rig import CameraCalibration, Rig
-from ipsys_log.messages.runs import Run
-from ipsys_log.messages.tracks import FrameTransforms, Positions, Tracks
+from ipsys_log.messages.runs import Cut, Merge, Run
+from ipsys_log.messages.tracks import FrameTransforms, Positions, RobotPath, Tracks, WheelCommand
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

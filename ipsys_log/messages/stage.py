@@ -1,14 +1,14 @@
-"""The row of a stage: the channels that it reads and writes, its plan and its execution."""
+"""The row of a stage: the channels that it reads and writes, its plan and its execution, and its resets."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 from ipsys_log.messages.channels import MODEL, Channel
 from ipsys_log.messages.message import Message
-from ipsys_log.messages.resets import Resets
 from ipsys_log.messages.rig import CameraCalibration, Rig
 
 # A step turns a message into payloads; it is called with the messages in log order.
@@ -159,3 +159,40 @@ def model_read(_parameters: Mapping[str, str], view: StageView) -> str:
     """Return the method of a stage that reads a model: the name of the model, "" without one."""
     models = view.payloads(MODEL)
     return models[-1].name if models else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Resets:
+    """The instants at which a stage clears its memory of each camera, at absolute multiples of a period.
+
+    The instants depend on the log time and the name of the camera only. So a cut or a merge keeps them, and
+    the frames of a camera between two resets can be processed without the frames before them.
+
+    Parameters
+    ----------
+    period_ns : time between two resets of a camera.
+    shift_ns : time that merges have added to the log times since the resets were fixed.
+
+    Examples
+    --------
+    >>> resets = Resets(30_000_000_000)
+    >>> number = resets.number("red", 1_700_000_000_000_000_000)
+    >>> resets.start_ns("red", number) <= 1_700_000_000_000_000_000 < resets.start_ns("red", number + 1)
+    True
+    """
+
+    period_ns: int
+    shift_ns: int = 0
+
+    def number(self, camera: str, log_time_ns: int) -> int:
+        """Return the number of the last reset of a camera at or before a log time in ns."""
+        return (log_time_ns - self._first_ns(camera)) // self.period_ns
+
+    def start_ns(self, camera: str, number: int) -> int:
+        """Return the log time in ns of a reset of a camera."""
+        return self._first_ns(camera) + number * self.period_ns
+
+    def _first_ns(self, camera: str) -> int:
+        # Simultaneous searches of all cameras would take too long for live tracking. The name of a camera,
+        # unlike its number in the rig, stays the same in all parts of a log.
+        return self.shift_ns + (zlib.crc32(camera.encode()) * self.period_ns >> 32)

@@ -16,8 +16,7 @@ from ipsys_log.analysis.coverage import FloorCoverage
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.report.alignment import AlignedLab
-from ipsys_log.report.camera_labels import legend_label, name_cameras
-from ipsys_log.report.figures import figure_bytes
+from ipsys_log.report.figures import figure_bytes, legend_label, name_cameras
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, REST, camera_styles, shorten

@@ -17,9 +17,8 @@ from ipsys_log.analysis.differences import Comparison
 from ipsys_log.analysis.latency import Percentiles
 from ipsys_log.analysis.overlap_stream import OverlapSummary
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.disk import DiskRoom
+from ipsys_log.capture.disk import DiskRoom, RecordedFile
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
-from ipsys_log.capture.recorded_file import RecordedFile
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
 from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 

@@ -12,8 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
-from ipsys_log.analysis.frame_gaps import FrameGaps, find_gaps
 from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.analysis.recording import FrameGaps, find_gaps
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.geometry.plausible_lenses import calibration_remarks

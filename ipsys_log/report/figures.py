@@ -1,19 +1,22 @@
-"""Figures as bytes (equal figures give equal bytes), and the common style of their axes."""
+"""Figures as bytes (equal figures give equal bytes), the common style of their axes, and names of cameras."""
 
 from __future__ import annotations
 
 import base64
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import ArrayLike
 
-from ipsys_log.report.styles import GRID
+from ipsys_log.report.styles import GRID, shorten
 
 _DPI = 150
 # Options that leave out the time of writing.
@@ -23,6 +26,9 @@ _WITHOUT: dict[str, dict[str, object]] = {
     "jpeg": {},
     "webp": {},
 }
+# A legend of more cameras covers the map, and so many colours cannot be told apart.
+MOST_IN_LEGEND = 6
+_WHITE = withStroke(linewidth=2.5, foreground="white")
 
 
 def png(figure: Figure, dpi: int = _DPI) -> bytes:
@@ -78,3 +84,37 @@ def set_ticks(axes: Axes, axis: str, values: Sequence[float]) -> None:
     target.set_major_locator(FixedLocator(values))
     target.set_minor_locator(NullLocator())
     target.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def has_legend(count: int) -> bool:
+    """Return whether a legend names so many cameras; otherwise, :func:`name_cameras` does.
+
+    Examples
+    --------
+    >>> has_legend(3), has_legend(24)
+    (True, False)
+    """
+    return count <= MOST_IN_LEGEND
+
+
+def legend_label(text: str, count: int) -> str | None:
+    """Return the entry of a camera in the legend of ``count`` cameras; None if their legend is too large."""
+    return text if has_legend(count) else None
+
+
+def name_cameras(axes: Axes, places_m: Mapping[str, ArrayLike], colours: Mapping[str, str]) -> None:
+    """Write the names of many cameras at their places on a floor map; few cameras have a legend.
+
+    Parameters
+    ----------
+    places_m : by camera, x and y of the middle of its view.
+    colours : by camera.
+    """
+    if has_legend(len(places_m)):
+        return
+    for camera, place_m in places_m.items():
+        x_m, y_m = np.asarray(place_m, dtype=np.float64)[:2].tolist()
+        axes.text(
+            x_m, y_m, shorten(camera), color=colours[camera], fontsize=8, weight="bold", ha="center",
+            va="center", zorder=7, path_effects=[_WHITE], clip_on=True,
+        )  # fmt: skip

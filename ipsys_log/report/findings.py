@@ -23,7 +23,7 @@ from ipsys_log.runs.graph import input_runs, writes
 from ipsys_log.runs.provenance import complete_runs, newest_run, replaced_lenses
 from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.selection import rig_in_force
-from ipsys_log.soundness.clocks import check_clocks
+from ipsys_log.soundness.times import check_clocks
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.calibrated_cameras import CalibratedCamera

@@ -31,9 +31,8 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.camera_labels import legend_label, name_cameras
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.figures import figure_bytes
+from ipsys_log.report.figures import figure_bytes, legend_label, name_cameras
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import GRID, REST, camera_styles, robot_colour, robot_line, shorten
 from ipsys_log.runs.provenance import newest_run

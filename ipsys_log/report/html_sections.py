@@ -15,7 +15,7 @@ from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import GROUPS, Choice, label, uses_height
-from ipsys_log.report.camera_labels import has_legend
+from ipsys_log.report.figures import has_legend
 from ipsys_log.report.findings import Findings, overall_row, overall_row_with_excluded
 from ipsys_log.report.points_figure import hull_m
 from ipsys_log.units import CM_PER_M, MM_PER_M

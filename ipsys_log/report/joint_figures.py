@@ -14,8 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 from ipsys_log.messages import Rig
-from ipsys_log.report.camera_labels import has_legend, name_cameras
-from ipsys_log.report.figures import style_axes
+from ipsys_log.report.figures import has_legend, name_cameras, style_axes
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
 

@@ -14,8 +14,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from ipsys_log.report.camera_labels import has_legend
-from ipsys_log.report.figures import figure_bytes
+from ipsys_log.report.figures import figure_bytes, has_legend
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE, REST, shorten
 from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration

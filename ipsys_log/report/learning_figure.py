@@ -19,8 +19,7 @@ from ipsys_log.report.advice import (
     mean_curve,
     uses_height,
 )
-from ipsys_log.report.camera_labels import has_legend
-from ipsys_log.report.figures import scale_logarithmic, set_ticks, style_axes
+from ipsys_log.report.figures import has_legend, scale_logarithmic, set_ticks, style_axes
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.styles import NOTE, ModelStyle, model_styles, shorten
 from ipsys_log.units import CM_PER_M

@@ -13,10 +13,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.analysis.drive_plan import PlannedDrive
+from ipsys_log.analysis.joint_plan import PlannedDrive
 from ipsys_log.arrays import Array
-from ipsys_log.report.camera_labels import legend_label, name_cameras
-from ipsys_log.report.figures import figure_bytes
+from ipsys_log.report.figures import figure_bytes, legend_label, name_cameras
 from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import NOTE, REST, camera_styles
 from ipsys_log.report.tables import means_cm

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.spatial import ConvexHull, QhullError
 
 from ipsys_log.arrays import Array
-from ipsys_log.report.camera_labels import has_legend, legend_label, name_cameras
+from ipsys_log.report.figures import has_legend, legend_label, name_cameras
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, REST, TEST, camera_styles, shorten

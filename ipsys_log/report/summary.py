@@ -17,8 +17,7 @@ from ipsys_log.models.table import reads_corners
 from ipsys_log.report.accuracy import Accuracy, gather_outliers, remaining_json
 from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
-from ipsys_log.report.tables import format_interval, name_cell, plain_table, wrap_text
-from ipsys_log.report.trajectory_table import trajectory_lines
+from ipsys_log.report.tables import format_interval, name_cell, plain_table, trajectory_lines, wrap_text
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 

@@ -24,8 +24,7 @@ from ipsys_log.messages import (
     RigNodes,
     RigStream,
 )
-from ipsys_log.passwords import hide_password
-from ipsys_log.plain_text import shell_words
+from ipsys_log.plain_text import hide_password, shell_words
 from ipsys_log.rig.checks import check_units
 
 Item = TypeVar("Item")

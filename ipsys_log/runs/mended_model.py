@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.mending import PoseChange, mend_poses
+from ipsys_log.joint.payload import PoseChange, mend_poses
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation

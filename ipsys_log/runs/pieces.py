@@ -28,8 +28,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import ANNOTATIONS, RIG
-from ipsys_log.messages.resets import Resets
-from ipsys_log.messages.stage import Pieces
+from ipsys_log.messages.stage import Pieces, Resets
 from ipsys_log.runs.inputs import given_settings, left_out_frames
 from ipsys_log.runs.provenance import read_channels
 from ipsys_log.runs.stream import WiredStage, derive

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from threading import Thread
 
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
@@ -13,7 +15,7 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import IMAGES, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
-from ipsys_log.models.table import reads_corners
+from ipsys_log.models.table import create, reads_corners
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_earlier_runs, describe_changed_images
 from ipsys_log.runs.execute import compute_messages, run_stage
@@ -22,7 +24,6 @@ from ipsys_log.runs.model_checks import check_fits
 from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.pieces import DividedRun, PieceWorkers, divide_run
-from ipsys_log.runs.preload import preload
 from ipsys_log.runs.provenance import Outcome, imported_inputs
 
 
@@ -150,6 +151,28 @@ class Replay:
             yield from self.one_pass.follow(messages, session, task, name, following, model)
 
 
+def preload(messages: Iterable[Message], models: Sequence[str]) -> Iterator[Message]:
+    """Yield the messages of a stage, and load the libraries of models meanwhile: scikit-learn takes a second.
+
+    The loading begins after the first message, and the end waits for it. So the imports of the stages never
+    meet it: two threads that import modules with mutual imports can see unfinished ones.
+    """
+    thread = None
+    for message in messages:
+        yield message
+        if thread is None:
+            thread = Thread(target=_load_models, args=(tuple(models),), name="preload", daemon=True)
+            thread.start()
+    if thread is not None:
+        thread.join()
+
+
 def _name_run(progress: Progress, run: str) -> Progress:
     """Return a progress function whose steps name their run: with several models, a stage has several."""
     return lambda stage, done, total: progress(f"{stage} {run}", done, total)
+
+
+def _load_models(models: Sequence[str]) -> None:
+    for model in models:
+        with suppress(Exception):  # the stage that needs it reports the error
+            create(model)

@@ -1,10 +1,13 @@
-"""Settings and random numbers of the simulated lab."""
+"""Settings and random numbers of the simulated lab, and of a hall with a grid of cameras."""
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from enum import IntEnum
+from string import ascii_lowercase
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +18,9 @@ from ipsys_log.rig.file import check_name
 FLOOR_M = 4.88
 # Each camera of a hall has this part of the floor: 6 x 4 cameras are above 20 x 15 m.
 _HALL_SPACING_M = (20 / 6, 15 / 4)
+_MOST_IN_ROW = 12
+# The cameras of a hall are higher than those of the lab, so that fields of view overlap on all sides.
+_MOUNT_HEIGHT_M = 5.0
 
 
 class Purpose(IntEnum):
@@ -88,7 +94,7 @@ class LabSettings:
     width, height : size of an image in px; the focal length scales with the width (1160 px at 1920).
     cameras : names, in the order of the world's y; in a hall, column after column.
     grid : columns (along x) and rows (along y) of the cameras of a hall, see
-        :func:`~ipsys_log.simulation.hall.hall_settings`; None: one row of cameras above a floor of 4.88 m.
+        :func:`hall_settings`; None: one row of cameras above a floor of 4.88 m.
     dictionary, marker_length_m, markers : OpenCV's name; side of the black square; number of simultaneous
         markers, with the ids 0, 1, ...
     stations : approximate number of calibration points that each camera sees.
@@ -182,6 +188,59 @@ class LabSettings:
         if self.grid is None:
             return FLOOR_M, FLOOR_M
         return self.grid[0] * _HALL_SPACING_M[0], self.grid[1] * _HALL_SPACING_M[1]
+
+
+def parse_grid(text: str) -> tuple[int, int]:
+    """Return the columns and rows of a grid of cameras from text such as ``6x4``.
+
+    Raises
+    ------
+    IpsysError
+        The text is not a grid, or the grid is too large.
+
+    Examples
+    --------
+    >>> parse_grid("6x4")
+    (6, 4)
+    """
+    match = re.fullmatch(r"([0-9]{1,6})x([0-9]{1,6})", text)
+    if match is None:
+        raise IpsysError(f"--cameras {text!r} is not a grid; give columns x rows, such as 6x4")
+    columns, rows = int(match[1]), int(match[2])
+    if not (1 <= columns <= _MOST_IN_ROW and 1 <= rows <= _MOST_IN_ROW):
+        raise IpsysError(
+            f"--cameras {text}: give 1 to {_MOST_IN_ROW} columns and 1 to {_MOST_IN_ROW} rows, such as 6x4"
+        )
+    return columns, rows
+
+
+def grid_names(columns: int, rows: int) -> tuple[str, ...]:
+    """Return the names of the cameras, column after column: a letter for the column, a number for the row.
+
+    Examples
+    --------
+    >>> grid_names(2, 3)
+    ('a1', 'a2', 'a3', 'b1', 'b2', 'b3')
+    """
+    return tuple(f"{letter}{row + 1}" for letter in ascii_lowercase[:columns] for row in range(rows))
+
+
+def hall_settings(columns: int, rows: int, **settings: Any) -> LabSettings:
+    """Return the settings of a hall; ``settings`` are other settings of the lab.
+
+    Raises
+    ------
+    IpsysError
+        A value is impossible for a lab.
+
+    Examples
+    --------
+    >>> hall = hall_settings(6, 4, markers=12)
+    >>> len(hall.cameras), [round(size_m, 2) for size_m in hall.floor_m], hall.mount_height_m
+    (24, [20.0, 15.0], 5.0)
+    """
+    settings = {"mount_height_m": _MOUNT_HEIGHT_M, **settings}
+    return LabSettings(cameras=grid_names(columns, rows), grid=(columns, rows), **settings)
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:

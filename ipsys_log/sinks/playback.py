@@ -6,14 +6,13 @@ import heapq
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import FrameTransforms, Latency, Message
 from ipsys_log.sinks.streams.poses import NewSession, first_session
-from ipsys_log.sinks.timeline import Timeline
 from ipsys_log.units import NS_PER_S
 
 # A message is logged at most so long after its capture; a later one is played late.
@@ -98,7 +97,7 @@ class Playback:
         self.loop = self._options.loop
         self.session = first_session(now_ns)
         self._changed = threading.Condition()
-        self._timeline = Timeline(self._start_ns, now_ns, self._options.rate, self._options.start_paused)
+        self._timeline = _Timeline(self._start_ns, now_ns, self._options.rate, self._options.start_paused)
         self._target_ns: int | None = self._start_ns
         self._steps = 0
         # The capture time of the last message: during a pause, others of the same time follow it.
@@ -257,3 +256,46 @@ def _restamp(message: Message, time_ns: int) -> Message:
         payload = replace(payload, timestamp=payload.timestamp + shift_ns)
     log_time_ns = message.log_time_ns + shift_ns
     return replace(message, log_time_ns=log_time_ns, publish_time_ns=time_ns, payload=payload)
+
+
+class _Timeline:
+    """The time in a log. All times are in ns; ``now_ns`` is the time of the clock.
+
+    Attributes
+    ----------
+    rate : seconds of the log in a second of the clock.
+    is_paused : the time in the log stands still.
+    """
+
+    def __init__(self, time_ns: int, now_ns: int, rate: float = 1.0, is_paused: bool = False) -> None:
+        self.rate, self.is_paused = rate, is_paused
+        # One instant of the log, and its time by the clock.
+        self._time_ns, self._clock_ns = time_ns, now_ns
+
+    def time_ns(self, now_ns: int) -> int:
+        """Return the time in the log."""
+        if self.is_paused:
+            return self._time_ns
+        return self._time_ns + round((now_ns - self._clock_ns) * self.rate)
+
+    def clock_ns(self, time_ns: int, now_ns: int) -> int:
+        """Return the time of the clock at a time in the log; during a pause, this is now."""
+        if self.is_paused:
+            return now_ns
+        return self._clock_ns + round((time_ns - self._time_ns) / self.rate)
+
+    def delay_s(self, time_ns: int, now_ns: int) -> float:
+        """Return how long the clock takes to a time in the log, in s; infinite during a pause."""
+        if self.is_paused:
+            return inf
+        return max(0.0, (self.clock_ns(time_ns, now_ns) - now_ns) / NS_PER_S)
+
+    def jump(self, time_ns: int, now_ns: int) -> None:
+        """Set the time in the log."""
+        self._time_ns, self._clock_ns = time_ns, now_ns
+
+    def change(self, now_ns: int, rate: float | None = None, is_paused: bool | None = None) -> None:
+        """Set the rate, or begin or end a pause, from now on."""
+        self.jump(self.time_ns(now_ns), now_ns)
+        self.rate = self.rate if rate is None else rate
+        self.is_paused = self.is_paused if is_paused is None else is_paused

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.frame_gaps import find_gaps
+from ipsys_log.analysis.recording import find_gaps
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.codec import payload_type

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 
 from ipsys_log.errors import IpsysError, UnreadError, os_error_text, reason_without
 from ipsys_log.log.bounds import BoundError
@@ -13,9 +13,12 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages.channels import clock_topic
+from ipsys_log.messages import IMPORTED
+from ipsys_log.messages.channels import IMAGES, MODEL, RECORD, clock_topic
 from ipsys_log.plain_text import shell_words
+from ipsys_log.runs.graph import writes
 from ipsys_log.runs.options import Progress
+from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.soundness.channels import (
     check_events,
     check_messages,
@@ -24,13 +27,13 @@ from ipsys_log.soundness.channels import (
     decoded_topics,
     image_topics,
 )
-from ipsys_log.soundness.clocks import check_clocks
-from ipsys_log.soundness.finding import BROKEN, REMARK, UNREAD, LogCheck, LogFinding
-from ipsys_log.soundness.provenance import check_runs, find_input_logs
+from ipsys_log.soundness.finding import BROKEN, NOTE, REMARK, UNREAD, LogCheck, LogFinding
 from ipsys_log.soundness.references import check_cameras, check_intrinsics, check_measurements, check_rigs
-from ipsys_log.soundness.times import MessageTimes
+from ipsys_log.soundness.times import MessageTimes, check_clocks
 
 _BYTES_PER_MB = 1_000_000
+# Logs without images are smaller: their markers are the start of all later stages.
+_IMAGE_NAME = IMAGES.topic.rpartition("/")[2]
 
 
 @one_reading()
@@ -122,13 +125,13 @@ def _check_contents(
         yield from _findings("rate", check_rates(session))
         yield from _findings("event", check_events(session))
         whole, names = session, session.run_names()
-        sources = find_input_logs(session, others)
+        sources = _find_input_logs(session, others)
         if sources:
             whole = stack.enter_context(Session([*sources, path]))
         for check in (check_rigs, check_cameras, check_intrinsics, check_measurements):
             yield from _findings("reference", check(whole))
         yield from _findings("time", check_clocks(whole))
-        yield from _findings("run", check_runs(whole, names))
+        yield from _findings("run", _check_runs(whole, names))
 
 
 def _findings(kind: str, part: Iterator[LogFinding]) -> Iterator[LogFinding]:
@@ -139,3 +142,50 @@ def _findings(kind: str, part: Iterator[LogFinding]) -> Iterator[LogFinding]:
         raise
     except IpsysError as error:
         yield LogFinding(kind, REMARK, str(error), "later messages of this kind are not checked")
+
+
+def _find_input_logs(session: Session, others: Sequence[LogLocation]) -> list[LogLocation]:
+    """Return the logs among ``others`` with inputs of runs that the log of ``session`` lacks in part."""
+    needed = {
+        read.topic: read.hash
+        for run in session.runs()
+        for read in run.inputs
+        if read.messages != session.count(read.topic)
+    }
+    return [path for path in others if needed and _has_input(path, needed)]
+
+
+def _has_input(path: LogLocation, needed: dict[str, str]) -> bool:
+    with suppress(IpsysError), Session([path]) as other:
+        # An input from several logs has the hash of each of them, joined by "+".
+        return any(
+            other.count(topic) and other.hash(topic) in wanted.split("+") for topic, wanted in needed.items()
+        )
+    return False
+
+
+def _check_runs(session: Session, names: Collection[str]) -> Iterator[LogFinding]:
+    """Check the runs with these names: their records, their inputs and their states."""
+    recorded = recorded_stages(session)
+    for stage in recorded:
+        if stage.run.run in names:
+            yield _check_stage(session, stage)
+    for name in sorted(set(names) - {stage.run.run for stage in recorded}):
+        text = f"run {name} has no record: its writer was stopped"
+        yield LogFinding("run", REMARK, text, "ipsys replay computes it again", RECORD.topic_of(name))
+
+
+def _check_stage(session: Session, stage: Recorded) -> LogFinding:
+    run = stage.run
+    text = f"run {run.run}, {run.stage}: {stage.state}"
+    topic = RECORD.topic_of(run.run)
+    missing = [read.topic for read in run.inputs if read.messages and not session.count(read.topic)]
+    is_copy = run.stage == IMPORTED or (writes(run, MODEL) and not is_fitted_here(run))
+    if stage.is_newer:
+        return LogFinding("run", REMARK, text, "", topic)
+    if stage.state == "unfinished" or stage.out_of_date:
+        return LogFinding("run", REMARK, text, "ipsys replay computes it again", topic)
+    if any(not topic.endswith(f"/{_IMAGE_NAME}") for topic in missing) and not (is_copy or stage.is_part):
+        text = f"run {run.run}, {run.stage}: its input {missing[0]} is not in the log"
+        return LogFinding("run", REMARK, text, "give the log with this input too", topic)
+    return LogFinding("run", NOTE, text, "", topic)

@@ -19,6 +19,7 @@ from ipsys_log.analysis.camera_models import fit_camera_models
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
     REPEATS,
+    Study,
     gather_points,
     labelled_subsets,
     learning_curve,
@@ -28,7 +29,6 @@ from ipsys_log.analysis.cross_validation import (
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
 from ipsys_log.analysis.outliers import find_outliers, is_gross
-from ipsys_log.analysis.study import Study
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect

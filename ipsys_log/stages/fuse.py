@@ -24,8 +24,14 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import POSES, POSITIONS, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.tracking.frame_reader import FrameReader
-from ipsys_log.tracking.track_inputs import TRACK_READS, LateFrames, model_of, track_reads, tracked_part
-from ipsys_log.tracking.track_rows import make_track
+from ipsys_log.tracking.track_messages import (
+    TRACK_READS,
+    LateFrames,
+    make_track,
+    model_of,
+    track_reads,
+    tracked_part,
+)
 from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
 
 

@@ -10,8 +10,14 @@ from ipsys_log.messages import Tracks
 from ipsys_log.messages.channels import EVENTS, POSITIONS, RIG, SMOOTHED_TRACKS
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, Timed
 from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
-from ipsys_log.tracking.track_inputs import TRACK_READS, LateFrames, model_of, track_reads, tracked_part
-from ipsys_log.tracking.track_rows import make_track
+from ipsys_log.tracking.track_messages import (
+    TRACK_READS,
+    LateFrames,
+    make_track,
+    model_of,
+    track_reads,
+    tracked_part,
+)
 
 _STEPS = 3
 

@@ -23,7 +23,7 @@ from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
-    from ipsys_log.analysis.drive_plan import PlannedDrive
+    from ipsys_log.analysis.joint_plan import PlannedDrive
 
 Lenses = Mapping[str, CameraCalibration]
 
@@ -143,9 +143,8 @@ def _plan_corner_model(
 ) -> PlannedFloor:
     """Plan points and a drive for a model of corners: its covariance gives their effect."""
     # Late: scipy takes 1 s, and plans of other models do not need these.
-    from ipsys_log.analysis.drive_plan import choose_drive
     from ipsys_log.analysis.expected_error import FloorGrid
-    from ipsys_log.analysis.joint_plan import expect_on_floor, plan_joint_points
+    from ipsys_log.analysis.joint_plan import choose_drive, expect_on_floor, plan_joint_points
     from ipsys_log.joint.payload import restore_joint
 
     models = {camera: joint for camera, joint in restore_joint(model).items() if camera in lenses}

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.frame_gaps import find_gaps
+from ipsys_log.analysis.recording import find_gaps
 from ipsys_log.units import NS_PER_S
 
 RATE_HZ = 10.0

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ipsys_log.analysis.drive_plan import choose_drive
 from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
     FloorGrid,
@@ -18,11 +17,11 @@ from ipsys_log.analysis.expected_error import (
     expect_errors,
     see_markers,
 )
-from ipsys_log.analysis.joint_plan import plan_joint_points
+from ipsys_log.analysis.joint_plan import choose_drive, plan_joint_points
 from ipsys_log.analysis.taped_points import choose_points, mean_error, posterior_root, some_modes
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.corner_slopes import edge_motion, linearise_corners
 from ipsys_log.joint.fit import JointFit, fit_jointly
+from ipsys_log.joint.locate import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel, build_models
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 

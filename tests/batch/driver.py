@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.batch.execution import run_batch
-from ipsys_log.batch.settings import WorkerSettings
 from ipsys_log.batch.tasks import BatchTask
-from ipsys_log.batch.workers import open_workers
+from ipsys_log.batch.workers import WorkerSettings, open_workers
 from ipsys_log.errors import IpsysError
 from tests.batch.piece_works import replay_pieces
 from tests.batch.works import PATIENCE_S, replay_and_note

@@ -14,10 +14,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from ipsys_log.batch.exports import plan_exports
-from ipsys_log.batch.settings import WorkerSettings
+from ipsys_log.batch.log_work import plan_exports
 from ipsys_log.batch.tasks import BatchTask, LogResult, perform
-from ipsys_log.batch.workers import most_tasks, open_workers
+from ipsys_log.batch.workers import WorkerSettings, most_tasks, open_workers
 from ipsys_log.cli import batch as batch_command
 from ipsys_log.cli.signals import Interrupted
 from ipsys_log.errors import IpsysError

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from ipsys_log import api
-from ipsys_log.batch.exports import export_log
-from ipsys_log.batch.log_work import check_log, replay_log, verify_log
+from ipsys_log.batch.log_work import check_log, export_log, replay_log, verify_log
 from ipsys_log.batch.tasks import BatchTask, LogPieces, LogResult, perform, perform_or_divide, perform_piece
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.log.location import LogUrl

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.capture import recorded_file
-from ipsys_log.capture.recorded_file import RecordedFile
+from ipsys_log.capture import disk
+from ipsys_log.capture.disk import RecordedFile
 from ipsys_log.capture.recorder import open_recording
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.growing_channel import GrowingChannel
@@ -64,7 +64,7 @@ def test_unknown_name_is_reported_and_the_log_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Other systems than Linux do not tell the present name of an open file."""
-    monkeypatch.setattr(recorded_file, "_OPEN_FILES", tmp_path / "none")
+    monkeypatch.setattr(disk, "_OPEN_FILES", tmp_path / "none")
     image = CompressedImage(1, "red", b"image", "jpeg")
     with open_recording(tmp_path / "a.mcap") as log:
         (tmp_path / "a.mcap").rename(tmp_path / "b.mcap")

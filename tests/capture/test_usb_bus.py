@@ -12,8 +12,14 @@ from typing import Any
 import pytest
 
 from ipsys_log.capture import usb_bus, v4l2
-from ipsys_log.capture.usb_bandwidth import BandwidthDemand, advise, list_demands
-from ipsys_log.capture.usb_bus import Mode, UsbConnection, find_cameras
+from ipsys_log.capture.usb_bus import (
+    BandwidthDemand,
+    Mode,
+    UsbConnection,
+    advise_bandwidth,
+    find_cameras,
+    list_demands,
+)
 from ipsys_log.messages import Rig, RigCamera
 from tests.capture.camera_driver import Driver
 from tests.conftest import Ipsys
@@ -143,29 +149,29 @@ def test_cameras_that_fit_a_bus_get_no_advice() -> None:
 
     Two of 1920 x 1080 x 30 x 0.25 B are 31 MB/s.
     """
-    assert advise(cameras(2)) == []
-    assert advise(cameras(3, rate_hz=25.0)) == []
-    assert advise(cameras(3, width=1280, height=720)) == []
+    assert advise_bandwidth(cameras(2)) == []
+    assert advise_bandwidth(cameras(3, rate_hz=25.0)) == []
+    assert advise_bandwidth(cameras(3, width=1280, height=720)) == []
     # Four cameras fit on separate buses, or on USB 3.
-    assert advise([demand._replace(bus=n) for n, demand in enumerate(cameras(4))]) == []
-    assert advise(cameras(4, speed_mbit_s=5000.0)) == []
+    assert advise_bandwidth([demand._replace(bus=n) for n, demand in enumerate(cameras(4))]) == []
+    assert advise_bandwidth(cameras(4, speed_mbit_s=5000.0)) == []
 
 
 def test_overloaded_bus_is_explained() -> None:
-    (line,) = advise([*cameras(4), *cameras(1, bus=2)])
+    (line,) = advise_bandwidth([*cameras(4), *cameras(1, bus=2)])
     assert line == (
         "cameras black, blue, red and white share USB bus 1 (Acme Hub at port 2) and need "
         "64.6 MB/s of its 48: plug one camera into another bus, or set 20 frames/s for each, or set "
         "1280 x 960 px"
     )
     # The advised settings fit.
-    assert advise(cameras(4, rate_hz=20.0)) == []
-    assert advise(cameras(4, width=1280, height=960)) == []
-    assert advise(cameras(4, rate_hz=25.0)) != []
+    assert advise_bandwidth(cameras(4, rate_hz=20.0)) == []
+    assert advise_bandwidth(cameras(4, width=1280, height=960)) == []
+    assert advise_bandwidth(cameras(4, rate_hz=25.0)) != []
 
 
 def test_single_camera_can_overload_a_bus() -> None:
-    (line,) = advise(cameras(1, format="YUYV"))
+    (line,) = advise_bandwidth(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "
         "set 10 frames/s, or set 800 x 600 px, or use a camera with MJPG"
@@ -173,7 +179,7 @@ def test_single_camera_can_overload_a_bus() -> None:
 
 
 def test_cameras_that_reserve_all_they_can_may_not_start() -> None:
-    (line,) = advise(cameras(2, most=3072, rate_hz=10.0))
+    (line,) = advise_bandwidth(cameras(2, most=3072, rate_hz=10.0))
     assert "may reserve 51.0 MB/s of its 48: if one of them does not start" in line
 
 
@@ -201,7 +207,7 @@ def test_cameras_command_lists_the_bus_load(
 def test_cameras_that_fit_in_no_mode_need_another_bus() -> None:
     """Thirty cameras do not fit at the lowest rate, and not at the smallest size."""
     many = [demand._replace(camera=f"c{n:02}") for n, demand in enumerate(cameras(1) * 30)]
-    (line,) = advise(many)
+    (line,) = advise_bandwidth(many)
     assert line.endswith(": plug one camera into another bus")
 
 

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from ipsys_log.log.contents import RawMessage, Schema, StoredChannel
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CameraPoint, CameraPoints, Message
-from ipsys_log.report.message_lines import message_json, message_line
+from ipsys_log.report.log_texts import message_json, message_line
 from ipsys_log.runs.output import write_log
 from tests.conftest import ROOT, Ipsys
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ipsys_log.first_day.camera_address import parse_camera_address
 from ipsys_log.first_day.camera_choice import add_camera
 from ipsys_log.messages import Rig, RigCamera
-from ipsys_log.passwords import hide_password
+from ipsys_log.plain_text import hide_password
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import Fault
 

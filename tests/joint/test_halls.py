@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.floor_error import grid_nodes
 from ipsys_log.joint import fit as joint_fit
-from ipsys_log.joint.anchoring import anchor
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
 from ipsys_log.joint.locate import locate_markers
@@ -21,10 +20,10 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 from ipsys_log.joint.settings import JointSettings
-from ipsys_log.joint.solver import Solution, solve
+from ipsys_log.joint.solver import Solution, anchor, solve
 from ipsys_log.joint.start import place_cameras
 from ipsys_log.messages import Markers, Measurement, Rig
-from ipsys_log.simulation.hall import hall_settings
+from ipsys_log.simulation.settings import hall_settings
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.points import choose_points
 from tests.geometric.session import simulate_session

@@ -14,9 +14,8 @@ from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.hypotheses import fit_hypotheses
 from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.model import build_models
-from ipsys_log.joint.observations import Observations
+from ipsys_log.joint.observations import Observations, seeing_cameras, without_points
 from ipsys_log.joint.payload import joint_payload, restore_joint
-from ipsys_log.joint.selection import seeing_cameras, without_points
 from ipsys_log.messages import Marker, Markers, Message, Rig, RigMarker
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S

@@ -9,9 +9,8 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.mending import PoseChange, mend_poses
 from ipsys_log.joint.model import JointModel, covariance_modes
-from ipsys_log.joint.payload import joint_payload, restore_joint
+from ipsys_log.joint.payload import PoseChange, joint_payload, mend_poses, restore_joint
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.messages import Model, Parameter
 from tests.joint.small_lab import Array, make_lab

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import FitError
-from ipsys_log.joint.fit import fit_jointly
+from ipsys_log.joint.fit import explain_divergence, fit_jointly
 from ipsys_log.joint.observations import Observations, marker_body
-from ipsys_log.joint.refusals import explain
 from ipsys_log.joint.solver import ConvergenceError
 from tests.joint.small_lab import make_lab
 
@@ -90,6 +89,8 @@ def test_camera_that_nothing_holds_is_named() -> None:
     values[fit.problem.layout.cameras[1].start + 3] += 1000.0
     error = ConvergenceError("no convergence", fit.problem, replace(fit.state, values=values))
     count = len(observations.sightings[1])
-    assert f"no sighting of camera c1 ({count} sightings) fits" in str(explain(error, observations))
+    assert f"no sighting of camera c1 ({count} sightings) fits" in str(
+        explain_divergence(error, observations)
+    )
     held = ConvergenceError("no convergence", fit.problem, fit.state)
-    assert str(explain(held, observations)) == "no convergence"
+    assert str(explain_divergence(held, observations)) == "no convergence"

@@ -21,7 +21,7 @@ from ipsys_log.report.joint_figures import clocks_figure, poses_figure
 from ipsys_log.report.lab_calibration_figure import _panels
 from ipsys_log.report.learning_figure import _figure
 from ipsys_log.report.points_figure import draw_hulls
-from ipsys_log.simulation.hall import grid_names
+from ipsys_log.simulation.settings import grid_names
 from ipsys_log.sinks.video.composite import _arrange
 from tests import labs
 from tests.report.test_joint_figures import calibrated

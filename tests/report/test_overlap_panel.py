@@ -9,8 +9,8 @@ import pytest
 
 from ipsys_log.analysis.disagreement import CameraPositions, PairDisagreement, compare_cameras
 from ipsys_log.messages import Floor, Rig
+from ipsys_log.report.html_figures import overlap_pictures
 from ipsys_log.report.html_sections import overlap_rows, overlap_tables
-from ipsys_log.report.overlap_figure import overlap_pictures
 from ipsys_log.units import NS_PER_S
 
 

@@ -20,7 +20,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, Message
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
-from ipsys_log.report.trajectory_table import trajectory_lines, trajectory_table
+from ipsys_log.report.tables import trajectory_lines, trajectory_table
 from ipsys_log.runs.output import append_messages
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import NS_PER_S

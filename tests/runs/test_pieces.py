@@ -17,7 +17,7 @@ from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.resets import Resets
+from ipsys_log.messages.stage import Resets
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, plan_stage, writer_of

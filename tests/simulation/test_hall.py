@@ -11,10 +11,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Markers, Rig
 from ipsys_log.rig.file import check_rig
 from ipsys_log.simulation.cameras import mount_cameras, sees
-from ipsys_log.simulation.drive import plan_drive
-from ipsys_log.simulation.drive_paths import LanePath
-from ipsys_log.simulation.hall import hall_settings, parse_grid
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.drive import LanePath, plan_drive
+from ipsys_log.simulation.settings import LabSettings, hall_settings, parse_grid
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session

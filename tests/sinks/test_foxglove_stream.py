@@ -30,7 +30,6 @@ from ipsys_log.log import codec as log_codec
 from ipsys_log.messages import CompressedImage, Event, Message
 from ipsys_log.sinks.sink import DropReport
 from ipsys_log.sinks.streams import foxglove as foxglove_stream
-from ipsys_log.sinks.streams import foxglove_client
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.foxglove_messages import SUBPROTOCOLS, Subscriptions
 from ipsys_log.sinks.streams.poses import NewSession
@@ -357,11 +356,11 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
 
 def test_slow_client_loses_images_before_other_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     sent: list[str | bytes] = []
-    monkeypatch.setattr(foxglove_client, "broadcast", lambda connections, data: sent.append(data))
+    monkeypatch.setattr(foxglove_stream, "broadcast", lambda connections, data: sent.append(data))
     events: list[str] = []
     transport = SimpleNamespace(get_write_buffer_size=lambda: 3 << 20)
     connection: Any = SimpleNamespace(transport=transport)
-    client = foxglove_client.Client(
+    client = foxglove_stream.Client(
         connection, DropReport("Foxglove", lambda kind, text: events.append(text))
     )
     client.put(b"image", is_image=True)

@@ -12,7 +12,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ClockEstimate, Message, clock_topic
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.soundness.clocks import check_clocks
+from ipsys_log.soundness.times import check_clocks
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

@@ -14,6 +14,7 @@ from ipsys_log.analysis.accuracy import POOLED, error_statistics, evaluate_cross
 from ipsys_log.analysis.camera_models import height_sigmas
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
+    Study,
     gather_points,
     labelled_subsets,
     learning_curve,
@@ -23,7 +24,6 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
-from ipsys_log.analysis.study import Study
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks

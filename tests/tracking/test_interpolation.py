@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.tracking.interpolation import TrackRows, interpolate
 from ipsys_log.tracking.motion import MotionNoise
-from ipsys_log.tracking.robot_rows import gather_rows
+from ipsys_log.tracking.track_messages import gather_rows
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from ipsys_log.messages import Position, Rig, RigMarker, Track, Tracks
 from ipsys_log.tracking import smoothed_poses
 from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
 from ipsys_log.tracking.smoother import smooth_track
-from ipsys_log.tracking.track_rows import make_track
+from ipsys_log.tracking.track_messages import make_track
 from ipsys_log.units import NS_PER_S
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ipsys_log.first_day.lab_folder import LabFolder
-from ipsys_log.simulation.hall import grid_names
+from ipsys_log.simulation.settings import grid_names
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.web.contrast import low_contrasts

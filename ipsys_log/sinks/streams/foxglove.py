@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
@@ -26,10 +26,11 @@ from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo, Tr
 from ipsys_log.messages.channels import IMAGES
 from ipsys_log.sinks.sink import DropReport, Warn, send_all
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, is_own_host, listen
-from ipsys_log.sinks.streams.foxglove_client import Client
 from ipsys_log.sinks.streams.foxglove_messages import (
     SUBPROTOCOLS,
     Advertised,
+    Subscriptions,
+    pack_message,
     pack_time,
     write_advertise,
     write_server_info,
@@ -51,6 +52,8 @@ _LATCHED = (Rig, CameraCalibration)
 # The server prints nothing, because the recorder uses the terminal.
 _LOGGER = logging.Logger("foxglove")
 _LOGGER.addHandler(logging.NullHandler())
+# Above the first limit of bytes that wait, images are dropped; above the second, all messages.
+_MOST_WITH_IMAGES_BYTES, _MOST_WAITING_BYTES = 2 << 20, 4 << 20
 
 
 class FoxgloveStream:
@@ -276,6 +279,34 @@ class FoxgloveStream:
             self._time_ns = time_ns
             for client in self._clients:
                 client.put(pack_time(time_ns))
+
+
+class Client:
+    """A client, used in the thread of the server only. A slow client loses messages, images first.
+
+    Parameters
+    ----------
+    drops : counts the messages that clients lose.
+    """
+
+    def __init__(self, connection: ServerConnection, drops: DropReport) -> None:
+        self.subscriptions = Subscriptions()
+        self._connection, self._drops = connection, drops
+
+    def put_message(self, channel: int, time_ns: int, data: bytes, is_image: bool) -> None:
+        """Send a message of a channel if the client has subscribed to it."""
+        number = self.subscriptions.number_of(channel)
+        if number is not None:
+            self.put(pack_message(number, time_ns, data), is_image)
+
+    def put(self, data: str | bytes, is_image: bool = False) -> None:
+        """Send data, or drop it if too much waits; this never blocks."""
+        waiting = self._connection.transport.get_write_buffer_size()
+        if waiting > (_MOST_WITH_IMAGES_BYTES if is_image else _MOST_WAITING_BYTES):
+            self._drops.add("a client is too slow")
+            return
+        # A coroutine would send in the next turn of the loop, which has to wait for the GIL again.
+        broadcast([self._connection], data)
 
 
 def _is_closed(connection: ServerConnection) -> bool:

@@ -1,4 +1,4 @@
-"""Poses as serialised messages of ROS 2: axes and frames by REP 103 and REP 105.
+"""Poses, images and camera intrinsics as messages of ROS 2: axes and frames by REP 103 and REP 105.
 
 The axes of the lab are those of the frame ``map``: x and y on the floor, z up, m and rad. The frame of a
 robot has the robot's name; its origin is the marker, and x points along the heading.
@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.rotations import quaternion
+from ipsys_log.log.ros2 import ROS2_MODELS
+from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
 from ipsys_log.sinks.streams.ros2_types import encode, make, make_header, make_time, message_class
 from ipsys_log.units import NS_PER_S
@@ -29,6 +32,8 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 # An unknown variance in m^2, rad^2, (m/s)^2 or (rad/s)^2: filters of ROS read 0 as exact, and refuse NaN.
 _UNKNOWN = 1e6
 _ALL_UNKNOWN = np.eye(6) * _UNKNOWN
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_COMPRESSED, _RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 
 
 def optical_frame(camera: str) -> str:
@@ -142,6 +147,48 @@ def encode_diagnostics(
     rows = [_status(robot, pose, session, now_ns, stale_s) for robot, pose in newest.items()]
     message = make("diagnostic_msgs/DiagnosticArray", make_header(now_ns, ""), rows)
     return encode(message, DIAGNOSTICS)
+
+
+def encode_image(camera: str, image: CompressedImage | RawImage | CompressedVideo) -> tuple[str, bytes]:
+    """Return the type and the bytes of the message of an image; its data stay as they are.
+
+    Raises
+    ------
+    IpsysError
+        The image is a frame of a video: ``sensor_msgs`` has no message for it.
+    """
+    if isinstance(image, CompressedVideo):
+        raise IpsysError(
+            f"camera {camera}: its images are {image.format} video, for which ROS 2 has no standard message; "
+            "leave the images out (--without-images)"
+        )
+    header, data = make_header(image.timestamp, optical_frame(camera)), np.frombuffer(image.data, np.uint8)
+    if isinstance(image, CompressedImage):
+        return _COMPRESSED, encode(
+            make("sensor_msgs/CompressedImage", header, image.format, data), _COMPRESSED
+        )
+    size = image.height, image.width
+    message = make("sensor_msgs/Image", header, *size, image.encoding, 0, image.step, data)
+    return _RAW, encode(message, _RAW)
+
+
+def encode_camera_info(camera: str, lens: CameraCalibration, time_ns: int) -> bytes:
+    """Return the message CameraInfo of camera intrinsics, with the stamp of an image."""
+    rectification = np.eye(3) if lens.R is None else lens.R
+    projection = np.column_stack([lens.K, np.zeros(3)]) if lens.P is None else lens.P
+    message = make(
+        "sensor_msgs/CameraInfo",
+        make_header(time_ns, optical_frame(camera)),
+        lens.height,
+        lens.width,
+        ROS2_MODELS.get(lens.distortion_model, lens.distortion_model),
+        np.asarray(lens.D, dtype=np.float64).ravel(),
+        *(matrix.astype(np.float64).ravel() for matrix in (lens.K, rectification, projection)),
+        0,
+        0,
+        make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False),
+    )
+    return encode(message, CAMERA_INFO)
 
 
 def _status(robot: str, pose: StreamPose | None, session: int, now_ns: int, stale_s: float) -> Any:

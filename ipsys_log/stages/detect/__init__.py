@@ -41,8 +41,7 @@ from ipsys_log.messages.channels import (
     RUN_EVENTS,
     Channel,
 )
-from ipsys_log.messages.resets import Resets
-from ipsys_log.messages.stage import Pieces, Plan, Stage, StageView
+from ipsys_log.messages.stage import Pieces, Plan, Resets, Stage, StageView
 from ipsys_log.stages.detect.adjustment import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.stages.detect.misprints import Inspection, Misprints

@@ -12,8 +12,7 @@ from ipsys_log.player import Player
 from ipsys_log.sinks.played_topics import PlayedScene
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.played_log import PlayedLog
-from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
+from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting, PlayedLog
 from ipsys_log.web.operator_seat import OperatorSeat
 
 

@@ -24,7 +24,7 @@ from ipsys_log.messages import FRAME_SKIPPED, Markers, Message, RigCamera, RigNo
 from ipsys_log.messages.channels import EVENTS, MARKERS, POSITIONS, TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.hall import hall_settings
+from ipsys_log.simulation.settings import hall_settings
 from tests.capture.nodes.lab_of_nodes import PATIENCE_S
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

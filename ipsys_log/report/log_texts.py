@@ -1,0 +1,190 @@
+"""Messages, channel sizes and findings of a check of a log, as text and as plain data.
+
+Long parts and bytes of a message are given by their size.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.channel_sizes import ChannelSize
+from ipsys_log.log.contents import RawMessage, StoredChannel
+from ipsys_log.messages import Message
+from ipsys_log.plain_text import plain_text
+from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
+from ipsys_log.units import format_bytes, format_time
+
+_LONGEST_VALUE = 200
+_TIME = "timestamp"  # every payload repeats its publish time
+_NUMBERS = ("messages", "payload", "in the file", "share")
+_MOST_LINES = 30
+
+
+def message_line(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> str:
+    """Return time (UTC), topic, schema and short content of a message in one line."""
+    name = channel.schema.name if channel.schema is not None else "no schema"
+    content = _data(raw, message, channel)
+    parts = [_short(key, value) for key, value in content.items() if key != _TIME]
+    return plain_text(" ".join((format_time(raw.log_time_ns), raw.topic, f"[{name}]", *parts)))
+
+
+def message_json(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> str:
+    """Return a message as one line of JSON; times are in ns, and a missing value is absent or null."""
+    is_read = not isinstance(message, LogError)
+    row = {
+        "topic": raw.topic,
+        "log_time_ns": raw.log_time_ns,
+        "publish_time_ns": message.publish_time_ns if isinstance(message, Message) else raw.publish_time_ns,
+        "schema": channel.schema.name if channel.schema is not None else None,
+        "data": _data(raw, message, channel),
+        "error": None if is_read or channel.message_encoding == "json" else str(message),
+    }
+    return json.dumps({key: value for key, value in row.items() if value is not None}, allow_nan=False)
+
+
+def sizes_json(path: str, file_bytes: int, sizes: Sequence[ChannelSize]) -> dict[str, Any]:
+    """Return the sizes of a log as plain data, in bytes; ``share`` is of the file."""
+    stored_bytes = sum(size.stored_bytes for size in sizes)
+    return {
+        "path": path,
+        "bytes": file_bytes,
+        "channels": [
+            {
+                "topic": size.topic,
+                "messages": size.messages,
+                "payload_bytes": size.payload_bytes,
+                "stored_bytes": size.stored_bytes,
+                "share": size.stored_bytes / file_bytes,
+            }
+            for size in sizes
+        ],
+        "other_bytes": file_bytes - stored_bytes,
+    }
+
+
+def sizes_table(sizes: dict[str, Any]) -> Table:
+    """Return the sizes of :func:`sizes_json` as a table, in 80 columns if the topics are short enough."""
+    title = f"{plain_text(sizes['path'])}, {format_bytes(sizes['bytes'])}"
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    table.add_column("topic", overflow="fold")
+    for name in _NUMBERS:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in sizes["channels"]:
+        table.add_row(
+            Text(plain_text(row["topic"])), str(row["messages"]), format_bytes(row["payload_bytes"]),
+            format_bytes(row["stored_bytes"]), _percent(row["share"]),
+        )  # fmt: skip
+    share = sizes["other_bytes"] / sizes["bytes"]
+    table.add_row("(definitions, indexes)", "", "", format_bytes(sizes["other_bytes"]), _percent(share))
+    return table
+
+
+def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
+    """Return the results as plain data; notes are included, and missing values are left out."""
+    return {
+        "state": LogCheck.worst(checks),
+        "logs": [
+            {
+                "path": str(check.path),
+                "state": check.state,
+                "findings": [_finding_json(finding) for finding in check.findings],
+            }
+            for check in checks
+        ],
+    }
+
+
+def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
+    """Yield the answer for a log, then a line for each finding; notes only with ``details``."""
+    findings = check.findings if details else check.remarks
+    yield f"{check.path}: {_answer(check)}"
+    for finding in findings[:_MOST_LINES]:
+        if finding is not _first_fault(check):
+            yield f"  {_finding_line(finding)}"
+        elif finding.advice:
+            yield f"  {finding.advice}"
+    if len(findings) > _MOST_LINES:
+        yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
+
+
+def _data(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> dict[str, Any]:
+    """Return the content of a message as plain data; its size if it cannot be decoded."""
+    if isinstance(message, Message):
+        content: dict[str, Any] = _plain(message.payload)
+        return content
+    if channel.message_encoding == "json":
+        try:
+            read = json.loads(raw.data)
+        except (ValueError, RecursionError):
+            return {"bytes": len(raw.data)}
+        return _plain(read) if isinstance(read, dict) else {"value": _plain(read)}
+    return {"bytes": len(raw.data)}
+
+
+def _plain(value: Any) -> Any:
+    """Return a payload as plain data, without missing fields; bytes become their number."""
+    if is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    elif isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items() if part is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, bytes | bytearray | memoryview):
+        return {"bytes": len(value)}
+    is_number = not isinstance(value, float) or isfinite(value)
+    return value if is_number else None
+
+
+def _short(key: str, value: Any) -> str:
+    """Return a field in one short text: a list as its length, bytes as their number."""
+    if isinstance(value, list):
+        return f"{key}[{len(value)}]"
+    if isinstance(value, dict):
+        if value.keys() == {"bytes"}:
+            return f"{key}={value['bytes']} bytes"
+        return f"{key}{{{len(value)}}}"
+    if key == "bytes":
+        return f"{value} bytes"
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{key}={text[:_LONGEST_VALUE]}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _finding_json(finding: LogFinding) -> dict[str, Any]:
+    return {key: value for key, value in asdict(finding).items() if value not in (None, "")}
+
+
+def _first_fault(check: LogCheck) -> LogFinding | None:
+    return next((finding for finding in check.findings if finding.level in (BROKEN, UNREAD)), None)
+
+
+def _answer(check: LogCheck) -> str:
+    fault = _first_fault(check)
+    if fault is not None:
+        return f"{check.state}: {plain_text(fault.text)}"
+    number = len(check.remarks)
+    return SOUND if not number else f"readable, {number} remark{'s' if number > 1 else ''}"
+
+
+def _finding_line(finding: LogFinding) -> str:
+    """Return the place, the fault and the advice of a finding in one line."""
+    place = [finding.topic] if finding.topic else []
+    place += [f"at {format_time(finding.time_ns)}"] if finding.time_ns is not None else []
+    place += [f"({finding.count} messages)"] if finding.count is not None and finding.count > 1 else []
+    title = f"{' '.join(place)}: " if place else ""
+    advice = f"; {finding.advice}" if finding.advice else ""
+    return plain_text(f"{title}{finding.text}{advice}")

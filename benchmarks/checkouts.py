@@ -59,7 +59,7 @@ def measure(options: argparse.Namespace) -> Report:
     for name, work in works.items():
         contenders = [
             Contender(who, _replay, (package.resolve(), *work))
-            for who, package in (("this", _ROOT), ("other", options.other))
+            for who, package in (("this", _ROOT), ("other", Path(options.other)))
         ]
         # The first turn also loads modules and the log.
         timings = race(contenders, 2, options.rounds)
@@ -68,9 +68,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
-    parser.add_argument(
-        "--other", type=Path, default=_ROOT, metavar="FOLDER", help="checkout to compare with"
-    )
+    parser.add_argument("--other", default=str(_ROOT), metavar="FOLDER", help="checkout to compare with")
 
 
 if __name__ == "__main__":

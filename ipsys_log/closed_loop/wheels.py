@@ -151,10 +151,12 @@ class Wheels:
         while missing := [name for name in self._robots if name not in commands]:
             if self._is_stopped:
                 return []
-            patience.take_turn(missing[0], "a command")
             for answer in self.receive(_TURN_S):
                 if answer.tick == number:
                     commands[answer.command.robot] = answer.command
+            # Only now: a program can end right after its answer.
+            if missing[0] not in commands:
+                patience.take_turn(missing[0], "a command")
         return [commands[robot] for robot in self._robots]
 
     def receive(self, wait_s: float) -> Iterator[Answer]:

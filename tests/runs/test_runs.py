@@ -78,6 +78,8 @@ def robots(folder: Path, log: Path, prefix: str) -> Path:
     with Session([log]) as session:
         rig = session.payloads(session.topics(RIG))[0]
     text = f'name = "a"\ndictionary = "{rig.dictionary}"\nmarker_length_m = {rig.marker_length_m}\n'
+    # Camera points depend on the heights, too: they are compared with the sizes of the markers.
+    text += f"marker_height_m = {rig.marker_height_m}\n" if rig.marker_height_m is not None else ""
     for p in rig.reference_points:
         text += f'[[reference_points]]\nname = "{p.name}"\nx_m = {p.x_m}\ny_m = {p.y_m}\n'
     for marker in rig.markers:

@@ -1,6 +1,6 @@
 """A stage for tests, in the form of a new stage: one file, one entry, and one channel.
 
-Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.damping damp LOG``.
+Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.damping replay LOG``.
 """
 
 from __future__ import annotations

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.console import console, print_json, say, warn
 from ipsys_log.cli.open_cameras import Lab, check_target, prepare_lab, record_now
 from ipsys_log.cli.options import (
     AsJson,
@@ -83,7 +82,7 @@ def align(
         options = {"rig": None, "calibration": None, "corners": corners, "kept": kept}
         _align([log], options, plot, as_json)
     if output is None:
-        remarks.print("no frames or results are kept; to keep them, add -o name.mcap", markup=False)
+        say("no frames or results are kept; to keep them, add -o name.mcap")
 
 
 def _prepare_now(
@@ -136,12 +135,12 @@ def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
 
         draw_alignment(lab, plot)
     if as_json:
-        print(json.dumps(alignment_json(lab), indent=2, allow_nan=False))  # noqa: T201
+        print_json(alignment_json(lab))
     else:
         console.print(alignment_table(lab))
         for line, good in coverage_lines(lab):
-            console.print(line, style="green" if good else "red", markup=False, soft_wrap=False)
+            console.print(line, style="green" if good else "red", soft_wrap=False)
     for note in lab.notes:
-        remarks.print(note, style="yellow", markup=False)
+        warn(note)
     if plot is not None:
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ipsys_log.cli.batch_options import DERIVED, EXPORT, FOLDER, LOGS, OUTDATED, RUN, WORKERS
-from ipsys_log.cli.console import console, remarks, say
+from ipsys_log.cli.console import console, print_json, remarks, say
 from ipsys_log.cli.options import check_present
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.cli.stages import build_command, options_until, replay_options
@@ -227,13 +226,13 @@ def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> N
     from ipsys_log.report.batch import batch_json, batch_table, failure_lines, write_results
 
     if as_json:
-        print(json.dumps(batch_json(results), indent=2))  # noqa: T201
+        print_json(batch_json(results))
     else:
         console.print(batch_table(results))
         for line in failure_lines(results):
             console.print(line, style="red")
     for trace in {result.trace for result in results if result.trace}:
-        remarks.print(trace)
+        say(trace)
     if table is not None:
         write_results(table, results)
         say(f"{table} written: a row for each log")

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
 from ipsys_log.cli.nominal_intrinsics import (
     FieldOfView,
@@ -55,7 +54,7 @@ Goal = Annotated[
 ]
 Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 Output = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
 ]
 Plot = Annotated[
@@ -74,7 +73,7 @@ Sources = Annotated[
     ),
 ]
 Seconds = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option(min=1.0, metavar="SECONDS", help="Without LOG: stop the cameras after this time."),
 ]
 Terminal = Annotated[
@@ -212,18 +211,18 @@ def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
 
         draw_lab(lab, plot)
     if as_json:
-        print(json.dumps(lab_json(lab), indent=2, allow_nan=False))  # noqa: T201
+        print_json(lab_json(lab))
     else:
         for line in lab_headline(lab):
-            console.print(line, markup=False, highlight=False)
+            console.print(line)
         console.print()
         console.print(lab_table(lab))
         for line in lab_advice(lab):
-            console.print(line, markup=False, highlight=False)
+            console.print(line)
     for note in lab.notes:
-        remarks.print(note, style="yellow", markup=False)
+        warn(note)
     if plot is not None:
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
 
 
 def _record_drive(
@@ -286,9 +285,8 @@ def _ask_points(output: Path, request: Request) -> None:
     from ipsys_log.survey.from_log import open_finished_log
 
     with progress_bar() as progress, open_finished_log(output, request, progress, say) as scene:
-        remarks.print(
+        say(
             f"measure {_LEAST_POINTS} to 4 of the points at which a marker was stationary; s skips a point, "
             "q ends",
-            markup=False,
         )
         ask_places(scene)

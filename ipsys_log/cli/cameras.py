@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console
+from ipsys_log.cli.console import console, print_json
 from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import writes_nothing
 
@@ -51,14 +50,14 @@ def cameras(
     attached = find_cameras()
     advice = advise_bandwidth(list_demands(attached, load_rig(rig) if rig else None))
     if as_json:
-        print(json.dumps({"cameras": [_plain(camera) for camera in attached], "advice": advice}, indent=2))  # noqa: T201
+        print_json({"cameras": [_plain(camera) for camera in attached], "advice": advice})
         return
     for camera in attached:
-        console.print(_describe(camera), markup=False)
+        console.print(_describe(camera))
     if not attached:
-        console.print(_NONE, markup=False)
+        console.print(_NONE)
     for line in advice:
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def _plain(camera: UsbCamera) -> dict[str, Any]:

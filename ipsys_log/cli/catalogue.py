@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar
+from ipsys_log.cli.console import console, print_json, progress_bar
 from ipsys_log.cli.options import AsJson
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def catalogue(
         typer.Option("--output", "-o", metavar="FILE", help="The catalogue: a Parquet file (.parquet)."),
     ],
     baseline: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             "--baseline",
             metavar="LOG",
@@ -44,13 +43,13 @@ def catalogue(
         ),
     ] = None,
     model_from: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
         ),
     ] = None,
     derived: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--derived",
             metavar="FOLDER",
@@ -90,7 +89,7 @@ def catalogue(
             place, output, since, derived, lambda done, total: progress("logs", done, total)
         )
     if as_json:
-        print(json.dumps(asdict(update), indent=2))  # noqa: T201
+        print_json(asdict(update))
         return
     removed = f", {update.removed} removed" if update.removed else ""
     console.print(f"{output} written: {update.logs} logs, {update.read} read{removed}")

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.console import console, print_json, progress_bar, say
 from ipsys_log.cli.options import AsJson, OneLog, OtherLog, ReadLogs, one_log_argument
 from ipsys_log.cli.signals import writes_nothing
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.differences import Comparison
 
-_Run = Optional[str]  # noqa: UP045
+_Run = str | None
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -41,18 +40,15 @@ def verify(
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
 
     with progress_bar() as progress:
-        comparisons = api.verify(
-            *logs, run=run, progress=progress, say=lambda text: remarks.print(text, markup=False)
-        )
+        comparisons = api.verify(*logs, run=run, progress=progress, say=say)
     if as_json:
-        print(json.dumps(comparison_json(comparisons), indent=2))  # noqa: T201
+        print_json(comparison_json(comparisons))
     else:
         console.print(comparison_table(comparisons, ("log", "again")))
         difference = first_difference(comparisons)
         console.print(
             _agreement(comparisons) if difference is None else difference,
             style="green" if difference is None else "red",
-            markup=False,
         )
     _end(comparisons)
 
@@ -67,7 +63,7 @@ def diff(
         ),
     ] = None,
     run: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--run",
             metavar="NAME",
@@ -100,14 +96,13 @@ def diff(
     why = None if comparable else explain_diff(*sides)
     if as_json:
         reason = {} if why is None else {"nothing_in_common": why}
-        print(json.dumps({**comparison_json(comparisons), **reason}, indent=2))  # noqa: T201
+        print_json({**comparison_json(comparisons), **reason})
     else:
         console.print(comparison_table(comparisons, ("first", "second")))
         difference = why or first_difference(comparisons)
         console.print(
             "no difference" if difference is None else difference,
             style="green" if difference is None else "red",
-            markup=False,
         )
     _end(comparisons)
 
@@ -115,7 +110,7 @@ def diff(
 def latency(
     logs: ReadLogs,
     plot: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(metavar="FILE", help="Draw the processing steps: .png, .pdf, .svg or .jpg."),
     ] = None,
     as_json: AsJson = False,
@@ -135,9 +130,9 @@ def latency(
         from ipsys_log.report.latency_figure import draw_latency
 
         draw_latency(times_s, plot)
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
     if as_json:
-        print(json.dumps({step: asdict(times) for step, times in steps.items()}, indent=2))  # noqa: T201
+        print_json({step: asdict(times) for step, times in steps.items()})
     else:
         console.print(latency_table(steps))
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar
+from ipsys_log.cli.console import console, print_json, progress_bar
 from ipsys_log.cli.options import AsJson, LogList, ReadLogs, log_argument
 from ipsys_log.cli.signals import writes_nothing
 from ipsys_log.plain_text import shell_words
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
 
 Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
-_Seconds = Optional[float]  # noqa: UP045
+_Seconds = float | None
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -48,7 +47,7 @@ def check(
     with progress_bar(()) as progress:
         checks = check_logs(logs, progress)
     if as_json:
-        print(json.dumps(check_json(checks), indent=2))  # noqa: T201
+        print_json(check_json(checks))
     else:
         for one in checks:
             for line in check_lines(one, details):
@@ -68,7 +67,7 @@ def du(logs: Logs, as_json: AsJson = False) -> None:
 
     results = [_sizes(path) for path in logs]
     if as_json:
-        print(json.dumps(results, indent=2))  # noqa: T201
+        print_json(results)
         return
     for number, result in enumerate(results):
         if number:
@@ -89,7 +88,7 @@ def _sizes(path: LogLocation) -> dict[str, Any]:
 def cat(
     logs: ReadLogs,
     topics: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--topics", metavar="TOPIC,...", help="Print only these topics, separated by commas."),
     ] = None,
     start_secs: Annotated[

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, Optional
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.console import console, say
 from ipsys_log.cli.measure_live import say_faults
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _GAP = 4
 
 Web = Annotated[bool, typer.Option("--web", help="Show a page, the dashboard, for any number of browsers.")]
 WebPort = Annotated[
-    Optional[int],  # noqa: UP045
+    int | None,
     typer.Option(
         "--web-port",
         min=0,
@@ -169,8 +169,8 @@ def _print_addresses(page: PageServer, is_secret: bool) -> None:
 
     if page.view_url is None:
         if is_secret:
-            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        remarks.print(f"dashboard at {page.url}", markup=False)
+            console.print(qr_code(page.url), style="#ffffff on #000000")
+        say(f"dashboard at {page.url}")
         return
     codes = [
         [*qr_code(url).splitlines(), name] for url, name in ((page.view_url, "view"), (page.url, "operate"))
@@ -180,6 +180,6 @@ def _print_addresses(page: PageServer, is_secret: bool) -> None:
     if len(codes[0]) != len(codes[1]) or 2 * width > console.width:
         rows = [*codes[0], *codes[1]]  # one above the other
     for row in rows:
-        console.print(row, style="#ffffff on #000000", markup=False)
-    remarks.print(f"dashboard, to view:    {page.view_url}", markup=False)
-    remarks.print(f"dashboard, to operate: {page.url}", markup=False)
+        console.print(row, style="#ffffff on #000000")
+    say(f"dashboard, to view:    {page.view_url}")
+    say(f"dashboard, to operate: {page.url}")

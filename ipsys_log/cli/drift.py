@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.cli.options import AsJson, LogList, OtherLog, RigFile, log_argument, other_log_option
 from ipsys_log.plain_text import shell_words
 
@@ -38,7 +37,7 @@ Fix = Annotated[
     ),
 ]
 Plot = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(metavar="FILE", help="Draw the drift over time: .png, .pdf, .svg or .jpg."),
 ]
 
@@ -78,7 +77,7 @@ def drift(
         from ipsys_log.report.drift_figure import draw_drift
 
         draw_drift(reading, plot)
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
 
 
 def _fix(reading: DriftReading) -> str | None:
@@ -111,11 +110,11 @@ def _print(reading: DriftReading, run: str | None, as_json: bool) -> None:
 
     if as_json:
         result = {**drift_json(reading), **({} if run is None else {"mended_run": run})}
-        print(json.dumps(result, indent=2, allow_nan=False))  # noqa: T201
+        print_json(result)
     else:
         for line, is_good in drift_lines(reading):
-            console.print(line, style="green" if is_good else "red", markup=False)
+            console.print(line, style="green" if is_good else "red")
         console.print()
         console.print(drift_table(reading))
     for remark in reading.remarks:
-        remarks.print(remark, style="yellow", markup=False)
+        warn(remark)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, say
+from ipsys_log.cli.console import console, print_json, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
 from ipsys_log.cli.options import AsJson, Force, NewLog, OneLog, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
 
 Models = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--model",
         metavar="NAME",
@@ -28,13 +27,13 @@ Models = Annotated[
     ),
 ]
 Paths = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--path", metavar="ROBOT=X,Y...", help='Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'
     ),
 ]
 Failures = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--fail", metavar="CAMERA=START:SECONDS", help="Let a camera fail: white=20:5 is at 20 s, for 5 s."
     ),
@@ -58,7 +57,7 @@ def drive(
     robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--program", metavar="FILE", help="The program of the robots (default: the example of ipsys)."
         ),
@@ -127,7 +126,7 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
     with Session([output]) as session:
         result = read_robot_run(session)
     if as_json:
-        print(json.dumps(robot_run_json(result), indent=2))  # noqa: T201
+        print_json(robot_run_json(result))
         return
     console.print(robot_run_tables(result))
-    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}", markup=False)
+    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}")

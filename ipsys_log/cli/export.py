@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -30,7 +30,7 @@ def export(
         ),
     ],
     format_: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             "--format",
             metavar="NAME",
@@ -45,13 +45,13 @@ def export(
         ),
     ] = "tracks",
     run: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--run", metavar="NAME", help="Export this run instead of the newest; repeat it for several."
         ),
     ] = None,
     robot: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(metavar="NAME", help="Export only this robot."),
     ] = None,
     without_images: Annotated[

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.console import console, print_json, progress_bar, remarks, say, warn
 from ipsys_log.cli.local_files import read_files
 from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appended_log_option, log_option
 from ipsys_log.plain_text import shell_words
@@ -81,9 +80,7 @@ def images(
     lab, lenses, assumed = _settings(rig, calibration, pictures)
     write_log(output, announce_assumed(read_images(pictures, lab, lenses, rate, taken_ns), assumed))
     if not times and len({len(paths) for paths in pictures.values()}) > 1:
-        remarks.print(
-            "the cameras have different numbers of images: images with the same number get the same time"
-        )
+        say("the cameras have different numbers of images: images with the same number get the same time")
     counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
     console.print(f"{output} written: images: {counts}")
 
@@ -122,7 +119,7 @@ def ros(
     ],
     output: NewLog,
     camera: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="NAME=TOPIC",
             help="Import the images of this topic as the camera NAME; repeat it for each camera. "
@@ -165,7 +162,7 @@ def truth(
         Path | None, log_option(help="A new log for the ground truth. Without --into, it needs --rig.")
     ] = None,
     robot: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="NAME", help="The robot of a file that names none; repeat it in the order of the files."
         ),
@@ -206,11 +203,11 @@ def truth(
     options = _truth_options(robot, run, align, time_offset, time_unit, length_unit, rig)
     imported = import_truth(files, into, output, options)
     if as_json:
-        print(json.dumps(truth_json(imported), indent=2, allow_nan=False))  # noqa: T201
+        print_json(truth_json(imported))
     else:
         for line in truth_lines(imported):
             console.print(line)
-    remarks.print(f"results are in {imported.path}", markup=False)
+    say(f"results are in {imported.path}")
 
 
 def detections(
@@ -250,8 +247,8 @@ def detections(
     text = ", ".join(f"{count} of {camera}" for camera, count in imported.markers.items())
     console.print(f"run {imported.run}: markers: {text}")
     for line in imported.remarks:
-        remarks.print(line, style="yellow", markup=False)
-    remarks.print(f"results are in {imported.path}", markup=False)
+        warn(line)
+    say(f"results are in {imported.path}")
 
 
 def pairs(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, print_outcomes, progress_bar, say, warn
 from ipsys_log.cli.options import AsJson, ReadLogs, appended_log_argument
 from ipsys_log.cli.signals import writes_nothing
 from ipsys_log.cli.stages import MORE, build_command, derive, options_until
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
 
 Runs = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),
 ]
 Save = Annotated[
@@ -37,7 +37,7 @@ FoxgloveLayout = Annotated[
 ]
 _HTML = (
     Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--html", metavar="FILE", help="The page to write. Default: the log's name with .html."),
     ],
     None,
@@ -68,7 +68,7 @@ def info(logs: ReadLogs, as_json: AsJson = False) -> None:
     with Session(logs) as session:
         contents = contents_json(session)
     if as_json:
-        print(json.dumps(contents, indent=2))  # noqa: T201
+        print_json(contents)
     else:
         for number, table in enumerate(contents_tables(contents)):
             if number:
@@ -90,7 +90,7 @@ def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
     with Session(logs) as session:
         states = states_json(session)
     if as_json:
-        print(json.dumps(states, indent=2))  # noqa: T201
+        print_json(states)
     else:
         console.print(runs_table(states))
 
@@ -110,7 +110,7 @@ def repair(
     from ipsys_log.report.repair import repair_lines
 
     for part in repair_lines(repair_log(log)):
-        console.print(part, markup=False)
+        console.print(part)
     try:
         with Session([log]) as session:
             if not session.run_names():
@@ -120,7 +120,7 @@ def repair(
         with progress_bar() as progress:
             print_outcomes(finish_runs(log, progress))
     except IpsysError as error:  # the log itself is complete
-        remarks.print(f"unfinished runs cannot be completed: {error}", style="yellow", markup=False)
+        warn(f"unfinished runs cannot be completed: {error}")
 
 
 def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: FoxgloveLayout = None) -> None:
@@ -145,9 +145,9 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
     for kind, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
         named = ", ".join(name for name in names if name)
         if named:
-            remarks.print(f"{kind:<21} run {named}")
+            say(f"{kind:<21} run {named}")
     if save is not None:
-        remarks.print(f"{save} written; to view it: rerun {save}")
+        say(f"{save} written; to view it: rerun {save}")
 
 
 def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
@@ -164,7 +164,7 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
         layout = make_layout(session, runs)
     with replacement_of(path) as file:
         file.write(json.dumps(layout, indent=2).encode() + b"\n")
-    remarks.print(f"{path} written; in Foxglove: Layouts, Import from file")
+    say(f"{path} written; in Foxglove: Layouts, Import from file")
 
 
 def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
@@ -194,7 +194,7 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
 
     with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
         write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
-    console.print(f"{target} written: open it in a browser", markup=False)
+    console.print(f"{target} written: open it in a browser")
 
 
 def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
@@ -209,8 +209,8 @@ def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
             return False
         page = render_report(session, ())
     write_files(target.parent, {target.name: page.encode()})
-    console.print(f"{target} written: open it in a browser", markup=False)
-    remarks.print("the session has no calibration points: the page shows the recording and its runs")
+    console.print(f"{target} written: open it in a browser")
+    say("the session has no calibration points: the page shows the recording and its runs")
     return True
 
 
@@ -228,5 +228,5 @@ def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
         check_file(picture, "--html", logs)
         page, panels = render_robot_run(session)
     write_files(target.parent, {target.name: page.encode(), picture.name: panels})
-    console.print(f"{target} and {picture} written", markup=False)
+    console.print(f"{target} and {picture} written")
     return True

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.console import console, print_json, progress_bar, say
 from ipsys_log.cli.options import (
     AsJson,
     LogList,
@@ -45,28 +44,28 @@ def cut(
     ] = "",
     end: Annotated[str, typer.Option(metavar="TIME", help=f"Keep messages before this time: {_TIME}")] = "",
     topics: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="PATTERN",
             help="Keep topics of this pattern, such as '/cameras/*'; repeat it for several.",
         ),
     ] = None,
     exclude_topics: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(metavar="PATTERN", help="Leave out topics of this pattern; repeat it for several."),
     ] = None,
     cameras: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--cameras", "--camera", metavar="NAME", help="Keep this camera; repeat it for several."
         ),
     ] = None,
     runs: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--runs", "--run", metavar="NAME", help="Keep this run; repeat it for several."),
     ] = None,
     exclude_runs: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--exclude-runs",
             "--exclude-run",
@@ -75,7 +74,7 @@ def cut(
         ),
     ] = None,
     robots: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--robots",
             "--robot",
@@ -120,7 +119,7 @@ def cut(
 def compact(
     log: Annotated[OneLog, one_log_argument(help="A finished log, a file or a URL. It stays as it is.")],
     output: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         log_option(help="The log to write, with a name that ends in .mcap."),
     ] = None,
     dry_run: Annotated[
@@ -152,7 +151,7 @@ def compact(
         with progress_bar() as progress:
             compaction.compact(log, output, overwrite, progress)
     if as_json:
-        print(json.dumps(_compact_json(log, size, output if is_written else None, dropped), indent=2))  # noqa: T201
+        print_json(_compact_json(log, size, output if is_written else None, dropped))
     elif output is not None and is_written:
         _show_saving(size, output)
 
@@ -164,7 +163,7 @@ def merge(
     ],
     output: NewLog,
     offset: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="NAME=SECONDS",
             help="Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
@@ -188,32 +187,29 @@ def merge(
         offsets = choose_offsets(logs, offset or (), progress)
         result = merge_logs(logs, output, offsets, overwrite, progress)
     if as_json:
-        print(json.dumps(_merge_json(output, result), indent=2))  # noqa: T201
+        print_json(_merge_json(output, result))
         return
     _show_merge(logs, offsets, result)
     from ipsys_log.units import format_bytes
 
-    console.print(
-        f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}", markup=False
-    )
-    remarks.print(f"next: ipsys replay {shell_words(output)}", markup=False)
+    console.print(f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}")
+    say(f"next: ipsys replay {shell_words(output)}")
 
 
 def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> None:
     from ipsys_log.units import format_bytes
 
     if not dropped:
-        console.print(f"{log}: no run is superseded or unfinished; nothing is written", markup=False)
+        console.print(f"{log}: no run is superseded or unfinished; nothing is written")
         return
     for one in dropped:
         count = "1 message" if one.messages == 1 else f"{one.messages} messages"
         stored = format_bytes(one.stored_bytes)
-        console.print(f"{one.run.run} is dropped: {one.run.reason}; {count}, about {stored}", markup=False)
+        console.print(f"{one.run.run} is dropped: {one.run.reason}; {count}, about {stored}")
     gained = sum(one.stored_bytes for one in dropped)
     console.print(
         f"{len(dropped)} run{'' if len(dropped) == 1 else 's'}, about {format_bytes(gained)} of "
         f"{format_bytes(size)}",
-        markup=False,
     )
 
 
@@ -221,7 +217,7 @@ def _show_saving(before: int, output: Path) -> None:
     from ipsys_log.units import format_bytes
 
     after = output.stat().st_size
-    console.print(f"{output} written: {format_bytes(after)} instead of {format_bytes(before)}", markup=False)
+    console.print(f"{output} written: {format_bytes(after)} instead of {format_bytes(before)}")
 
 
 def _compact_json(
@@ -248,9 +244,9 @@ def _compact_json(
 def _show_merge(logs: Sequence[LogLocation], offsets: Sequence[LogOffset], result: MergeResult) -> None:
     for path, offset, one in zip(logs[1:], offsets[1:], result.logs[1:], strict=True):
         sigma = "" if offset.sigma_s is None else f" (estimated, sigma {offset.sigma_s * 1e3:.2f} ms)"
-        console.print(f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}", markup=False)
+        console.print(f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}")
         for old, new in one.renamed_runs.items():
-            remarks.print(f"run {old} of {path} is run {new}", markup=False)
+            say(f"run {old} of {path} is run {new}")
 
 
 def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -35,13 +34,13 @@ if TYPE_CHECKING:
     from ipsys_log.survey.scene import MeasuringScene
 
 Log = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     appended_log_argument(
         help="A finished log, which gets the measurements. Without LOG: use the cameras of --rig now.",
     ),
 ]
 Output = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     log_option(help="Without LOG: the log to write, with about 1 s of frames of each point."),
 ]
 Terminal = Annotated[bool, typer.Option("--terminal", help="Ask in the terminal instead of on a page.")]
@@ -68,7 +67,7 @@ Places = Annotated[
 ]
 
 Baseline = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--ab",
         metavar="CM",
@@ -189,7 +188,7 @@ def _measure_log(
             scene.add([read_baseline(ab, scene.rig, scene.history(), scene.start_ns)])
         elif csv is not None:
             for text in add_sheet(scene, csv, force):
-                remarks.print(text, style="yellow", markup=False)
+                warn(text)
         elif terminal:
             from ipsys_log.cli.dialog import ask_places
 
@@ -199,9 +198,7 @@ def _measure_log(
         _show_count(log, scene.history()[before:], as_json)
         _show_next(log, scene.history())
     if rig is not None:
-        remarks.print(
-            f"give --rig {rig} to ipsys replay, too: the measurements use its reference points", markup=False
-        )
+        say(f"give --rig {rig} to ipsys replay, too: the measurements use its reference points")
 
 
 def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
@@ -213,9 +210,9 @@ def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
     stop_on_signal(lambda: signals.append(None))
     with serve(scene, host, port) as page:
         if host is not None:
-            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        console.print(f"open {page.url}", markup=False)
-        remarks.print("Ctrl-C ends the measuring; every saved point is already in the log")
+            console.print(qr_code(page.url), style="#ffffff on #000000")
+        console.print(f"open {page.url}")
+        say("Ctrl-C ends the measuring; every saved point is already in the log")
         try:
             page.wait(lambda: bool(signals))
         finally:
@@ -247,31 +244,29 @@ def exclude(
     result = (exclusion.readmit if readmit else exclusion.exclude)(log, points, reason)
     done, before = ("re-admitted", "not excluded") if readmit else ("excluded", "excluded already")
     for name, text in result.unchanged.items():
-        remarks.print(f"{name} is {before}{f': {text}' if text else ''}", style="yellow", markup=False)
+        warn(f"{name} is {before}{f': {text}' if text else ''}")
     if as_json:
         key = "readmitted" if readmit else "excluded"
         rows = {"log": str(log), key: result.changed, "unchanged": [*result.unchanged]}
-        print(json.dumps({**rows, "active": result.active}))  # noqa: T201
+        print_json({**rows, "active": result.active})
         return
     if not result.changed:
-        console.print(f"{log} is unchanged", markup=False)
+        console.print(f"{log} is unchanged")
         return
-    console.print(
-        f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}", markup=False
-    )
-    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
+    console.print(f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}")
+    say(f"next: ipsys replay {shell_words(log)}")
 
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
     withdrawn = sum(measurement.withdraws is not None for measurement in added)
     count = sum(measurement.is_point for measurement in added)
     if as_json:
-        print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
+        print_json({"log": str(log), "measured": count, "withdrawn": withdrawn})
         return
     baselines = sum(measurement.from_reference is not None for measurement in added)
     also = f", {baselines} distance AB" if baselines else ""
     also += f", {withdrawn} withdrawn" if withdrawn else ""
-    console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
+    console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}")
 
 
 def _show_next(log: Path, history: Sequence[Measurement]) -> None:
@@ -283,12 +278,11 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
     if not count:
         return
     if count < _GOOD:
-        remarks.print(
+        say(
             f"calibration points in the log: {count}; each camera must see {min_pairs(_MODEL)} or more for a "
             f"model, and about {_GOOD} for a good one",
-            markup=False,
         )
-    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
+    say(f"next: ipsys replay {shell_words(log)}")
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:
@@ -296,6 +290,6 @@ def _show_places(scene: FinishedLog, as_json: bool) -> None:
 
     stops = intervals_json(scene)
     if as_json:
-        print(json.dumps(stops, indent=2))  # noqa: T201
+        print_json(stops)
     else:
         console.print(intervals_table(stops))

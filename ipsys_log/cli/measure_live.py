@@ -10,7 +10,7 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Any
 
-from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.console import console, remarks, say
 from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
@@ -98,8 +98,8 @@ def serve_live_page(scene: LiveScene, host: str | None, port: int) -> Iterator[N
 
     with serve(scene, host, port) as page:
         if host is not None:
-            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        remarks.print(f"measure at {page.url}", markup=False)
+            console.print(qr_code(page.url), style="#ffffff on #000000")
+        say(f"measure at {page.url}")
         try:
             yield
         finally:
@@ -110,7 +110,7 @@ def say_faults(page: PageServer, name: str = "the measuring page") -> None:
     """Print the faults of the page's server at the end, when the screen is free for a traceback."""
     if page.exceptions.count:
         remarks.print(f"internal errors of {name}: {page.exceptions.count}; the first one:", style="red")
-        remarks.print(page.exceptions.first, markup=False, highlight=False)
+        say(page.exceptions.first)
 
 
 def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras) -> None:

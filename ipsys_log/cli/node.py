@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import remarks, say
+from ipsys_log.cli.console import say, warn
 from ipsys_log.cli.open_cameras import Lab, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import Calibrations, Corners, Force, log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
 
 NodeLog = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     log_option(help="The log of this node. Default: the name of the camera and the time, in this folder."),
 ]
 
@@ -37,13 +37,13 @@ def node(
     ] = "",
     output: NodeLog = None,
     centre: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             "--centre", metavar="HOST:PORT", help="The address of the centre, instead of the rig's."
         ),
     ] = None,
     certificates: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--certificates", metavar="FOLDER", help="The folder of the certificates, instead of the rig's."
         ),
@@ -54,7 +54,7 @@ def node(
     calibration: Calibrations = None,
     corners: Corners = None,
     seconds: Annotated[
-        Optional[float],  # noqa: UP045
+        float | None,
         typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
     ] = None,
     force: Force = False,
@@ -124,4 +124,4 @@ def _send(
             pipeline.record(cameras, settings, target, [status, sender], force)
         left = sender.finish(not cameras.is_stopped)
     if left:
-        remarks.print(sender.describe_missing(left, status.log), style="yellow", markup=False)
+        warn(sender.describe_missing(left, status.log))

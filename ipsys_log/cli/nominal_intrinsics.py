@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import remarks
+from ipsys_log.cli.console import say
 from ipsys_log.cli.options import cameras_of
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration
 
 Focal = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--focal",
         metavar="[CAMERA=]PX",
@@ -27,7 +27,7 @@ Focal = Annotated[
     ),
 ]
 FieldOfView = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--field-of-view",
         metavar="[CAMERA=]DEGREES",
@@ -150,4 +150,4 @@ def write_nominal(lenses: Mapping[str, CameraCalibration], folder: Path) -> None
         if (folder / name).exists():
             raise IpsysError(f"{folder / name}: exists already; give another folder to --save-nominal")
     write_files(folder, files)
-    remarks.print(f"{folder} has {', '.join(files)}", markup=False)
+    say(f"{folder} has {', '.join(files)}")

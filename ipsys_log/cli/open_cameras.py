@@ -13,7 +13,7 @@ from threading import TIMEOUT_MAX, Timer
 from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
-from ipsys_log.cli.console import console, remarks, say
+from ipsys_log.cli.console import console, remarks, say, warn
 from ipsys_log.cli.options import load_lab, split_calibration
 from ipsys_log.cli.signals import Interrupted, stop_on_signal
 from ipsys_log.units import format_bytes
@@ -74,13 +74,11 @@ def prepare_lab(
     check_devices(lab.cameras)
     check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
-        remarks.print(line, style="yellow", markup=False)
+        warn(line)
     for camera in lab.cameras:
         if camera.width and camera.height and camera.width < camera.height:
             text = f"camera {camera.name}: {camera.width} x {camera.height} px is upright"
-            remarks.print(
-                f"{text}: check that width and height are not exchanged", style="yellow", markup=False
-            )
+            warn(f"{text}: check that width and height are not exchanged")
     return lab
 
 
@@ -185,7 +183,7 @@ def open_cameras(
         settings = first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run, lab.assumed)
         yield attached, settings, status
     for line in () if doing else status.summary():
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def _say_room(
@@ -201,7 +199,7 @@ def _say_room(
             say(f"about {place} for each point; {free} free in {room.folder}")
         return
     short = room.is_short(seconds)
-    remarks.print(room.describe(seconds), style="bold red" if short else None, markup=False)
+    remarks.print(room.describe(seconds), style="bold red" if short else None)
     if advice := room.advise(lab.cameras, attached.states):
         say(advice)
 

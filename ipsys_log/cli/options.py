@@ -6,11 +6,11 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import remarks
+from ipsys_log.cli.console import say, warn
 from ipsys_log.cli.local_files import appended_logs, is_url, read_files
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 else:
     LogList = list[str]  # typer knows no union of types
     OneLog = str
-    OtherLog = Optional[str]  # noqa: UP045
-    NoLogs = Optional[list[str]]  # noqa: UP045
+    OtherLog = str | None
+    NoLogs = list[str] | None
 
 
 def build_option(parameter: StageParameter) -> Any:
@@ -108,7 +108,7 @@ def _named_as_log(path: Path | None) -> Path | None:
         page = "; ipsys report --html FILE writes a page" if path.suffix.lower() in (".html", ".htm") else ""
         raise IpsysError(f"-o {path}: the name of a new log ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
-    remarks.print(f"-o {path}: the log gets the name {named}", markup=False)
+    say(f"-o {path}: the log gets the name {named}")
     return named
 
 
@@ -120,7 +120,7 @@ RigFile = Annotated[
     typer.Option("--rig", metavar="FILE", help="Use this rig file (lab.toml) instead of the rig in the log."),
 ]
 Calibrations = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
@@ -128,10 +128,10 @@ Calibrations = Annotated[
         "log with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
-Corners = Annotated[Optional[str], build_option(CORNERS)]  # noqa: UP045
+Corners = Annotated[str | None, build_option(CORNERS)]
 Method = Annotated[str, build_option(METHOD)]
 Only = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--camera", metavar="NAME", help="Use only this camera of the rig; repeat it for several."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing log of this name.")]
@@ -216,7 +216,7 @@ def load_calibrations(
 
 def say_remark(camera: str, text: str) -> None:
     """Print a remark on the calibration of a camera."""
-    remarks.print(f"camera {camera}: {text}", style="yellow", markup=False)
+    warn(f"camera {camera}: {text}")
 
 
 def say_unusual(lenses: Mapping[str, CameraCalibration]) -> None:
@@ -257,7 +257,7 @@ def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]])
 
     rig = load_rig(path)
     for text in check_rig_cameras(rig, cameras(), f"--rig {path}"):
-        remarks.print(text, style="yellow", markup=False)
+        warn(text)
     return rig
 
 

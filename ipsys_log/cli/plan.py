@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.console import console, print_json, say, warn
 from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile, cameras_of, load_calibrations
 from ipsys_log.cli.stages import derive
 
@@ -28,7 +27,7 @@ _HIGHEST_M = 5.0
 Places = Annotated[int, typer.Option(metavar="N", help="Number of points to propose.")]
 Model = Annotated[str, typer.Option(metavar="NAME", help="The model to improve.")]
 Heights = Annotated[
-    Optional[list[float]],  # noqa: UP045
+    list[float] | None,
     typer.Option(
         "--height-m",
         metavar="METRES",
@@ -98,16 +97,16 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
 
         draw_plan(found, plot)
     if as_json:
-        print(json.dumps(_plan_json(found), indent=2, allow_nan=False))  # noqa: T201
+        print_json(_plan_json(found))
     else:
         console.print(_table(found))
         console.print(_headline(found))
         if found.drive is not None:
-            console.print(_drive_line(found.drive), highlight=False)
+            console.print(_drive_line(found.drive))
     for note in found.notes:
-        remarks.print(note, style="yellow", markup=False)
+        warn(note)
     if plot is not None:
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
 
 
 def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, progress_bar, say
 from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.plain_text import shell_words
@@ -21,11 +20,11 @@ def add_commands(app: typer.Typer) -> None:
 
 def pack(
     logs: Annotated[
-        Optional[list[Path]],  # noqa: UP045
+        list[Path] | None,
         file_log_argument(help="Logs, read as one session; they stay unchanged."),
     ] = None,
     output: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--output",
             "-o",
@@ -34,15 +33,15 @@ def pack(
         ),
     ] = None,
     card: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(metavar="FILE", help="The filled form of the dataset card."),
     ] = None,
     card_form: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(metavar="FILE", help="Only write the empty form of the dataset card."),
     ] = None,
     model: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="NAME",
             help="Score this model; repeat it for several. Default: all that the logs allow.",
@@ -71,7 +70,7 @@ def pack(
 
     if card_form is not None:
         write_card_form(card_form)
-        remarks.print(
+        say(
             f"{card_form} written: fill it in, then: "
             f"ipsys pack LOG -o dataset --card {shell_words(card_form)}"
         )
@@ -103,7 +102,7 @@ def score(
         ),
     ],
     model: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="MODEL",
             help="Repeat only this model, or score your own as FILE.py:CLASS; repeat it for several.",
@@ -122,7 +121,7 @@ def score(
     with say_kept(lambda _: f"{dataset} is unchanged"), progress_bar(lines_in_pipe=True) as progress:
         result = api.score(dataset, models=model or (), progress=progress, say=say)
     if as_json:
-        print(json.dumps(score_json(result), indent=2, allow_nan=False))  # noqa: T201
+        print_json(score_json(result))
     else:
         console.print(score_answer(result))
         for table in score_tables(result):

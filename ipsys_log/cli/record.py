@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import remarks, say
+from ipsys_log.cli.console import say, warn
 from ipsys_log.cli.dashboard import Web, WebPort, first_run, plan_dashboard, serve_dashboard
 from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ipsys_log.sinks.streams.settings import StreamSettings
 
 Seconds = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
 ]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
@@ -103,7 +103,7 @@ def record(
                 f"camera {name} has no calibration, but a replay needs one; write calibration = "
                 f'"{name}.yaml" into the rig file'
             )
-            remarks.print(text, style="yellow", markup=False)
+            warn(text)
         if measure:
             scene = live_scene(settings, cameras, model)
             with serve_live_page(scene, host, port):
@@ -124,7 +124,7 @@ def live(
     ],
     rig: RigNow = Path("lab.toml"),
     model: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--model",
             metavar="NAME",
@@ -162,7 +162,7 @@ def live(
     models = tuple(dict.fromkeys(model or ()))
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
-        remarks.print(line, style="yellow", markup=False)
+        warn(line)
     planned = plan_dashboard(web, streams["host"], web_port, request)
     streamed = choose_streams(lab.rig, rig.parent, has_page=web, **streams)
     for line in check_streams(streamed):
@@ -170,7 +170,7 @@ def live(
     robots = lab.rig.robot_heights_m()
     if streamed and not robots:
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
-        remarks.print(text, style="yellow", markup=False)
+        warn(text)
     shown_run = first_run(request)
     with (
         open_cameras(lab, output, seconds) as (cameras, settings, status),

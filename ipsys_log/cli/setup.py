@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.console import console, progress_bar, say
 from ipsys_log.cli.measure_live import say_faults
 from ipsys_log.cli.options import Host, NewLog, OtherLog, Port, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
@@ -95,9 +95,7 @@ def init(
     write_new({path: text})
     console.print(f"{path} written: edit it to describe your lab")
     if HIDDEN in text:
-        console.print(
-            f"a log has no passwords: in each source, replace {HIDDEN} by its password", markup=False
-        )
+        console.print(f"a log has no passwords: in each source, replace {HIDDEN} by its password")
 
 
 def _init_simulated(path: Path) -> None:
@@ -107,11 +105,9 @@ def _init_simulated(path: Path) -> None:
     write_new(texts)
     tape = tape_sheet_path(path)
     lines = texts[tape].splitlines()
-    console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
-    console.print(
-        f"{tape} written: the tape measurements of its {len(lines) - 1} stationary markers", markup=False
-    )
-    console.print(f"next: ipsys align --rig {shell_words(path)}", markup=False)
+    console.print(f"{path} written: the simulated lab, with three cameras")
+    console.print(f"{tape} written: the tape measurements of its {len(lines) - 1} stationary markers")
+    console.print(f"next: ipsys align --rig {shell_words(path)}")
 
 
 def _rig_of(log: LogLocation) -> str:
@@ -168,18 +164,18 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
     with serve_app(page.app, host, port, has_viewers=True) as server:
         stop_on_signal(lambda: signals.append(None))
         if host is not None:
-            console.print(qr_code(server.url), style="#ffffff on #000000", markup=False)
-        console.print(f"open {server.url}", markup=False)
+            console.print(qr_code(server.url), style="#ffffff on #000000")
+        console.print(f"open {server.url}")
         if server.view_url is not None:
-            remarks.print(f"to view only: {server.view_url}", markup=False)
-        remarks.print(f"Ctrl-C ends; to continue: {_command(folder, host, port)}", markup=False)
+            say(f"to view only: {server.view_url}")
+        say(f"Ctrl-C ends; to continue: {_command(folder, host, port)}")
         try:
             server.wait(lambda: bool(signals))
         finally:
             page.session.close()
             say_faults(server, "the setup page")
             for bug in page.session.jobs.bugs:
-                remarks.print(bug, markup=False, highlight=False)
+                say(bug)
     if page.session.jobs.bugs:
         raise typer.Exit(1)
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, print_outcomes, progress_bar, say
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
-_Path = Optional[Path]  # noqa: UP045
+_Path = Path | None
 
 # The options of every stage, and of the printed results: type with help, and default.
 _SHARED: dict[str, tuple[Any, Any]] = {
@@ -45,7 +44,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
     "calibration": (Calibrations, None),
     "run": (
         Annotated[
-            Optional[str],  # noqa: UP045
+            str | None,
             typer.Option(
                 "--run", metavar="NAME", help="Name of the new run, instead of edges, poly, poly_2 ..."
             ),
@@ -58,7 +57,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
     ),
     "jobs": (
         Annotated[
-            Optional[int],  # noqa: UP045
+            int | None,
             typer.Option(
                 "--jobs",
                 metavar="N",
@@ -258,7 +257,7 @@ def _derive(
     else:
         _print(accuracies, details)
     for line in drawn:
-        remarks.print(line)
+        say(line)
 
 
 def _check_figures(logs: Sequence[LogLocation], plot: Path | None, plots: Path | None) -> None:
@@ -297,7 +296,7 @@ def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> 
 
     stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
     results = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
-    print(json.dumps(results, indent=2, allow_nan=False))  # noqa: T201
+    print_json(results)
 
 
 def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
@@ -312,7 +311,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
             console.print(part)
             console.print()
     if accuracies and not details:
-        remarks.print("--details prints errors by camera, every outlier and models by number of points")
+        say("--details prints errors by camera, every outlier and models by number of points")
 
 
 def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
@@ -321,6 +320,6 @@ def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
     if target is None:
         return
     if any(outcome.fresh for outcome in outcomes):
-        remarks.print(f"results are in {target}", markup=False)
+        say(f"results are in {target}")
     else:
-        remarks.print("nothing to do: all results are up to date")
+        say("nothing to do: all results are up to date")

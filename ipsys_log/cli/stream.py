@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -15,7 +15,7 @@ from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_st
 
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
 RigFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),
 ]
 Rate = Annotated[
@@ -28,11 +28,11 @@ StartOffset = Annotated[
     typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first position."),
 ]
 Run = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option("--run", metavar="NAME", help="Play the tracks of this run. Default: the newest."),
 ]
 Topics = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--topics",
         metavar="TOPIC",

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,11 +24,11 @@ _PANEL = "Streams of positions"
 def _port_option(name: str, text: str) -> Any:
     """Return the type of an option for a port."""
     option = typer.Option(name, metavar="PORT", min=1, max=65535, help=text, rich_help_panel=_PANEL)
-    return Annotated[Optional[int], option]  # noqa: UP045
+    return Annotated[int], option | None
 
 
 Udp = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--udp",
         metavar="HOST:PORT",
@@ -38,7 +38,7 @@ Udp = Annotated[
     ),
 ]
 Key = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--key",
         metavar="FILE",
@@ -56,7 +56,7 @@ Vrpn = Annotated[
 ]
 VrpnPort = _port_option("--vrpn-port", "Serve VRPN on another port.")
 Mavlink = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--mavlink",
         metavar="ROBOT=HOST:PORT",
@@ -78,7 +78,7 @@ Ros2Port = _port_option(
     "--ros2-port", "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router."
 )
 Ros2Domain = Annotated[
-    Optional[int],  # noqa: UP045
+    int | None,
     typer.Option(
         "--ros2-domain",
         metavar="ID",
@@ -108,7 +108,7 @@ Images = Annotated[
     typer.Option("--images", help="Show images, too, in Foxglove and in Rerun.", rich_help_panel=_PANEL),
 ]
 StreamHost = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--host",
         metavar="ADDRESS",
@@ -118,7 +118,7 @@ StreamHost = Annotated[
     ),
 ]
 Robots = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--robot",
         metavar="NAME",

@@ -13,10 +13,10 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.floor_error import GRID_M, SightingErrors
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.styles import shorten
 from ipsys_log.simulation.settings import FLOOR_M
+from tests.geometric.floor_error import GRID_M, SightingErrors
 
 __all__ = ["draw_floor_map"]
 

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 from scipy.spatial import cKDTree
 
-from ipsys_log.analysis.floor_error import GRID_M, WALL_M, WHOLE_PRINT
 from ipsys_log.analysis.plan import mean_length
 from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.lenses import in_image, project
@@ -22,6 +21,11 @@ from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel
 
+# Step of the grid, and its least distance from the walls.
+GRID_M = 0.1
+WALL_M = 0.3
+# A marker counts as visible if a square of this multiple of its side is wholly in the image.
+WHOLE_PRINT = 1.4
 # A node is covered if the camera saw a marker nearer than this: the floor changes little over this distance.
 _COVERED_M = 0.35
 # Smaller gaps are not reported.

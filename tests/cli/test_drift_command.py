@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, shift_floor_map
-from ipsys_log.analysis.floor_error import compute_errors, grid_nodes
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
@@ -22,6 +21,7 @@ from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
+from tests.geometric.floor_error import compute_errors, grid_nodes
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.geometric.weeks import (

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.accuracy import POOLED, root_mean_square_m
-from ipsys_log.analysis.trajectory_errors import DELTAS, ErrorSummary, TrajectoryErrors, pool_trajectories
+from ipsys_log.analysis.trajectory_errors import DELTAS, TrajectoryErrors, pool_trajectories
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report.accuracy import Accuracy, gather_outliers
@@ -112,10 +112,12 @@ def trajectory_lines(accuracy: Accuracy) -> Iterator[str]:
     if not accuracy.trajectories:
         return
     pooled = pool_trajectories(accuracy.trajectories)
-    space_cm, floor_cm = (errors.rmse_m * CM_PER_M for errors in (pooled.absolute_3d, pooled.absolute_2d))
+    space_cm, floor_cm = (
+        root_mean_square_m(errors) * CM_PER_M for errors in (pooled.absolute_3d, pooled.absolute_2d)
+    )
     text = f"Absolute trajectory error (ATE): RMSE {space_cm:.2f} cm in 3D, {floor_cm:.2f} cm on the floor"
     relative = [
-        f"{errors.summary.rmse_m * CM_PER_M:.2f} cm over {errors.delta:g} {errors.unit}"
+        f"{root_mean_square_m(errors.summary) * CM_PER_M:.2f} cm over {errors.delta:g} {errors.unit}"
         for errors in pooled.relative
     ]
     yield f"{text}; relative pose error (RPE): RMSE {', '.join(relative)}." if relative else f"{text}."
@@ -285,15 +287,17 @@ def _choice(choice: Choice) -> str:
 
 def _trajectory_cells(trajectory: TrajectoryErrors) -> list[str]:
     ate = trajectory.absolute_3d
-    values = (ate.rmse_m, ate.mean_m, ate.median_m, ate.std_m, ate.p95_m, ate.max_m)
+    values = (root_mean_square_m(ate), ate.mean_m, ate.median_m, ate.std_m, ate.p95_m, ate.max_m)
     relative = {(errors.delta, errors.unit): errors.summary for errors in trajectory.relative}
     return [str(ate.count), *map(_error_cm, values), *(_rmse_cm(relative.get(delta)) for delta in DELTAS)]
 
 
-def _rmse_cm(errors: ErrorSummary | None) -> str:
-    return "-" if errors is None else _error_cm(errors.rmse_m)
+def _rmse_cm(errors: ErrorStatistics | None) -> str:
+    return "-" if errors is None else _error_cm(root_mean_square_m(errors))
 
 
-def _error_cm(value_m: float) -> str:
+def _error_cm(value_m: float | None) -> str:
+    if value_m is None:
+        return "-"
     value_cm = value_m * CM_PER_M
     return f"{value_cm:.2f}" if value_cm < 100 else f"{value_cm:.0f}"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).resolve().parent.parent))
 
-from ipsys_log.analysis.expected_error import GRID_M
+from ipsys_log.analysis.floor_grid import GRID_M
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.styles import shorten
 from ipsys_log.simulation.settings import FLOOR_M

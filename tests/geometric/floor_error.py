@@ -13,7 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ipsys_log.analysis.expected_error import GRID_M, WALL_M, WHOLE_PRINT
+from ipsys_log.analysis.expected_error import WHOLE_PRINT
+from ipsys_log.analysis.floor_grid import GRID_M, WALL_M
 from ipsys_log.arrays import Array, Mask
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import in_image, project, undistort

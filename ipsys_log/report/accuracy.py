@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats, root_mean_square_m
 from ipsys_log.analysis.ground_truth import TrackErrors, gather_paths, track_errors
 from ipsys_log.analysis.trajectory_errors import (
-    ErrorSummary,
     TrajectoryErrors,
     pool_trajectories,
     trajectory_errors,
@@ -230,24 +229,17 @@ def _trajectories_json(trajectories: Sequence[TrajectoryErrors]) -> dict[str, An
 def _trajectory_json(trajectory: TrajectoryErrors) -> dict[str, Any]:
     absolute = {"3d": trajectory.absolute_3d, "2d": trajectory.absolute_2d}
     return {
-        "ate": {name: _summary_json(errors) for name, errors in absolute.items()},
+        "ate": {name: _statistics(errors, root_mean_square_m(errors)) for name, errors in absolute.items()},
         "rpe": [
-            {"delta": one.delta, "unit": one.unit, "relation": one.relation, **_summary_json(one.summary)}
+            {
+                "delta": one.delta,
+                "unit": one.unit,
+                "relation": one.relation,
+                **_statistics(one.summary, root_mean_square_m(one.summary)),
+            }
             for one in trajectory.relative
         ],
     }
-
-
-def _summary_json(errors: ErrorSummary) -> dict[str, float | int]:
-    values = {
-        "rmse_cm": errors.rmse_m,
-        "mean_cm": errors.mean_m,
-        "median_cm": errors.median_m,
-        "std_cm": errors.std_m,
-        "max_cm": errors.max_m,
-        "p95_cm": errors.p95_m,
-    }
-    return {**{name: value_m * CM_PER_M for name, value_m in values.items()}, "n": errors.count}
 
 
 def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:

@@ -500,7 +500,7 @@ def live(
             )
             tracker.begin(attached.stop)
             sinks: list[Sink] = [tracker, *streams]
-            return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=sinks)
+            return pipeline.live(attached, settings, Path(record), request, sinks=sinks, overwrite=force)
 
     return Tracker(track)
 

@@ -29,7 +29,7 @@ from ipsys_log.sinks.played_topics import (
     viewed_topics,
 )
 from ipsys_log.sinks.selection import rig_in_force
-from ipsys_log.sinks.sink import LiveSinks, Sink
+from ipsys_log.sinks.sink import FanOut, Sink
 from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
 from ipsys_log.tracker import LiveTracks, Tracker
 
@@ -198,7 +198,7 @@ class Player:
     def _play(self, tracker: Tracker) -> list[Outcome]:
         try:
             tracker.begin(self._playback.stop)
-            with LiveSinks([*self._streams, *self._viewers, tracker], self._warn) as show:
+            with FanOut([*self._streams, *self._viewers, tracker], self._warn) as show:
                 for message in chain(self._first, self._playback):
                     show(message)
             show.check()

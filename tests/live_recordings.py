@@ -75,7 +75,7 @@ def record_every_frame(lab: Path, calibration: Path, target: Path) -> None:
     """Record on a fast machine: no frame is skipped."""
     attached, settings, clock = attached_in_steps(lab)
     with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
+        pipeline.live(attached, settings, target, Request(model_from=calibration), sinks=[clock.watch])
 
 
 def again(log: Path, run: str | None = None) -> list[Comparison]:

@@ -49,7 +49,7 @@ def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathF
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     with attached:
         request = Request(model_from=calibration)
-        pipeline.live(attached, settings, target, request, consumers=[clock.watch])
+        pipeline.live(attached, settings, target, request, sinks=[clock.watch])
     return target
 
 

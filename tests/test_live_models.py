@@ -44,7 +44,7 @@ def recorded(lab_log: Path, fitted: Path, tmp_path_factory: pytest.TempPathFacto
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     request = Request(models=MODELS, model_from=fitted)
     with attached:
-        outcomes = pipeline.live(attached, settings, target, request, consumers=[clock.watch])
+        outcomes = pipeline.live(attached, settings, target, request, sinks=[clock.watch])
     assert [(one.stage, one.run) for one in outcomes] == [
         ("detect", "edges"),
         ("camera-frame", "edges"),

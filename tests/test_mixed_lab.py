@@ -75,7 +75,7 @@ def mixed(
             (rig,) = session.payloads(["/rig"])
         settings = first_messages(rig, lenses(replayed_log), attached.now_ns, attached.imported_run)
         if request.param == "live":
-            pipeline.live(attached, settings, target, wanted, consumers=[clock.watch])
+            pipeline.live(attached, settings, target, wanted, sinks=[clock.watch])
         else:
             pipeline.record(attached, settings, target, [clock.watch])
     if request.param == "record":

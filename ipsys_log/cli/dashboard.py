@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.player import Player
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Sink
+    from ipsys_log.sinks.streams.settings import Stream
     from ipsys_log.web.dashboard.state import Dashboard
     from ipsys_log.web.server import PageServer
 
@@ -86,7 +86,7 @@ def serve_dashboard(
     opened: tuple[LiveCameras, list[Message], LiveStatus],
     log: Path,
     run: str,
-    streams: Sequence[Sink],
+    streams: Sequence[Stream],
 ) -> Iterator[list[Dashboard]]:
     """Serve the dashboard of a live recording until the end of the block, and print its address.
 

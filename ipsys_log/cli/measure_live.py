@@ -42,7 +42,7 @@ def measure_now(
     """Measure points into a new log, each with a second of frames; return the measurements."""
     from ipsys_log import pipeline
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Consumer
+    from ipsys_log.sinks.sink import Sink
 
     lab, request = prepare_lab(rig, camera, calibration), Request(corners=corners)
     read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
@@ -56,8 +56,8 @@ def measure_now(
     doing = f"measuring into {output}; {ends} to end"
     with open_cameras(lab, output, None, doing, not terminal) as (cameras, settings, status):
         scene = live_scene(settings, cameras, model)
-        consumers: list[Consumer] = [status, scene]
-        work = partial(pipeline.measure, cameras, settings, output, request, consumers, force)
+        sinks: list[Sink] = [status, scene]
+        work = partial(pipeline.measure, cameras, settings, output, request, sinks, force)
         if terminal:
             _ask_beside(work, scene, cameras)
         else:

@@ -181,8 +181,8 @@ def live(
         serve_dashboard(planned, (cameras, settings, status), output, shown_run, senders) as dashboards,
     ):
         viewer = [_viewer(settings, cameras, shown_run)] if view else []
-        sinks: list[Sink] = [*viewer, *pages, *dashboards, *senders]
-        pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
+        sinks: list[Sink] = [status, *viewer, *pages, *dashboards, *senders]
+        pipeline.live(cameras, settings, output, request, None, sinks, force)
 
 
 def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView:

@@ -25,7 +25,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.simulation.robot_lab import RobotLab, robot_rig
-from ipsys_log.sinks.sink import Consumer
+from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.settings import Stream, open_streams
 from ipsys_log.stages.fit import model_run
 
@@ -139,14 +139,11 @@ class _Parts:
         self,
         cameras: CameraSource,
         lab: RobotLab,
-        streams: Sequence[Stream],
-        consumers: Sequence[Consumer] = (),
+        sinks: Sequence[Sink],
     ) -> list[Outcome]:
         settings = self.settings(lab, cameras.now_ns)
         self.begin(cameras.stop)
-        return pipeline.live(
-            cameras, settings, self.target, self.request, None, consumers, self.overwrite, streams
-        )
+        return pipeline.live(cameras, settings, self.target, self.request, None, sinks, self.overwrite)
 
 
 def _drive_lockstep(parts: _Parts) -> list[Outcome]:
@@ -157,7 +154,7 @@ def _drive_lockstep(parts: _Parts) -> list[Outcome]:
     cameras = LockstepCameras(parts.run, lab, clock, sync, parts.say)
     with parts.connect(cameras) as (streams, wheels, programs):
         cameras.steering = Steering(parts.run, lab, wheels, programs, clock.now_ns(), parts.say)
-        outcomes = parts.live(cameras, lab, streams, [sync])
+        outcomes = parts.live(cameras, lab, [*streams, sync])
         if cameras.fault is not None:
             raise cameras.fault
         return outcomes

@@ -42,7 +42,7 @@ from ipsys_log.runs.graph import copy_model
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.sinks.sink import Sink
-from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
+from ipsys_log.sinks.streams.settings import Stream, check_streams, open_streams, settings_of_rig
 from ipsys_log.stages.fit import model_run
 from ipsys_log.survey.add_sheet import add_sheet, check_sheet
 from ipsys_log.survey.entry import check_references
@@ -74,7 +74,7 @@ class LiveRecording:
     log: Path
     model: Model
     run: str
-    streams: tuple[Sink, ...]
+    streams: tuple[Stream, ...]
 
 
 def align(folder: LabFolder, job: Job) -> None:
@@ -214,8 +214,8 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
             view = LiveRecording(lab, log, copy_model(request, name)[1], run, tuple(streams))
             with show(view) as sink:
                 job.say("open the dashboard")
-                sinks: list[Sink] = [sink, *streams]
-                pipeline.live(cameras, lab.settings, log, request, None, [lab.monitor], sinks=sinks)
+                sinks: list[Sink] = [lab.monitor, sink, *streams]
+                pipeline.live(cameras, lab.settings, log, request, None, sinks)
 
 
 @contextmanager
@@ -309,7 +309,7 @@ class _NewestImage:
 
 
 class _Enough:
-    """A consumer that stops the cameras when each has sent frames for some seconds.
+    """A sink that stops the cameras when each has sent frames for some seconds.
 
     It counts the time by the frames, so that a slow machine records the same scene.
     """
@@ -321,9 +321,9 @@ class _Enough:
         self._counts = dict.fromkeys(cameras.states, 0)
         self._done: set[str] = set()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Count a frame."""
-        if message is None or message.camera not in self._counts:
+        if message.camera not in self._counts:
             return
         camera = message.camera
         self._counts[camera] += 1

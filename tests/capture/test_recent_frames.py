@@ -237,9 +237,9 @@ class Hand:
         self.scene, self.tape = scene, tape
         self._done: set[str] = set()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         self.scene(message)
-        if message is None or not isinstance(message.payload, CompressedImage):
+        if not isinstance(message.payload, CompressedImage):
             return
         views = self.scene.views(None)
         for marker_id in {point.id for view in views for row in view.points for point in row.points}:

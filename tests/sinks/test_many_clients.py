@@ -149,7 +149,7 @@ def recording(lab: Path, calibration: Path, target: Path) -> Iterator[tuple[Clie
         )
         with attached:
             request = Request(model_from=calibration)
-            pipeline.live(attached, first, target, request, consumers=[clock.watch], sinks=streams)
+            pipeline.live(attached, first, target, request, sinks=[clock.watch, *streams])
         yield clients, events
 
 

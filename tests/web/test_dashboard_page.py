@@ -363,7 +363,7 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
         dashboard = Dashboard(setting, operator)
         frames = 0
 
-        def act(message: Message | None) -> None:
+        def act(message: Message) -> None:
             nonlocal frames
             if message is None:
                 return
@@ -380,8 +380,7 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
             pages.start()
             assert pages.connected.wait(WAIT_LIMIT_S)
             request = Request(model_from=calibration)
-            consumers = [clock.watch, act]
-            pipeline.live(attached, settings, log, request, None, consumers, sinks=[dashboard])
+            pipeline.live(attached, settings, log, request, None, [clock.watch, act, dashboard])
             pages.join(WAIT_LIMIT_S)
             assert not pages.is_alive()
     return Watched(log, pages, shown)

@@ -22,7 +22,7 @@ _FADE_NS = NS_PER_S
 
 
 class LiveView:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that shows a recording in a Rerun viewer.
+    """A :class:`~ipsys_log.sinks.sink.QueuedSink` that shows a recording in a Rerun viewer.
 
     Parameters
     ----------

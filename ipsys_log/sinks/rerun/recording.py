@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO
@@ -19,9 +19,8 @@ from ipsys_log.analysis.pairs import locate_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.interrupts import undivided
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Message
+from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.sinks.player import play
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
 from ipsys_log.sinks.rerun.scene import Plot, draw_legend, draw_places, draw_rig, layout, symbol_scale
 from ipsys_log.sinks.rerun.series import DISAGREEMENT, LATENCY_MS, Series, draw_series, read_series
@@ -205,7 +204,11 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
         recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
     fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)
     sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs, symbol_scale(rig))
-    play(session.messages([*shown.frames, *shown.moving, *shown.events]), [_Batches(sink, sent)])
+    for number, message in enumerate(session.messages([*shown.frames, *shown.moving, *shown.events])):
+        sink(message)
+        if number % _BATCH == 0:
+            sink.flush()
+            sent()
     sink.close()
     sent()
 
@@ -220,21 +223,3 @@ def _sizes_px(session: Session, cameras: Sequence[str]) -> dict[str, tuple[int, 
     topics = {camera: session.calibrations[camera] for camera in cameras if camera in session.calibrations}
     lenses = {camera: next(iter(session.payloads([topic])), None) for camera, topic in topics.items()}
     return {camera: (lens.width, lens.height) for camera, lens in lenses.items() if lens is not None}
-
-
-class _Batches:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that draws messages and sends them in batches."""
-
-    name = "the recording"
-
-    def __init__(self, sink: RerunSink, sent: Callable[[], object]) -> None:
-        self._sink, self._sent = sink, sent
-
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Draw the messages until they end."""
-        for number, message in enumerate(messages):
-            if message is not None:
-                self._sink(message)
-            if number % _BATCH == 0:
-                self._sink.flush()
-                self._sent()

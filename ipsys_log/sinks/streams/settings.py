@@ -14,7 +14,7 @@ from typing import Protocol
 
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigStream
-from ipsys_log.sinks.sink import PromptSink, Warn
+from ipsys_log.sinks.sink import InlineSink, Warn
 from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
 from ipsys_log.sinks.streams.udp import UdpStream, read_key
 from ipsys_log.sinks.streams.vrpn import PORT, VrpnStream
@@ -24,7 +24,7 @@ PORTS = {"vrpn": PORT, "ros2": 7447, "foxglove": 8765}
 _SECRET_BYTES = 12
 
 
-class Stream(PromptSink, Protocol):
+class Stream(InlineSink, Protocol):
     """A sink with open sockets that never waits; one with connections also has a ``client_count``."""
 
     @property

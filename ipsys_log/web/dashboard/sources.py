@@ -10,7 +10,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.player import Player
 from ipsys_log.sinks.played_topics import PlayedScene
-from ipsys_log.sinks.sink import Sink
+from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting, PlayedLog
 from ipsys_log.web.operator_seat import OperatorSeat
@@ -23,7 +23,7 @@ def dashboard_of_recording(
     log: Path,
     model: Model,
     run: str,
-    streams: Sequence[Sink],
+    streams: Sequence[Stream],
     seat: OperatorSeat | None = None,
 ) -> Dashboard:
     """Return the dashboard of a live recording, with an operator.

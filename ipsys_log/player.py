@@ -34,7 +34,7 @@ from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_stream
 from ipsys_log.tracker import LiveTracks, Tracker
 
 if TYPE_CHECKING:
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
 _TURN_S = 0.1
 
@@ -221,7 +221,7 @@ def _rig_of(session: Session, chosen: PlayedTopics, settings: StreamSettings) ->
 def _open_page() -> ViewerPage:
     """Open the viewer in a browser; its library is optional, and loaded only here."""
     check_installed("--rerun needs", "rerun")
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
     return ViewerPage()
 

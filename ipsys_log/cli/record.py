@@ -200,7 +200,7 @@ def _page_viewer(
         yield []
         return
     from ipsys_log.sinks.rerun.live import LiveView
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
     shown = cameras.states if streamed.images else ()
     with closing(ViewerPage()) as page:

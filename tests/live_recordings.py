@@ -11,8 +11,8 @@ from typing import Any
 
 from ipsys_log import pipeline
 from ipsys_log.analysis.differences import Comparison
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (

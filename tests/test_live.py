@@ -324,7 +324,8 @@ def test_position_is_sent_after_its_write_and_before_its_latency(
 
     monkeypatch.setattr(Recording, "put", noted)
     attached, settings, clock = attached_in_steps(lab_log)
-    request, sinks = Request(model_from=calibration), [clock.watch, Noting(steps)]
+    request = Request(model_from=calibration)
+    sinks: list[Sink] = [clock.watch, Noting(steps)]
     with attached:
         pipeline.live(attached, settings, tmp_path / "x.mcap", request, None, sinks)
     assert [step for step, *_ in steps] == ["written", "sent"] * (len(steps) // 2)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.open_cameras import Lab, check_target, prepare_lab, record_now
+from ipsys_log.cli.open_cameras import check_target, prepare_lab, record_now
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -25,6 +25,7 @@ from ipsys_log.cli.options import (
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab
     from ipsys_log.log.location import LogLocation
     from ipsys_log.report.alignment import AlignedLab
 

@@ -267,13 +267,13 @@ def _record_drive(
         from ipsys_log.web.server import check_port_free
 
         check_port_free(*page)
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
-        scene = live_scene(settings, cameras, None)
+    with open_cameras(lab, output, seconds) as (opened, status):
+        scene = live_scene(opened, None)
         calibrating = LiveCalibration(lab.rig, lab.lenses, goal_m, say)
         sinks: list[Sink] = [status, scene, calibrating]
         try:
             with nullcontext() if page is None else serve_live_page(scene, *page):
-                pipeline.live(cameras, settings, output, request, "camera-frame", sinks, force)
+                pipeline.live(opened.cameras, opened.settings, output, request, "camera-frame", sinks, force)
         finally:
             calibrating.close()
     if page is None or (len(scene.history()) < _LEAST_POINTS and sys.stdin.isatty()):

@@ -13,8 +13,8 @@ from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.measure_live import say_faults
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.messages import Message, Model
+    from ipsys_log.capture.lab import OpenLab
+    from ipsys_log.messages import Model
     from ipsys_log.player import Player
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.runs.options import Request
@@ -71,19 +71,11 @@ def plan_dashboard(
     return DashboardPlan(host, port, copy_model(request, first)[1])
 
 
-def first_run(request: Request) -> str:
-    """Return the run of the first model: streams, the viewer and the dashboard show one run."""
-    from ipsys_log.runs.select import wanted_models
-    from ipsys_log.stages.fit import model_run
-
-    first, *_ = wanted_models(request)
-    return model_run(first)
-
-
 @contextmanager
 def serve_dashboard(
     plan: DashboardPlan | None,
-    opened: tuple[LiveCameras, list[Message], LiveStatus],
+    opened: OpenLab,
+    status: LiveStatus,
     log: Path,
     run: str,
     streams: Sequence[Stream],
@@ -93,7 +85,7 @@ def serve_dashboard(
     Parameters
     ----------
     plan : None: there is no dashboard.
-    opened : the cameras, the first messages of the log, and the status on the screen.
+    opened, status : the open cameras, and the status on the screen.
     log, run, streams : the log that is written, the run of the shown tracks, and the streams of positions.
     """
     if plan is None:
@@ -101,8 +93,7 @@ def serve_dashboard(
         return
     from ipsys_log.web.dashboard.sources import dashboard_of_recording
 
-    cameras, settings, status = opened
-    dashboard = dashboard_of_recording(cameras, settings, status.checks, log, plan.model, run, streams)
+    dashboard = dashboard_of_recording(opened, status.checks, log, plan.model, run, streams)
     with _serve(dashboard, plan.host, plan.port, has_viewers=True):
         yield [dashboard]
 

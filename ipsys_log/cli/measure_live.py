@@ -11,13 +11,14 @@ from time import sleep
 from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, open_cameras, prepare_lab
+from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.log.location import LogLocation
-    from ipsys_log.messages import Measurement, Message, Model
+    from ipsys_log.messages import Measurement, Model
     from ipsys_log.runs.options import Request
     from ipsys_log.survey.live import LiveScene
     from ipsys_log.web.server import PageServer
@@ -54,10 +55,11 @@ def measure_now(
         check_port_free(host, port)
     ends = "q" if terminal else "Ctrl-C"
     doing = f"measuring into {output}; {ends} to end"
-    with open_cameras(lab, output, None, doing, not terminal) as (cameras, settings, status):
-        scene = live_scene(settings, cameras, model)
+    with open_cameras(lab, output, None, doing, not terminal) as (opened, status):
+        cameras = opened.cameras
+        scene = live_scene(opened, model)
         sinks: list[Sink] = [status, scene]
-        work = partial(pipeline.measure, cameras, settings, output, request, sinks, force)
+        work = partial(pipeline.measure, cameras, opened.settings, output, request, sinks, force)
         if terminal:
             _ask_beside(work, scene, cameras)
         else:
@@ -84,11 +86,11 @@ def ready_to_measure(lab: Lab, request: Request, model_from: LogLocation | None)
     return model
 
 
-def live_scene(settings: list[Message], cameras: LiveCameras, model: Model | None) -> LiveScene:
+def live_scene(opened: OpenLab, model: Model | None) -> LiveScene:
     """Make the scene of the live cameras, for measuring."""
     from ipsys_log.survey.live import LiveScene
 
-    return LiveScene(settings[0].payload, model, cameras.states, cameras.save)
+    return LiveScene(opened.rig, model, opened.cameras.states, opened.cameras.save)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import remarks, say
-from ipsys_log.cli.dashboard import Web, WebPort, first_run, plan_dashboard, serve_dashboard
+from ipsys_log.cli.dashboard import Web, WebPort, plan_dashboard, serve_dashboard
 from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
     Calibrations,
@@ -30,8 +30,7 @@ from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.messages import Message
+    from ipsys_log.capture.lab import OpenLab
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
@@ -97,7 +96,8 @@ def record(
         check_port_free(host, port)
     elif detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
+    with open_cameras(lab, output, seconds) as (opened, status):
+        cameras, settings = opened.cameras, opened.settings
         for name in sorted(set(lab.names) - set(lab.lenses)):
             text = (
                 f"camera {name} has no calibration, but a replay needs one; write calibration = "
@@ -105,7 +105,7 @@ def record(
             )
             remarks.print(text, style="yellow", markup=False)
         if measure:
-            scene = live_scene(settings, cameras, model)
+            scene = live_scene(opened, model)
             with serve_live_page(scene, host, port):
                 pipeline.live(cameras, settings, output, request, "camera-frame", [status, scene], force)
         elif detect:
@@ -146,11 +146,10 @@ def live(
     """Track robots live: record, and process every frame with all stages up to fuse, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
-    from ipsys_log.capture.live_plan import check_start
+    from ipsys_log.capture.live_plan import check_start, shown_run
     from ipsys_log.extras import check_installed
-    from ipsys_log.messages.channels import TRACKS
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.streams.settings import check_streams, open_streams
+    from ipsys_log.sinks.streams.settings import check_streams, open_live_streams
 
     for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
         if is_wanted:
@@ -167,34 +166,29 @@ def live(
     streamed = choose_streams(lab.rig, rig.parent, has_page=web, **streams)
     for line in check_streams(streamed):
         say(line)
-    robots = lab.rig.robot_heights_m()
-    if streamed and not robots:
+    if streamed and not lab.rig.robot_heights_m():
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
         remarks.print(text, style="yellow", markup=False)
-    shown_run = first_run(request)
+    run = shown_run(request)
     with (
-        open_cameras(lab, output, seconds) as (cameras, settings, status),
-        open_streams(
-            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, heights_m=robots
-        ) as senders,
-        _page_viewer(settings, cameras, shown_run, streamed) as pages,
-        serve_dashboard(planned, (cameras, settings, status), output, shown_run, senders) as dashboards,
+        open_cameras(lab, output, seconds) as (opened, status),
+        open_live_streams(streamed, opened, run) as senders,
+        _page_viewer(opened, run, streamed) as pages,
+        serve_dashboard(planned, opened, status, output, run, senders) as dashboards,
     ):
-        viewer = [_viewer(settings, cameras, shown_run)] if view else []
+        viewer = [_viewer(opened, run)] if view else []
         sinks: list[Sink] = [status, *viewer, *pages, *dashboards, *senders]
-        pipeline.live(cameras, settings, output, request, None, sinks, force)
+        pipeline.live(opened.cameras, opened.settings, output, request, None, sinks, force)
 
 
-def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView:
+def _viewer(opened: OpenLab, run: str) -> LiveView:
     from ipsys_log.sinks.rerun.live import LiveView
 
-    return LiveView(settings[0].payload, cameras.states, run, say)
+    return LiveView(opened.rig, opened.cameras.states, run, say)
 
 
 @contextmanager
-def _page_viewer(
-    settings: list[Message], cameras: LiveCameras, run: str, streamed: StreamSettings
-) -> Iterator[list[LiveView]]:
+def _page_viewer(opened: OpenLab, run: str, streamed: StreamSettings) -> Iterator[list[LiveView]]:
     """Show the recording on a page for a browser of this machine, if the user asked for it."""
     if not streamed.rerun:
         yield []
@@ -202,7 +196,7 @@ def _page_viewer(
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.rerun.viewer import ViewerPage
 
-    shown = cameras.states if streamed.images else ()
+    shown = opened.cameras.states if streamed.images else ()
     with closing(ViewerPage()) as page:
         say(page.describe())
-        yield [LiveView(settings[0].payload, shown, run, say, page.show, page.name)]
+        yield [LiveView(opened.rig, shown, run, say, page.show, page.name)]

@@ -365,8 +365,6 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
 
         def act(message: Message) -> None:
             nonlocal frames
-            if message is None:
-                return
             shown.append(message)
             frames += message.topic.endswith("/image")
             if frames == 20 and operator.seat.number == 0:
@@ -407,5 +405,5 @@ def test_ten_pages_do_not_change_a_recording(watched: Watched, lab_log: Path) ->
 
 
 def test_without_a_plan_there_is_no_page(tmp_path: Path) -> None:
-    with serve_dashboard(None, None, tmp_path, "poly", ()) as dashboards:  # type: ignore[arg-type]
+    with serve_dashboard(None, None, None, tmp_path, "poly", ()) as dashboards:  # type: ignore[arg-type]
         assert dashboards == []

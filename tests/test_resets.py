@@ -32,7 +32,7 @@ def test_live_equals_replay_across_resets(lab_log: Path, tmp_path: Path) -> None
     frames = {camera: images[:12] for camera, images in sent(lab_log).items()}
     attached, settings, clock = attached_in_steps(lab_log, frames)
     with attached:
-        pipeline.live(attached, settings, target, REQUEST, "detect", consumers=[clock.watch])
+        pipeline.live(attached, settings, target, REQUEST, "detect", sinks=[clock.watch])
     (outcome,) = pipeline.replay([target], REQUEST, "detect")
     assert not outcome.fresh
     with Session([target]) as session:

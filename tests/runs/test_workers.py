@@ -7,9 +7,8 @@ import multiprocessing.connection
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import Message
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import pieces, workers
-from ipsys_log.runs import replay as stages_in_order
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 from ipsys_log.runs.workers import LocalWorkers
@@ -61,26 +58,6 @@ def test_bytes_are_equal_for_any_number_of_processes(
         counts[jobs] = len(started)
     assert counts == {1: 0, 2: 2, 5: 7}
     assert len({log.read_bytes() for log in logs.values()}) == 1
-
-
-def test_models_are_loaded_only_beside_other_processes(
-    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Imports and detection in threads of one process take longer together than one after the other."""
-    loaded: list[Sequence[str]] = []
-
-    def watched(messages: Iterable[Message], models: Sequence[str]) -> Iterable[Message]:
-        loaded.append(tuple(models))
-        return messages
-
-    monkeypatch.setattr(stages_in_order, "preload", watched)
-    alone = Path(shutil.copy(lab, tmp_path / "alone.mcap"))
-    request = replace(REQUEST, models=("rigid",))
-    replay([alone], request, "fit")
-    assert not loaded
-    replay([lab], request, "fit", jobs=2)
-    assert loaded == [("rigid",)]
-    assert lab.read_bytes() == alone.read_bytes()
 
 
 def _count_workers(monkeypatch: pytest.MonkeyPatch) -> list[Any]:

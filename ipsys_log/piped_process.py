@@ -20,8 +20,7 @@ ONE_THREAD = dict.fromkeys(
 )
 # The path of modules is that of the parent: the folder of the user has no part in it.
 _START = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from {module} import {function}; {function}(*map(int, sys.argv[2:]))"
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {module} import {function}; {function}()"
 )
 
 
@@ -30,8 +29,7 @@ class PipedProcess:
 
     Parameters
     ----------
-    function : a function of a module, called with the ``descriptors``. It begins with :func:`parent_pipe`.
-    descriptors : file descriptors that the process also gets.
+    function : a function of a module. It begins with :func:`parent_pipe`.
 
     Attributes
     ----------
@@ -43,14 +41,13 @@ class PipedProcess:
         The system has no more processes or file descriptors for this program.
     """
 
-    def __init__(self, function: Callable[..., None], *descriptors: int) -> None:
+    def __init__(self, function: Callable[[], None]) -> None:
         start = _START.format(module=function.__module__, function=function.__name__)
         modules = json.dumps([path for path in sys.path if path])
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", start, modules, *map(str, descriptors)],
+            [sys.executable, "-P", "-c", start, modules],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            pass_fds=descriptors,
             start_new_session=True,
             env={**os.environ, **ONE_THREAD},
         )

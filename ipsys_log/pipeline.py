@@ -107,6 +107,8 @@ def replay(
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)
+    if workers is not None and workers.first_only and len(stages) > 1:
+        request, stages = replace(request, run=None), stages[:1]  # the given name is for the last stage
     with open_target(paths, output) as (logs, target), LocalWorkers(jobs) as local:
         work = Replay(request, stages, models, logs, target, workers or local, progress, say)
         work.compute()

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors", "interrupts", "piped_process"),
+    ("errors", "piped_process"),
     ("arrays", "units", "plain_text", "extras", "atomic_files"),
     ("messages",),
     ("geometry", "rig"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, open_cameras, prepare_lab
-from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
+from ipsys_log.cli.signals import allow_interrupt
 
 if TYPE_CHECKING:
     from ipsys_log.capture.multiplexer import LiveCameras
@@ -121,7 +121,7 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras)
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:
-            with suppress_interrupt():
+            with suppress(KeyboardInterrupt):
                 while not (working.done() or any(view.points for view in scene.views(None))):
                     sleep(_TURN_S)
                 sleep(_LOOK_S)

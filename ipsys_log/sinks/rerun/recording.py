@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import IO
 
@@ -17,7 +16,6 @@ import rerun as rr
 
 from ipsys_log.analysis.pairs import locate_measurements
 from ipsys_log.errors import IpsysError
-from ipsys_log.interrupts import undivided
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Message
 from ipsys_log.messages.channels import MEASUREMENTS
@@ -148,12 +146,12 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
         show_in_viewer(lambda write: _stream(session, shown, write))
         return shown
     partial = save.with_name(save.name + ".partial")
-    with ExitStack() as stack:
-        with undivided():
-            partial.touch()  # errors of the path are raised by this call, not by Rerun
-            stack.callback(partial.unlink, missing_ok=True)
+    try:
+        partial.touch()  # errors of the path are raised by this call, not by Rerun
         _save(session, shown, partial)
         partial.replace(save)
+    finally:
+        partial.unlink(missing_ok=True)
     return shown
 
 

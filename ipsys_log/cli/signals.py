@@ -44,8 +44,8 @@ class InterruptError(Exception):
 class _State:
     """The state of the signals.
 
-    It has the signal of this command so far, the text of a normal end (None: an interrupt is a failure), the text on
-    the results after a failure, and the results that the command has kept so far.
+    It has the signal of this command so far, the text of a normal end (None: an interrupt is a failure), the
+    text on the results after a failure, and the results that the command has kept so far.
     """
 
     noted: int | None = None

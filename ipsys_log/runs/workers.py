@@ -14,8 +14,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
@@ -206,24 +204,12 @@ def serve() -> None:
     """Compute the pieces with the numbers from the pipe, until it ends. A worker's main function."""
     receiver, sender = parent_pipe()
     try:
-        run, pieces = receiver.recv()
-        numbers: SimpleQueue[int] = SimpleQueue()
-        Thread(target=_read_numbers, args=(receiver, numbers), daemon=True).start()
-        _serve(run, pieces, numbers, sender)
+        _serve(*receiver.recv(), receiver, sender)
     except (EOFError, ConnectionError):
         os._exit(0)  # the process that waits for results has ended
 
 
-def _read_numbers(receiver: Connection, numbers: SimpleQueue[int]) -> None:
-    """Read the numbers of pieces, and end this process with the pipe, also in the middle of a piece."""
-    try:
-        while True:
-            numbers.put(receiver.recv())
-    finally:
-        os._exit(0)
-
-
-def _serve(run: PieceRun, pieces: Sequence[Piece], numbers: SimpleQueue[int], sender: Connection) -> None:
+def _serve(run: PieceRun, pieces: Sequence[Piece], receiver: Connection, sender: Connection) -> None:
     import cv2
 
     from ipsys_log.log.dataset import Session
@@ -236,11 +222,11 @@ def _serve(run: PieceRun, pieces: Sequence[Piece], numbers: SimpleQueue[int], se
         with Session(run.paths) as session, ThreadPoolExecutor(1) as thread:
             check_versions(session, run)
             while True:
-                result = compute_piece(session, run, pieces[numbers.get()])
+                result = compute_piece(session, run, pieces[receiver.recv()])
                 if sent is not None:
                     sent.result()
                 sent = thread.submit(_send, sender, result)
-    except ConnectionError:
+    except (EOFError, ConnectionError):
         raise
     except Exception as error:
         sender.send(_failure(error))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -33,7 +33,7 @@ from ipsys_log.cli.options import (
     other_log_option,
 )
 from ipsys_log.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
-from ipsys_log.cli.signals import SAVED, allow_interrupt, runs_until_stopped, suppress_interrupt
+from ipsys_log.cli.signals import SAVED, allow_interrupt, runs_until_stopped
 from ipsys_log.cli.stream import StreamOptions, choose_streams, takes_streams
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras)
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:
-            with suppress_interrupt():
+            with suppress(KeyboardInterrupt):
                 while not (working.done() or any(view.points for view in scene.views(None))):
                     sleep(_TURN_S)
                 sleep(_LOOK_S)

@@ -11,14 +11,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.checked_chunk import CheckedMessage, Entries, Rows, check_messages
-from ipsys_log.log.chunks import (
-    EqualBlocks,
-    RawBlocks,
-    check_compression,
-    find_blocks,
-    parse_chunk_contents,
-    unpack,
-)
+from ipsys_log.log.chunks import check_compression, parse_chunk_contents, unpack
 from ipsys_log.log.contents import RawMessage
 from ipsys_log.log.hashing import WORTH_COMBINING
 from ipsys_log.log.order import Cursor
@@ -68,7 +61,7 @@ def chunk_entries(
 def planned_range(chunk: ChunkRef) -> Run:
     """Return the range of a chunk that its first reader needs: its message indexes, or all of it.
 
-    A chunk that is small, or that its compression has made smaller, is always read as a whole.
+    A chunk of images has indexes that are often read alone, and little else that is needed without them.
     """
     is_whole = chunk.length <= _SMALL or chunk.compressed_size < _PACKED * chunk.uncompressed_size
     return chunk.offset if is_whole or not chunk.index_length else chunk.offset + chunk.length, chunk.end
@@ -124,9 +117,8 @@ def runs(entries: Entries, wanted: Rows, end: int) -> list[Run]:
 
 
 _CACHE_BYTES = 64 << 20
-_SMALL = 64 << 10  # bytes: a smaller compressed chunk is unpacked as a whole, without a search for its blocks
-_PACKED = 0.75  # of its size: a chunk that is compressed to less has few raw blocks
-_SPARSE = 4096  # bytes per wanted message: a chunk with fewer is unpacked as a whole too
+_SMALL = 64 << 10  # bytes: the indexes of a smaller chunk are not worth a read of their own
+_PACKED = 0.75  # of its size: a chunk that is compressed to less has no images
 _OPCODE = int(Opcode.MESSAGE)
 _SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message record without payload
 _new = tuple.__new__  # RawMessage(...) calls a Python function and takes twice as long
@@ -213,31 +205,27 @@ class _Messages:
 
 @dataclass(slots=True)
 class _Records:
-    """The records of one chunk, by their offsets in the chunk. They are read in place if possible."""
+    """The records of one chunk, by their offsets in the chunk. A compressed chunk is unpacked once.
+
+    Unpacked records stay in memory until the last message is read, because chunks may overlap in time.
+    """
 
     view: LogBytes
     chunk: ChunkRef
-    raw: EqualBlocks | RawBlocks | None = None
     whole: bytes | None = None
 
     def read(self, low: int, high: int) -> bytes:
-        chunk = self.chunk
-        if low < 0 or high > chunk.uncompressed_size:
-            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
-        if not chunk.compression:
-            return self.view.read(chunk.offset + CHUNK_HEAD_SIZE + low, high - low)
-        data = self.raw.read(low, high) if self.raw is not None else None
-        if data is None:
-            data = self.unpacked()[low:high]
+        if low < 0 or high > self.chunk.uncompressed_size:
+            raise self.view.fault(self.chunk.offset, "a message reaches beyond the end of its chunk")
+        if not self.chunk.compression:
+            return self.view.read(self.chunk.offset + CHUNK_HEAD_SIZE + low, high - low)
+        data = self.unpacked()[low:high]
         if len(data) != high - low:
-            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
+            raise self.view.fault(self.chunk.offset, "a message reaches beyond the end of its chunk")
         return data
 
     def unpacked(self, *_: int) -> bytes:
-        """Return all records, decompressed once.
-
-        They stay in memory until the last message is read, because chunks may overlap in time.
-        """
+        """Return all records; their CRC is checked."""
         if self.whole is None:
             offset = self.chunk.offset
             self.whole = unpack(self.view, offset, parse_chunk_head(self.view, offset)[1])
@@ -260,21 +248,17 @@ def open_chunk(
     """
     if next_chunk is not None:
         view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
-    offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
-    packed = chunk.compressed_size
-    check_compression(view, name)
+    offset, size = chunk.offset, chunk.uncompressed_size
+    check_compression(view, chunk.compression)
     entries = chunk_entries(view, chunk, cache.searched)
     if is_checked and size >= sum(map(len, entries.values())) * WORTH_COMBINING > 0:
         return _open_checked(view, chunk, entries, topics, span)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
-    if not name:
-        view.plan("messages", _row_ranges(chunk, entries, rows))
-    if not is_checked and name and packed > _SMALL and packed > len(rows) * _SPARSE:
-        records.raw = find_blocks(view, name, offset + CHUNK_HEAD_SIZE + len(name), packed, size)
-    if is_checked or (name and records.raw is None):
+    if is_checked or chunk.compression:
         ranges, fetch = [(0, size)] * len(rows), records.unpacked
     else:
+        view.plan("messages", _row_ranges(chunk, entries, rows))
         ranges, fetch = runs(entries, rows, size), partial(cache.fetch, offset, records.read)
     times, offsets = rows.T.tolist()
     messages = _Messages(view, topics, offset, times, offsets, ranges, fetch, records.read, size)

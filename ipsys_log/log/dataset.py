@@ -65,7 +65,6 @@ class Session:
     def __init__(self, paths: Sequence[LogLocation]) -> None:
         self.paths = list(paths)
         self._stack = ExitStack()
-        self._added: tuple[Message, ...] = ()
         self._channels: dict[tuple[str, str], Channel | None] = {}
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
@@ -121,8 +120,7 @@ class Session:
             and self._channel_of(topic, stored) is channel
             and run_of_topic(topic) == run
         }
-        added = {m.topic for m in self._added if channel_of(m.topic, type(m.payload)) is channel}
-        return sorted(stored_topics | {topic for topic in added if run_of_topic(topic) == run})
+        return sorted(stored_topics)
 
     def _channel_of(self, topic: str, stored: StoredChannel) -> Channel | None:
         schema = stored.schema.name if stored.schema is not None else ""
@@ -180,8 +178,7 @@ class Session:
         ]
 
     def count(self, topic: str) -> int:
-        stored = sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
-        return stored + sum(message.topic == topic for message in self._added)
+        return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
 
     def hash(self, topic: str) -> str:
         """Return the hash of a channel's messages, which does not depend on their file.
@@ -206,10 +203,6 @@ class Session:
         streams: list[Iterator[Message]] = [
             self._decoded(reader, items, topics, start_ns, end_ns) for reader, items in self._items()
         ]
-        if self._added:
-            low_ns, high_ns = start_ns or 0, _LATEST_NS if end_ns is None else end_ns
-            added = (m for m in self._added if m.topic in topics and low_ns <= m.log_time_ns < high_ns)
-            streams.append(added)
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
@@ -355,15 +348,6 @@ class Session:
         """Return a view of these logs with the images of these topics only; it ends with this session."""
         view = copy(self)
         view.images = {camera: topic for camera, topic in self.images.items() if topic in topics}
-        return view
-
-    def with_message(self, message: Message) -> Session:
-        """Return a view of these logs with one more message, of a topic that they do not have.
-
-        The view has its topic, its count and its payload. It ends with this session.
-        """
-        view = copy(self)
-        view._added = (*self._added, message)
         return view
 
     def _check_same_parameters(self) -> None:

@@ -74,14 +74,11 @@ class Pieces(NamedTuple):
     resets : the bounds of the pieces.
     step : makes the step for one piece; its first messages are the rig and the intrinsics.
     reports : makes the function that sees the payloads of all pieces, in log order.
-    interim : types of payloads that only ``reports`` gets: dataclasses of payloads, texts and tuples of
-        numbers.
     """
 
     resets: Resets
     step: Callable[[], Step]
     reports: Callable[[], Reports]
-    interim: tuple[type, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -386,8 +386,8 @@ def _resets(options: Mapping[str, str]) -> Resets:
 
 def _pieces(parameters: Mapping[str, str]) -> Pieces:
     """Return how the frames of a camera between two resets are processed alone."""
-    resets, interim = _resets(parameters), (OtherSize, OtherPrints, LensInUse, SeenSquares)
-    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports, interim)
+    resets = _resets(parameters)
+    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports)
 
 
 def _why_stock(camera: str) -> str:

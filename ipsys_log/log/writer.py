@@ -318,12 +318,8 @@ class LogWriter:
         """Return the hash of the messages that this writer has written to a channel."""
         return self._hashes.get(topic, ChannelHash())
 
-    def write(
-        self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes, crc: int | None = None
-    ) -> None:
+    def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Add a message to a channel that was declared with `add_channel`; times in ns.
-
-        `crc` is the CRC-32 of the data if the caller knows it.
 
         Raises
         ------
@@ -345,7 +341,7 @@ class LogWriter:
         state = self._hashes.get(topic)
         if state is None:
             state = self._hashes[topic] = self._hash_so_far(topic)
-        crc = zlib.crc32(data) if crc is None else crc
+        crc = zlib.crc32(data)
         state.add_row(log_time_ns, publish_time_ns, len(data), crc)
         sequence = state.count & 0xFFFFFFFF
         if self._contents.unchunked:

@@ -61,7 +61,7 @@ class MergeSource:
             (one for one in contents.channels.values() if one.topic == topic), key=lambda one: one.id
         )
         named = replace(channel, metadata={**channel.metadata, **self.metadata})
-        writer.adopt_channel(named, contents.schemas.get(channel.schema_id), is_distinct=True)
+        writer.adopt_channel(named, contents.schemas.get(channel.schema_id))
 
 
 def merged(

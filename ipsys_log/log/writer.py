@@ -230,13 +230,10 @@ class LogWriter:
         self._channels[topic] = (channel.id, self._images if image else self._small)
         self._declared[topic] = schema, message_encoding
 
-    def adopt_channel(
-        self, channel: mcap.Channel, schema: mcap.Schema | None, is_distinct: bool = False
-    ) -> int:
+    def adopt_channel(self, channel: mcap.Channel, schema: mcap.Schema | None) -> int:
         """Declare a channel of another log; return its id here, which is the same if this id is free.
 
-        A channel with the same topic and schema is continued, with `is_distinct` only if its metadata are the
-        same, too.
+        A channel with the same topic, schema and metadata is continued.
 
         Raises
         ------
@@ -247,14 +244,7 @@ class LogWriter:
         own = Schema(schema.name, schema.encoding, schema.data) if schema else None
         self._check_kind(channel.topic, own, channel.message_encoding)
         known = (c for c in self._contents.channels.values() if c.topic == channel.topic)
-        same = next(
-            (
-                c
-                for c in known
-                if self._schema_of(c) == own and not (is_distinct and c.metadata != channel.metadata)
-            ),
-            None,
-        )
+        same = next((c for c in known if self._schema_of(c) == own and c.metadata == channel.metadata), None)
         if same is None:
             schema_id = self._schema_id(own, schema.id) if own and schema else 0
             key = self._free_id(self._contents.channels, channel.id)

@@ -29,7 +29,7 @@ class LogOffset(NamedTuple):
 
 @dataclass(slots=True)
 class _Common:
-    """What several logs have: channels, by topic their owner's topic, and the combined rig of the owner."""
+    """The common content of logs: by topic its owner's topic, and the combined rig of the owner."""
 
     equal: list[dict[str, str]]
     rig: Rig | None = None

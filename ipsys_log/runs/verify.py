@@ -121,11 +121,11 @@ def _is_repeated(
         Its inputs have changed.
     """
     run = stage.run
-    if stage.is_of_other_version:
-        say(f"run {run.run}: {run.stage} is {stage.state}; it is not verified")
-        return False
     if logs := copied_from(session, run):
         say(f"run {run.run}: {run.stage} was copied from {', '.join(logs)}; its hashes are compared")
+        return False
+    if stage.is_of_other_version:
+        say(f"run {run.run}: {run.stage} is {stage.state}; it is not verified")
         return False
     return _is_up_to_date(session, run, checked, say)
 

@@ -79,9 +79,9 @@ def verify(
 ) -> None:
     """Compute every run of a log again from its inputs, and compare each channel byte for byte.
 
-    Frames that live processing skipped are excluded. In a part of a log (ipsys cut), results that depend on
-    messages outside of the part are compared with the record of the cut. In a merged log (ipsys merge), the
-    runs of each log are repeated with its own images. The exit code is 1 if there is a difference.
+    Frames that live processing skipped are excluded. Runs that ipsys cut or ipsys merge has copied without
+    their whole inputs are compared with the hashes of the copy; the command names them. The exit code is 1 if
+    there is a difference.
 
     Examples
 

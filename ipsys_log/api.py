@@ -463,9 +463,9 @@ def live(
         from ipsys_log.capture.multiplexer import LiveCameras
         from ipsys_log.exchange.lab_files import load_cameras, load_lenses
         from ipsys_log.messages.channels import TRACKS
+        from ipsys_log.models.table import model_run
         from ipsys_log.runs.select import wanted_models
         from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
-        from ipsys_log.stages.fit import model_run
 
         lab, wanted = load_cameras(Path(rig), cameras)
         assumed: dict[str, str] = {}

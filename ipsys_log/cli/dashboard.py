@@ -73,8 +73,8 @@ def plan_dashboard(
 
 def first_run(request: Request) -> str:
     """Return the run of the first model: streams, the viewer and the dashboard show one run."""
+    from ipsys_log.models.table import model_run
     from ipsys_log.runs.select import wanted_models
-    from ipsys_log.stages.fit import model_run
 
     first, *_ = wanted_models(request)
     return model_run(first)

@@ -21,13 +21,13 @@ from ipsys_log.closed_loop.steering import Steering
 from ipsys_log.closed_loop.wheels import Wheels
 from ipsys_log.messages import EVENTS_TOPIC, PATHS_TOPIC, Event, Message, Rig, RobotPath
 from ipsys_log.messages.channels import TRACKS
+from ipsys_log.models.table import model_run
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.simulation.robot_lab import RobotLab, robot_rig
 from ipsys_log.sinks.sink import Consumer
 from ipsys_log.sinks.streams.settings import Stream, open_streams
-from ipsys_log.stages.fit import model_run
 
 # The kind of the event with the settings of the run.
 ROBOT_RUN = "robot_run"

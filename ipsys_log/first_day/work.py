@@ -36,6 +36,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import TRACKS
+from ipsys_log.models.table import model_run
 from ipsys_log.report.calibration import calibration_lines
 from ipsys_log.report.files import write_files
 from ipsys_log.runs.graph import copy_model
@@ -43,7 +44,6 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
-from ipsys_log.stages.fit import model_run
 from ipsys_log.survey.add_sheet import add_sheet, check_sheet
 from ipsys_log.survey.entry import check_references
 from ipsys_log.survey.from_log import open_finished_log

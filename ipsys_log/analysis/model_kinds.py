@@ -192,12 +192,12 @@ class CornerModels:
         }
         cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
         tape = rig.tape_sigma_m, rig.tape_scale_sigma, rig.ab_sigma_m
-        return POINT_MODELS.fit_part(rig), markers, cameras, tape
+        return _POINT_KIND.fit_part(rig), markers, cameras, tape
 
     def place_part(self, rig: Rig) -> object:
         references = {m.id for m in rig.reference_markers}
         lengths = {(m.id, m.length_m) for m in rig.markers}
-        return POINT_MODELS.place_part(rig), rig.marker_length_m, lengths, references
+        return _POINT_KIND.place_part(rig), rig.marker_length_m, lengths, references
 
     def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
         if not has_corners:
@@ -243,14 +243,14 @@ class CornerModels:
         return restore_joint(model)
 
 
-POINT_MODELS, CORNER_MODELS = PointModels(), CornerModels()
+_POINT_KIND, _CORNER_KIND = PointModels(), CornerModels()
 
 
 def model_kind(name: str) -> ModelKind:
     """Return the kind of a model by its name."""
-    return CORNER_MODELS if reads_corners(name) else POINT_MODELS
+    return _CORNER_KIND if reads_corners(name) else _POINT_KIND
 
 
 def joint_models(model: Model) -> Mapping[str, JointModel]:
     """Return the joint model of each camera; none for a model of camera points."""
-    return CORNER_MODELS.restore(model) if reads_corners(model.name) else {}
+    return _CORNER_KIND.restore(model) if reads_corners(model.name) else {}

@@ -66,7 +66,7 @@ class MeanCorners:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Baseline:
+class DriftBaseline:
     """The reference markers of a camera before a motion.
 
     Attributes
@@ -116,7 +116,7 @@ class Motion:
 
 def build_baseline(
     camera: PosedCamera, floor_m: Array, corners: Mapping[int, MeanCorners], lengths_m: Mapping[int, float]
-) -> Baseline:
+) -> DriftBaseline:
     """Return the baseline of a camera; a marker outside of the field of view of its lens model is left out.
 
     Parameters
@@ -140,10 +140,10 @@ def build_baseline(
         turn, centre_m = poses.rotations[0, other], poses.centres_m[0, other]
         points_c[marker_id] = marker_corners(length_m) @ turn.T + centre_m
     kept = {marker_id: corners[marker_id] for marker_id in points_c}
-    return Baseline(camera, floor_m, kept, points_c)
+    return DriftBaseline(camera, floor_m, kept, points_c)
 
 
-def estimate_motion(baseline: Baseline, corners: Mapping[int, MeanCorners]) -> Motion | None:
+def estimate_motion(baseline: DriftBaseline, corners: Mapping[int, MeanCorners]) -> Motion | None:
     """Estimate the motion of a camera; None without a common marker.
 
     A marker that contradicts at least two others is left out.
@@ -192,7 +192,7 @@ class _Fit:
         return self.chi2 <= self.rows + _CONSISTENT * float(np.sqrt(2 * self.rows))
 
 
-def _fit(baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[int]) -> _Fit:
+def _fit(baseline: DriftBaseline, corners: Mapping[int, MeanCorners], markers: list[int]) -> _Fit:
     """Fit a motion to the displacements of markers: Gauss-Newton with the prior of largest evidence."""
     moved_px = np.concatenate([corners[m].corners_px - baseline.corners[m].corners_px for m in markers])
     spread = np.linalg.cholesky(_covariance(baseline, corners, markers, moved_px))
@@ -214,7 +214,7 @@ def _fit(baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[i
 
 
 def _covariance(
-    baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[int], moved_px: Array
+    baseline: DriftBaseline, corners: Mapping[int, MeanCorners], markers: list[int], moved_px: Array
 ) -> Array:
     """Return the covariance (8 k, 8 k) of the displacements of k markers, in px^2."""
     shared = np.tile(np.eye(2), (4, 4))
@@ -260,7 +260,7 @@ def _best_scale(rows: Array, aims: Array) -> tuple[float, float]:
     return float(_SCALES_M[best]), float(doubled[best])
 
 
-def _mean_shift(baseline: Baseline, fit: _Fit) -> tuple[float, float]:
+def _mean_shift(baseline: DriftBaseline, fit: _Fit) -> tuple[float, float]:
     """Return the mean length of the shift of the floor map and its standard deviation, in m.
 
     Without a motion, the length has no slope: then the standard deviation is that of an axis of the mean.
@@ -282,7 +282,7 @@ def _mean_shift(baseline: Baseline, fit: _Fit) -> tuple[float, float]:
     return float(lengths_m.mean()), float(np.sqrt(max(of_length, of_axis)))
 
 
-def _why_no_split(baseline: Baseline, markers: list[int]) -> str | None:
+def _why_no_split(baseline: DriftBaseline, markers: list[int]) -> str | None:
     if len(markers) < _SPLIT_MARKERS:
         return (
             f"turn and shift cannot be separated with {len(markers)} reference "

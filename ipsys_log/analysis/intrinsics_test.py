@@ -131,7 +131,7 @@ def _contradicts(given: ShapeFit, corrected: ShapeFit) -> bool:
     )
 
 
-def find_contradictions(
+def find_contradicted_inputs(
     frames: Iterable[tuple[str, Markers]], lenses: Mapping[str, CameraCalibration], rig: Rig
 ) -> Iterator[str]:
     """Yield what the frames of cameras contradict: intrinsics that are not nominal, and sizes of the rig."""

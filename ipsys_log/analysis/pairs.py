@@ -24,14 +24,14 @@ _ONE_HEIGHT_M = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """Sightings of one marker by one camera: ``times_ns`` (n,), ascending, and ``points_m`` (n, 3)."""
+class TimedPoints:
+    """TimedPoints of one marker by one camera: ``times_ns`` (n,), ascending, and ``points_m`` (n, 3)."""
 
     times_ns: NDArray[np.int64]
     points_m: NDArray[np.float64]
 
 
-def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
+def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], TimedPoints]:
     """Return camera points by camera and marker, ordered by the time of exposure of the marker.
 
     Raises
@@ -56,7 +56,7 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
                 f"camera {key[0]}: a camera point of marker {key[1]} is impossible; run camera-frame again, "
                 "with --run and another name"
             )
-        sightings[key] = Sightings(times_ns, points_m)
+        sightings[key] = TimedPoints(times_ns, points_m)
     return sightings
 
 
@@ -150,7 +150,7 @@ def _follow(withdrawn: dict[str, Measurement], message: Measurement) -> None:
         withdrawn.pop(message.readmits or message.id, None)
 
 
-def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:
+def still_interval(sightings: TimedPoints, time_ns: int) -> tuple[int, int] | None:
     """Return the stationary interval of a marker around a time.
 
     Parameters
@@ -180,7 +180,7 @@ def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None
 
 
 def build_pairs(
-    sightings: Mapping[tuple[str, int], Sightings], places: Iterable[RiggedMeasurement]
+    sightings: Mapping[tuple[str, int], TimedPoints], places: Iterable[RiggedMeasurement]
 ) -> dict[str, list[Pair]]:
     """Return the calibration points that each camera saw.
 
@@ -237,7 +237,7 @@ def _check_duplicates(camera: str, pairs: Iterable[Pair]) -> None:
 
 
 def _mean_point(
-    sightings: Sightings | None, measurement: Measurement
+    sightings: TimedPoints | None, measurement: Measurement
 ) -> tuple[NDArray[np.float64], int] | None:
     if sightings is None:
         return None

@@ -155,10 +155,10 @@ def can_evaluate(view: StageView, options: Mapping[str, str], model: str) -> boo
     measurements = [point.measurement for point in measured(view)]
     enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
     held_out = held_out_ids(measurements, options)
-    return bool(held_out) or (is_fitted_here(view, options, model) and enough)
+    return bool(held_out) or (can_refit(view, options, model) and enough)
 
 
-def is_fitted_here(view: StageView, options: Mapping[str, str], model: str) -> bool:
+def can_refit(view: StageView, options: Mapping[str, str], model: str) -> bool:
     """Return whether a model is fitted to points of this log: then it can be fitted to fewer points too."""
     if "model_from" in options:
         return False

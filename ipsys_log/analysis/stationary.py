@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.analysis.pairs import TimedPoints
 from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraPoint, CameraPoints, Measurement
 from ipsys_log.units import NS_PER_S
@@ -166,7 +166,7 @@ def is_near(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
     return near
 
 
-def stationary_intervals(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tuple[str, ...]]]:
+def stationary_intervals(cameras: Mapping[str, TimedPoints]) -> list[tuple[int, int, tuple[str, ...]]]:
     """Return the stationary intervals of one marker, from the sightings of all cameras, in order of time.
 
     Parameters
@@ -198,7 +198,7 @@ def stationary_intervals(cameras: Mapping[str, Sightings]) -> list[tuple[int, in
     return rows
 
 
-def _seen_still(cameras: Mapping[str, Sightings], start_ns: int, end_ns: int) -> tuple[str, ...]:
+def _seen_still(cameras: Mapping[str, TimedPoints], start_ns: int, end_ns: int) -> tuple[str, ...]:
     """Return the cameras that saw the marker in an interval; none if one of them saw it move."""
     seen = []
     for camera, sightings in sorted(cameras.items()):
@@ -210,12 +210,12 @@ def _seen_still(cameras: Mapping[str, Sightings], start_ns: int, end_ns: int) ->
     return tuple(seen)
 
 
-def _between(sightings: Sightings, start_ns: int, end_ns: int) -> Array:
+def _between(sightings: TimedPoints, start_ns: int, end_ns: int) -> Array:
     within = (sightings.times_ns >= start_ns) & (sightings.times_ns <= end_ns)
     return sightings.points_m[within]
 
 
-def _joined(sightings: Sightings) -> list[tuple[int, int]]:
+def _joined(sightings: TimedPoints) -> list[tuple[int, int]]:
     """Return the stationary intervals of one camera; join consecutive intervals at the same position."""
     intervals: list[tuple[int, int]] = []
     for start_ns, end_ns in _camera_stretches(sightings):
@@ -227,7 +227,7 @@ def _joined(sightings: Sightings) -> list[tuple[int, int]]:
     return intervals
 
 
-def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
+def _camera_stretches(sightings: TimedPoints) -> Iterator[tuple[int, int]]:
     """Yield the intervals in which one camera sees a marker stationary."""
     times_ns, points_m = sightings.times_ns, sightings.points_m
     ends = np.append(np.flatnonzero(np.diff(times_ns) > _GAP_NS), len(times_ns) - 1) + 1

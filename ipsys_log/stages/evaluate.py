@@ -8,7 +8,7 @@ from ipsys_log.analysis.calibration_points import find_pairs, held_out_ids, meas
 from ipsys_log.analysis.cross_validation import FOLDS, Study, labelled_subsets
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
 from ipsys_log.analysis.model_kinds import JOINT_READS, model_kind
-from ipsys_log.analysis.point_evaluation import can_evaluate, is_fitted_here
+from ipsys_log.analysis.point_evaluation import can_evaluate, can_refit
 from ipsys_log.messages import Evaluation, Model
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
@@ -18,7 +18,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     model: Model = view.payloads(MODEL)[-1]
     if not can_evaluate(view, options, model.name):
         return ""
-    again = is_fitted_here(view, options, model.name)
+    again = can_refit(view, options, model.name)
     seed = options.get("seed", "0")
     kind = model_kind(model.name)
     reads = (*kind.fit_reads, MODEL, TRUTH)

@@ -19,8 +19,10 @@ from ipsys_log.messages import Floor
 _AVERAGED = 5
 # A marker that moves on the floor by less than this share of the least shift is not examined further.
 _EXAMINED = 0.5
-# Two cameras see the same motion of a marker within this distance, or this share of it.
-_SAME_M, _SAME_SHARE = 0.0007, 0.3
+# Two cameras see the same motion of a marker within this distance,
+_SAME_M = 0.0007
+# or this share of the motion.
+_SAME_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

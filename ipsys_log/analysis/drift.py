@@ -31,9 +31,14 @@ from ipsys_log.joint.observations import lens_model_of
 # A shift of the floor map below this mean is not reported: slow changes of light and temperature reach half
 # of it, and the smallest motion to find is 2 mm.
 LEAST_SHIFT_M = 0.0012
-# Standard deviations of a corner: noise of a frame; slow changes of each corner; slow changes that all
-# corners of a marker share (light); and those that all markers of a camera share (temperature).
-_FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.06
+# Standard deviations of a corner (test_still_camera_never_counts_as_moved): noise of a frame;
+_FRAME_PX = 0.02
+# slow changes of each corner;
+_CORNER_PX = 0.03
+# slow changes that all corners of a marker share, by light;
+_MARKER_PX = 0.05
+# and those that all markers of a camera share, by temperature.
+_CAMERA_PX = 0.06
 # Errors of the intrinsics and of the baseline poses change a displacement by this share.
 _DISPLACEMENT_SHARE = 0.01
 # Prior scales that are tried, in m on the floor. The least keeps the uncertainty of a still camera honest.
@@ -49,9 +54,10 @@ _SMALL = 1e-6
 _SURE = 8.0
 # Residuals of consistent markers exceed their expectation by less than this many standard deviations.
 _CONSISTENT = 8.0
-# Markers for the split into turn and shift, and their least spread: the second singular value of the
-# directions to them.
-_SPLIT_MARKERS, _SPLIT_SPREAD = 3, 0.15
+# Markers for the split into turn and shift (test_few_markers_do_not_separate_turn_and_shift),
+_SPLIT_MARKERS = 3
+# and their least spread: the second singular value of the directions to them.
+_SPLIT_SPREAD = 0.15
 _POSE_PX = 0.05
 # The second pose of a marker is only taken if the corners clearly prefer it.
 _OTHER_POSE_CHI2 = 20.0

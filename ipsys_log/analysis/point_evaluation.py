@@ -30,8 +30,11 @@ from ipsys_log.models.table import min_pairs
 # closely enough to show an error of some centimetres.
 SCREENING = ("poly", "rayplane", "best", "joint")
 # The same model selects the gross outliers for all evaluations, so that all models have the same points. The
-# polynomial is a hundred times as fast; with fewer points of a camera, it is too uncertain.
-_GROSS_MODEL, _GROSS_MODEL_FEW, _FEW = "poly", "best", 20
+# polynomial is a hundred times as fast as the second model;
+_GROSS_MODEL = "poly"
+_GROSS_MODEL_FEW = "best"
+# with fewer points of a camera, it is too uncertain.
+_FEW = 20
 
 
 def evaluate_model(

@@ -19,9 +19,10 @@ Places = NDArray[np.int64]
 
 # The distances (m) and times (s) of the relative pose error.
 DELTAS = ((1.0, "m"), (1.0, "s"))
-# A pair counts if its distance differs from the stated one by at most this share, as in evo; or if its time
-# differs by at most this share of the usual interval.
-_DISTANCE_SHARE, _INTERVAL_SHARE = 0.1, 0.5
+# A pair counts if its distance differs from the stated one by at most this share, as in evo;
+_DISTANCE_SHARE = 0.1
+# or if its time differs by at most this share of the usual interval.
+_INTERVAL_SHARE = 0.5
 TRANSLATION, DISTANCE = "translation_part", "point_distance"
 
 

@@ -1,4 +1,4 @@
-"""LevelPositions of markers from their corners, by a joint model and the heights of the markers.
+"""Positions of markers from their corners, by a joint model and the heights of the markers.
 
 The residuals and derivatives of the corners also serve other estimates.
 """
@@ -23,7 +23,7 @@ _CORNERS = marker_corners(1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelPositions:
-    """LevelPositions of n markers in the world.
+    """Positions of n level markers in the world.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ def locate_markers(
 
     Returns
     -------
-    LevelPositions.
+    LevelPositions : those of the markers.
     """
     inward = edge_motion(corners_px)
     points_m, headings_rad, floor_slopes, floor_modes = _start(model, corners_px, inward, heights_m)

@@ -7,7 +7,7 @@ The rest of the program asks :func:`model_kind` what a model reads, and lets it 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from ipsys_log.analysis.calibration_points import training_pairs
 from ipsys_log.analysis.camera_models import check_different, check_line, check_pairs, fit_model
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 JOINT_READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
 
 
-class ModelKind(Protocol):
-    """A kind of models.
+class PointModels:
+    """The models of camera points.
 
     Attributes
     ----------
@@ -40,78 +40,25 @@ class ModelKind(Protocol):
     is_checked : the checks before a fit find all its faults.
     """
 
-    fit_reads: tuple[Channel, ...]
-    repeats: int
-    is_checked: bool
-
-    def reads(self, name: str) -> tuple[Channel, ...]:
-        """Return the channels that positions follow from."""
-
-    def fit_part(self, rig: Rig) -> object:
-        """Return the part of the rig on which the fit of a model, and its evaluation, depend."""
-
-    def place_part(self, rig: Rig) -> object:
-        """Return the part of the rig on which positions depend."""
-
-    def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
-        """Check that a log has what a fit to points (n, 3) needs; ``where`` is the start of an error text.
-
-        Raises
-        ------
-        FitError
-            It has not.
-        """
-
-    def check_pairs(self, name: str, pairs: Mapping[str, Sequence[Pair]]) -> None:
-        """Check that the observations of each camera are enough for a fit, if that is known before.
-
-        Raises
-        ------
-        FitError
-            They are not.
-        """
-
-    def fit(
-        self, name: str, view: StageView, train: Collection[str], notes: list[str], progress: Progress
-    ) -> Model:
-        """Fit a model of a log to the calibration points ``train``; add remarks to ``notes``."""
-
-    def evaluate(
-        self, model: Model, view: StageView, study: Study, time_ns: int, notes: list[str], progress: Progress
-    ) -> Evaluation:
-        """Compute the errors of a model; add remarks to ``notes``."""
-
-    def step(self, model: Model) -> Step:
-        """Return the step from messages to positions."""
-
-    def restore(self, model: Model) -> Mapping[str, object]:
-        """Return the fitted model of each camera.
-
-        Raises
-        ------
-        IpsysError
-            The model is not complete.
-        """
-
-
-class PointModels:
-    """The models of camera points."""
-
     fit_reads: tuple[Channel, ...] = (RIG, CAMERA_POINTS, MEASUREMENTS)
     repeats = REPEATS
     is_checked = True
 
     def reads(self, name: str) -> tuple[Channel, ...]:
+        """Return the channels that positions follow from."""
         return (RIG, CAMERA_POINTS) if reads_height(name) else (CAMERA_POINTS,)
 
     def fit_part(self, rig: Rig) -> object:
+        """Return the part of the rig on which a fit and its evaluation depend."""
         return rig.reference_points, {m.id for m in rig.markers}
 
     def place_part(self, rig: Rig) -> object:
+        """Return the part of the rig on which positions depend."""
         heights = {(m.id, m.height_m, m.height_sigma_m) for m in rig.markers}
         return rig.marker_height_m, rig.marker_height_sigma_m, heights
 
     def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
+        """Check that a log has what a fit to points (n, 3) needs; ``where`` is the start of an error text."""
         if len(train_m) < min_pairs(name):
             raise FitError(
                 f"{where}: {name} needs at least {min_pairs(name)} calibration points for each camera, "
@@ -122,11 +69,13 @@ class PointModels:
         check_line(where, train_m)
 
     def check_pairs(self, name: str, pairs: Mapping[str, Sequence[Pair]]) -> None:
+        """Check that the observations of each camera are enough for a fit, if that is known before."""
         check_pairs(name, pairs)
 
     def fit(
         self, name: str, view: StageView, train: Collection[str], notes: list[str], progress: Progress
     ) -> Model:
+        """Fit a model of a log to the calibration points ``train``; add remarks to ``notes``."""
         pairs = training_pairs(view, train)
         fitted = fit_model(name, pairs, view.last_ns(*self.fit_reads), progress)
         notes.extend(_unused_points(pairs, train))
@@ -146,12 +95,15 @@ class PointModels:
         notes: list[str],
         progress: Progress,
     ) -> Evaluation:
+        """Compute the errors of a model; add remarks to ``notes``."""
         return evaluate_model(model, study, time_ns, notes, progress)
 
     def step(self, model: Model) -> Step:
+        """Return the step from messages to positions."""
         return LocatePoints(model)
 
     def restore(self, model: Model) -> Mapping[str, AppliedModel]:
+        """Return the fitted model of each camera."""
         return {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
 
 
@@ -174,9 +126,10 @@ def _unused_points(pairs: Mapping[str, list[Pair]], train: Collection[str]) -> l
 
 
 class CornerModels:
-    """The models of corners: all cameras, drives and calibration points in one fit.
+    """The models of corners, with the interface of :class:`PointModels`.
 
-    Their modules are imported late: scipy takes 1 s, and most commands need no such model.
+    One fit has all cameras, drives and calibration points. Its modules are imported late: scipy takes 1 s,
+    and most commands need no such model.
     """
 
     fit_reads: tuple[Channel, ...] = JOINT_READS
@@ -243,6 +196,7 @@ class CornerModels:
         return restore_joint(model)
 
 
+ModelKind = PointModels | CornerModels
 _POINT_KIND, _CORNER_KIND = PointModels(), CornerModels()
 
 

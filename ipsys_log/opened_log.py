@@ -225,7 +225,7 @@ class Log:
         name = self._run_of(TRACKS, run)
         assert name is not None  # tracks are a derived channel
         if not self._session.count(TRUTH.topic):
-            raise IpsysError(f"{self._session}: has no ground truth; import one: ipsys import truth")
+            raise IpsysError(f"{self._session}: has no ground truth; import one: ipsys import TABLE --into")
         paths = gather_paths(self._session.messages(self._session.topics(TRACKS, name)))
         true = gather_paths(self._session.messages([TRUTH.topic]))
         rows = []

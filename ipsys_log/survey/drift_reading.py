@@ -145,7 +145,8 @@ def _read_log(path: LogLocation, name: str, rig: Rig | None) -> _Log:
         run = newest_run(session, MARKERS)
         if run is None:
             raise IpsysError(
-                f"{path}: has no detected markers; to detect them: ipsys detect {shell_words(path)}"
+                f"{path}: has no detected markers; to detect them: "
+                f"ipsys replay {shell_words(path)} --until detect"
             )
         ids = {marker.id for marker in rigs[-1].reference_markers}
         windows = DriftLog(name, read_windows(session, run, ids))

@@ -31,7 +31,7 @@ from ipsys_log.joint.observations import lens_model_of
 # A shift of the floor map below this mean is not reported: slow changes of light and temperature reach half
 # of it, and the smallest motion to find is 2 mm.
 LEAST_SHIFT_M = 0.0012
-# Standard deviations of a corner (test_still_camera_never_counts_as_moved): noise of a frame;
+# Standard deviations of a corner: noise of a frame;
 _FRAME_PX = 0.02
 # slow changes of each corner;
 _CORNER_PX = 0.03

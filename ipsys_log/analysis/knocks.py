@@ -29,13 +29,13 @@ _FEWEST_RECENT = 3
 # The state before is the median of earlier sightings, at most so old and at least so many.
 _BEFORE_NS = 3 * NS_PER_S
 _FEWEST_BEFORE = 5
-# Smallest motion of a marker that counts (test_slow_warming_is_no_knock).
+# Smallest motion of a marker that counts.
 _LEAST_MARKER_M = 0.002
 # Smallest change of the difference of two cameras that counts. It also changes with the place of the robot,
-# at most so many m per m (test_models_that_disagree_over_the_floor_cause_no_warning).
+# at most so many m per m.
 _LEAST_OVERLAP_M = 0.015
 _OVERLAP_SLOPE = 0.02
-# A smaller change in units of the usual spread is noise (test_still_cameras_cause_no_warning).
+# A smaller change in units of the usual spread is noise.
 _SPREADS = 6.0
 # Values within such an extent cannot have changed by _LEAST_OVERLAP_M, also with rounding.
 _CALM_M = 0.99 * _LEAST_OVERLAP_M

@@ -110,14 +110,16 @@ def test_model_with_known_heights_needs_them_in_the_rig(ipsys: Ipsys, tmp_path: 
 
 
 def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
+    from ipsys_log.analysis.camera_models import fit_model
     from ipsys_log.messages import CameraPoint, CameraPoints
-    from ipsys_log.stages.fit import fit_model
-    from ipsys_log.stages.locate import Locate
+    from ipsys_log.models.locate_step import LocatePoints
 
     rng = np.random.default_rng(0)
     world, camera = labs.places(rng, 40), labs.camera(rng)
     tape, covariances = labs.measure(world, rng)
-    locate = Locate(fit_model("best", {"red": labs.pairs(camera.see(world, rng), tape, covariances)}, 0))
+    locate = LocatePoints(
+        fit_model("best", {"red": labs.pairs(camera.see(world, rng), tape, covariances)}, 0)
+    )
 
     def inside(*place_m: float) -> bool | None:
         (seen,) = camera.see(np.array([place_m]), rng)

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.consistency import FEWEST_POINTS
+from ipsys_log.analysis.point_evaluation import SCREENING
 from ipsys_log.analysis.trajectory_errors import pool_trajectories
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.models.table import reads_corners
@@ -18,7 +19,6 @@ from ipsys_log.report.accuracy import Accuracy, gather_outliers, remaining_json
 from ipsys_log.report.advice import advise, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
 from ipsys_log.report.rows import cm, counted, name_cell, wrap_text
-from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 
 # Number of outliers with an explanation in the answer; the other outliers are only named.

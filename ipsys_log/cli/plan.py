@@ -196,8 +196,6 @@ def _table(found: PlannedFloor) -> Table:
 
 
 def _plan_json(found: PlannedFloor) -> dict[str, Any]:
-    from ipsys_log.units import CM_PER_M
-
     places = [
         {
             "number": number,
@@ -205,8 +203,8 @@ def _plan_json(found: PlannedFloor) -> dict[str, Any]:
             "distances_m": found.distances_m(place.point_m),
             "side": found.side(place.point_m),
             "cameras": list(place.cameras),
-            "mean_before_cm": place.mean_before_m * CM_PER_M,
-            "mean_after_cm": place.mean_after_m * CM_PER_M,
+            "mean_before_m": place.mean_before_m,
+            "mean_after_m": place.mean_after_m,
         }
         for number, place in enumerate(found.plan.places, 1)
     ]
@@ -214,8 +212,8 @@ def _plan_json(found: PlannedFloor) -> dict[str, Any]:
         "model": found.model,
         "run": found.run,
         "marker_height_m": found.height_m,
-        "mean_before_cm": places[0]["mean_before_cm"],
-        "mean_after_cm": places[-1]["mean_after_cm"],
+        "mean_before_m": places[0]["mean_before_m"],
+        "mean_after_m": places[-1]["mean_after_m"],
         "places": places,
         **({} if found.drive is None else {"drive": _drive_json(found.drive)}),
         "notes": list(found.notes),
@@ -224,13 +222,12 @@ def _plan_json(found: PlannedFloor) -> dict[str, Any]:
 
 def _drive_json(drive: PlannedDrive) -> dict[str, Any]:
     from ipsys_log.analysis.joint_plan import DRIVE_S
-    from ipsys_log.units import CM_PER_M
 
     return {
         "low_m": drive.low_m.tolist(),
         "high_m": drive.high_m.tolist(),
         "duration_s": DRIVE_S,
         "cameras": list(drive.cameras),
-        "mean_before_cm": drive.mean_before_m * CM_PER_M,
-        "mean_after_cm": drive.mean_after_m * CM_PER_M,
+        "mean_before_m": drive.mean_before_m,
+        "mean_after_m": drive.mean_after_m,
     }

@@ -24,7 +24,7 @@ _PANEL = "Streams of positions"
 def _port_option(name: str, text: str) -> Any:
     """Return the type of an option for a port."""
     option = typer.Option(name, metavar="PORT", min=1, max=65535, help=text, rich_help_panel=_PANEL)
-    return Annotated[int], option | None
+    return Annotated[int | None, option]
 
 
 Udp = Annotated[

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from ipsys_log.analysis.expected_error import FloorGap
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import Rows, cm, counted, mm
 from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.units import CM_PER_M, MM_PER_M
@@ -83,9 +83,9 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
     """Return the result as plain data for JSON; an error without a value is None."""
     return {
         "enough": lab.is_enough,
-        "goal_mm": lab.goal_m * MM_PER_M,
-        "mean_mm": lab.mean_m * MM_PER_M,
-        "p95_mm": lab.p95_m * MM_PER_M,
+        "goal_m": lab.goal_m,
+        "mean_m": lab.mean_m,
+        "p95_m": lab.p95_m,
         "run": lab.run,
         "marker_height_m": lab.height_m,
         "calibration_points": len(lab.points_m),
@@ -96,13 +96,13 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
         "faults": [
             {"kind": f.kind, "subject": f.subject, "score": f.score, "text": f.text} for f in lab.faults
         ],
-        "drive": None if lab.gap is None or lab.is_enough else _gap_json(lab.gap),
+        "drive": None if lab.gap is None or lab.is_enough else plain(lab.gap),
         "tape": [
             {
                 "x_m": float(point.point_m[0]),
                 "y_m": float(point.point_m[1]),
                 "cameras": list(point.cameras),
-                "mean_after_mm": point.mean_after_m * MM_PER_M,
+                "mean_after_m": point.mean_after_m,
             }
             for point in lab.points
         ],
@@ -113,26 +113,16 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
 def _camera_json(camera: CameraResult) -> dict[str, Any]:
     return {
         "camera": camera.camera,
-        "mean_mm": _finite(camera.mean_m * MM_PER_M),
-        "p95_mm": _finite(camera.p95_m * MM_PER_M),
+        "mean_m": _finite(camera.mean_m),
+        "p95_m": _finite(camera.p95_m),
         "covered": camera.covered,
         "points": camera.sightings[0],
         "moving": camera.sightings[1],
         "residual_px": _finite(camera.rmse_px),
-        "clock_ms": None if camera.clock_s is None else camera.clock_s * 1000,
-        "row_time_us": None if camera.row_time_s is None else camera.row_time_s * 1e6,
+        "clock_s": camera.clock_s,
+        "row_time_s": camera.row_time_s,
         "nominal": camera.nominal,
-        "gaps": [_gap_json(gap) for gap in camera.gaps],
-    }
-
-
-def _gap_json(gap: FloorGap) -> dict[str, Any]:
-    return {
-        "camera": gap.camera,
-        "area_m2": gap.area_m2,
-        "low_m": gap.low_m.tolist(),
-        "high_m": gap.high_m.tolist(),
-        "error_mm": gap.error_m * MM_PER_M,
+        "gaps": plain(camera.gaps),
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import asdict
 from typing import Any
 
 from rich.console import Group
@@ -12,6 +11,7 @@ from rich.text import Text
 from ipsys_log.analysis.robot_run import RobotResult, RobotRunResult, Stop, read_robot_run
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ErrorStatistics
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import Rows, cm
 from ipsys_log.units import NS_PER_S
 
@@ -72,7 +72,7 @@ def stop_line(robot: str, stop: Stop, start_ns: int) -> str:
 def robot_run_json(result: RobotRunResult) -> dict[str, Any]:
     """Return the results as plain data; lengths are in m."""
     return {
-        "seconds": (result.end_ns - result.start_ns) / NS_PER_S,
+        "duration_s": (result.end_ns - result.start_ns) / NS_PER_S,
         "nearest_m": result.nearest_m,
         "robots": [_robot_json(robot, result.start_ns) for robot in result.robots],
     }
@@ -89,12 +89,12 @@ def _robot_json(robot: RobotResult, start_ns: int) -> dict[str, Any]:
                 "y_m": point.place.y_m,
                 "arrival_s": (point.start_ns - start_ns) / NS_PER_S,
                 "control_m": point.control_m,
-                "true": None if point.true_m is None else _errors_json(point.true_m),
-                "positioning": {run: _errors_json(errors) for run, errors in point.positioning_m.items()},
+                "true": plain(point.true_m),
+                "positioning": plain(point.positioning_m),
             }
             for point in robot.reached
         ],
-        "positioning": {run: _errors_json(errors) for run, errors in robot.positioning_m.items()},
+        "positioning": plain(robot.positioning_m),
         "stops": [
             {
                 "start_s": (stop.start_ns - start_ns) / NS_PER_S,
@@ -106,11 +106,6 @@ def _robot_json(robot: RobotResult, start_ns: int) -> dict[str, Any]:
             for stop in robot.stops
         ],
     }
-
-
-def _errors_json(errors: ErrorStatistics) -> dict[str, float | int | None]:
-    known = asdict(errors)
-    return {name: known[name] for name in ("count", "median_m", "p95_m", "max_m")}
 
 
 def render_robot_run(session: Session) -> tuple[str, bytes]:

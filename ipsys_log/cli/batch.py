@@ -34,8 +34,10 @@ _REPEAT = " After a failure or an interrupt, repeat the command: it computes onl
 _RATE_PERIOD_S = 1800.0
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the group with its commands: the single commands on many logs."""
+def add_commands(
+    app: typer.Typer, panel: str, wrap: Callable[[Callable[..., None]], Callable[..., None]]
+) -> None:
+    """Add the group with its commands, each wrapped: the single commands on many logs."""
     group = typer.Typer(
         help="Run a command on many logs, with many processes or the workers of a Dask scheduler.",
         no_args_is_help=True,
@@ -43,7 +45,7 @@ def add_commands(app: typer.Typer) -> None:
 
     def add(name: str, text: str, work: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> None:
         options = {"logs": LOGS, **options, **WORKERS}
-        group.command(name, help=text)(build_command(options, work))
+        group.command(name, help=text)(wrap(build_command(name, text, options, work)))
 
     text = "Run the missing stages of each log, and append their results to it." + _MORE + _REPEAT
     add("replay", text, _replay, {**_stage_options(None), "output": FOLDER, "outdated": OUTDATED})
@@ -59,7 +61,7 @@ def add_commands(app: typer.Typer) -> None:
         + _REPEAT
     )
     add("export", text, _export, EXPORT)
-    app.add_typer(group, name="batch")
+    app.add_typer(group, name="batch", rich_help_panel=panel)
 
 
 def _stage_options(until: str | None) -> dict[str, tuple[Any, Any]]:
@@ -139,7 +141,7 @@ def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of :func:`ipsys_log.api.replay`; rig and intrinsics are read once."""
-    from ipsys_log.cli.options import load_calibrations, split_calibration
+    from ipsys_log.cli.lab_inputs import load_calibrations, split_calibration
     from ipsys_log.errors import IpsysError
     from ipsys_log.models.table import check_name
     from ipsys_log.rig.file import load_rig

@@ -91,10 +91,6 @@ Force = Annotated[
 ]
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(calibrate)
-
-
 @say_kept(lambda written: f"written: {', '.join(written)}" if written else "no file was written")
 def calibrate(
     board: BoardName,
@@ -118,6 +114,12 @@ def calibrate(
     The command writes one file for each camera that saw the board, with the name of the camera. If a camera
     has no result, the files of the others are written, and the exit code is 1. Sharp, different images are
     selected automatically; two dozen with the board in all parts of the image are enough.
+
+    Examples
+
+        ipsys calibrate photos/red --board 6x4              # a folder: red.yaml
+        ipsys calibrate --rig lab.toml --board 6x4          # use the cameras now
+        ipsys calibrate red.mp4 --board charuco:4x5 --camera red --plot red.png
     """
     from ipsys_log import api
     from ipsys_log.calibration.board import parse_board

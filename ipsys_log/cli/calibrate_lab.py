@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
-from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
-from ipsys_log.cli.nominal_intrinsics import (
+from ipsys_log.cli.lab_inputs import (
     FieldOfView,
     Focal,
     SaveNominal,
+    cameras_of,
+    load_calibrations,
+    load_matching_rig,
     nominal_lenses,
     nominal_lenses_of_logs,
     write_nominal,
@@ -30,12 +32,10 @@ from ipsys_log.cli.options import (
     NoLogs,
     Port,
     RigFile,
-    cameras_of,
-    load_calibrations,
-    load_matching_rig,
     log_argument,
     log_option,
 )
+from ipsys_log.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
@@ -86,10 +86,6 @@ Terminal = Annotated[
 _LEAST_POINTS = 2
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command("calibrate-lab")(calibrate_lab)
-
-
 def calibrate_lab(
     logs: Sources = None,
     goal_mm: Goal = 3.0,
@@ -117,6 +113,12 @@ def calibrate_lab(
 
     Without LOG, the command records the cameras of --rig into -o until Ctrl-C. Meanwhile it prints the
     expected error, and takes the measured points on a page.
+
+    Examples
+
+        ipsys calibrate-lab drive.mcap cal.mcap --plot floor.png
+        ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
+        ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.messages.channels import MODEL, RIG
@@ -261,17 +263,13 @@ def _record_drive(
     lab.lenses.update(nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
     check_target(output, force, lab.files)
     request = Request(corners=corners)
-    ready_to_measure(lab, request, None)
-    if page is not None:
-        from ipsys_log.web.server import check_port_free
-
-        check_port_free(*page)
+    ready_to_measure(lab, request, None, page)
     with open_cameras(lab, output, seconds) as (cameras, settings, status):
         scene = live_scene(settings, cameras, None)
         calibrating = LiveCalibration(lab.rig, lab.lenses, goal_m, say)
         consumers: list[Consumer] = [status, scene, calibrating]
         try:
-            with nullcontext() if page is None else serve_live_page(scene, *page):
+            with nullcontext() if page is None else serve_live_measuring(scene, *page):
                 pipeline.live(cameras, settings, output, request, "camera-frame", consumers, force)
         finally:
             calibrating.close()

@@ -1,4 +1,4 @@
-"""New logs from the messages of others: ``ipsys cut``, ``ipsys compact`` and ``ipsys merge``."""
+"""New logs from the messages of others: ``ipsys cut`` and ``ipsys merge``."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ from ipsys_log.cli.options import (
     AsJson,
     LogList,
     NewLog,
-    OneLog,
     Overwrite,
     ReadLogs,
     log_argument,
     log_option,
-    one_log_argument,
 )
 from ipsys_log.plain_text import shell_words
 
@@ -31,14 +29,11 @@ if TYPE_CHECKING:
 _TIME = "UTC, such as '2026-05-04 10:00:00', or seconds from the start of the log."
 
 
-def add_commands(app: typer.Typer) -> None:
-    for command in (cut, compact, merge):
-        app.command()(command)
-
-
 def cut(
     logs: ReadLogs,
-    output: NewLog,
+    output: Annotated[
+        Path | None, log_option(help="The log to write, with a name that ends in .mcap.")
+    ] = None,
     start: Annotated[
         str, typer.Option(metavar="TIME", help=f"Keep messages from this time on: {_TIME}")
     ] = "",
@@ -86,13 +81,36 @@ def cut(
         int,
         typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera, with its results."),
     ] = 1,
+    compact: Annotated[
+        bool,
+        typer.Option(
+            "--compact", help="Leave out superseded and unfinished runs, and keep everything else of one LOG."
+        ),
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="With --compact: only list these runs, and write nothing.")
+    ] = False,
     overwrite: Overwrite = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a part of a log to a new log: a time range, some topics, cameras, runs, robots or frames.
 
     The messages stay as they are. Rig, intrinsics, models, measurements and the records of runs come with
     every part. The new log names the log that it was cut from, and ipsys verify checks its messages.
+
+    A run is superseded if newer complete runs of the same name, settings and kind of input replace all its
+    stages: poly_2 supersedes poly. --compact keeps runs that a kept run has read, and the provenance of all.
+    Another log may have results of a dropped run as its input: ipsys info --runs lists the input runs.
+
+    Examples
+
+        ipsys cut monday.mcap -o part.mcap --start 60 --end 90
+        ipsys cut monday.mcap -o part.mcap --start '2026-05-04 10:00' --camera red
+        ipsys cut monday.mcap -o small.mcap --exclude-topics '/cameras/*/image'
+        ipsys cut monday.mcap -o poly.mcap --run poly
+        ipsys cut calibration.mcap --compact --dry-run     # which runs, how much?
     """
+    from ipsys_log.errors import IpsysError
     from ipsys_log.runs.cut import cut as cut_logs
     from ipsys_log.runs.cut_selection import CutOptions
     from ipsys_log.units import format_bytes
@@ -108,52 +126,54 @@ def cut(
         robots=robots or (),
         every=every,
     )
+    if compact:
+        if options.as_text():
+            raise IpsysError("--compact: cannot be used with options that select a part; cut again for these")
+        _compact(logs, output, dry_run, overwrite, as_json)
+        return
+    if dry_run:
+        raise IpsysError("--dry-run: has no effect without --compact")
+    if output is None:
+        raise IpsysError("-o is missing; give the name of the new log")
     with progress_bar() as progress:
         result = cut_logs(logs, output, options, overwrite, progress)
+    size = output.stat().st_size
+    if as_json:
+        print_json({"output": str(output), **result._asdict(), "bytes": size})
+        return
     console.print(
         f"{output} written: {result.kept} of {result.messages} messages, {result.channels} channels, "
-        f"{format_bytes(output.stat().st_size)}"
+        f"{format_bytes(size)}"
     )
 
 
-def compact(
-    log: Annotated[OneLog, one_log_argument(help="A finished log, a file or a URL. It stays as it is.")],
-    output: Annotated[
-        Path | None,
-        log_option(help="The log to write, with a name that ends in .mcap."),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only list the runs that would be dropped, and write nothing.")
-    ] = False,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
+def _compact(
+    logs: Sequence[LogLocation], output: Path | None, dry_run: bool, overwrite: bool, as_json: bool
 ) -> None:
-    """Copy a log without its superseded and unfinished runs. The other runs keep their provenance.
-
-    A run is superseded if newer complete runs of the same name, settings and kind of input replace all its
-    stages: poly_2 supersedes poly. Runs that a kept run has read are kept. Another log may have results of a
-    dropped run as its input: ipsys runs lists the input runs of a log.
-    """
+    """Copy a log without its superseded and unfinished runs, or list them."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.log_files import read_log_state
     from ipsys_log.runs import compact as compaction
     from ipsys_log.runs.output import check_copy
 
+    if len(logs) != 1:
+        raise IpsysError("--compact: compacts one log; name only one")
     if output is None and not dry_run:
         raise IpsysError("-o is missing; give the name of the new log, or --dry-run")
+    (log,) = logs
     if output is not None:
         check_copy([log], output, overwrite)
     dropped, size = compaction.dropped_runs(log), read_log_state(log).size
-    is_written = output is not None and bool(dropped) and not dry_run
+    written = output if dropped and not dry_run else None
     if not as_json:
         _show_dropped(log, size, dropped)
-    if output is not None and is_written:
+    if written is not None:
         with progress_bar() as progress:
-            compaction.compact(log, output, overwrite, progress)
+            compaction.compact(log, written, overwrite, progress)
     if as_json:
-        print_json(_compact_json(log, size, output if is_written else None, dropped))
-    elif output is not None and is_written:
-        _show_saving(size, output)
+        print_json(_compact_json(log, size, written, dropped))
+    elif written is not None:
+        _show_saving(size, written)
 
 
 def merge(
@@ -175,8 +195,14 @@ def merge(
     """Merge the logs of several recorders of one session, with different cameras, into a new log.
 
     Each recorder has its own clock. Without --offset, the command estimates the offset of a log from moving
-    markers that its cameras and those of an earlier log saw. Run ipsys detect on both logs first. Rigs and
-    intrinsics must not contradict each other. The new log has the record of the merge with all offsets.
+    markers that its cameras and those of an earlier log saw. Run ipsys replay --until detect on both logs
+    first. Rigs and intrinsics must not contradict each other. The new log has the record of the merge with
+    all offsets.
+
+    Examples
+
+        ipsys merge monday_a.mcap monday_b.mcap -o monday.mcap
+        ipsys merge a.mcap b.mcap c.mcap -o day.mcap --offset b=0.012 --offset c=-1
     """
     from ipsys_log.runs.merge import merge as merge_logs
     from ipsys_log.runs.merge_offsets import choose_offsets

@@ -61,10 +61,6 @@ _DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"
 _MOST = 2000
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(markers)
-
-
 def markers(
     rig: RigNow = None,
     ids: Ids = None,
@@ -80,7 +76,14 @@ def markers(
     """Draw markers and calibration boards as a PDF at true size, with a ruler to check the print.
 
     Each marker has its white margin, cutting marks, its id and an arrow to its front: the direction of its
-    heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long."""
+    heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long.
+
+    Examples
+
+        ipsys markers --rig lab.toml                # all markers of the rig
+        ipsys markers --ids 0-11 --length 0.08 --page letter
+        ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
+    """
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_file, write_files

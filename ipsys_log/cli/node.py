@@ -23,10 +23,6 @@ NodeLog = Annotated[
 ]
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(node)
-
-
 @runs_until_stopped
 def node(
     rig: Annotated[
@@ -62,7 +58,14 @@ def node(
     """Record one camera of this host, and send its frames to the centre, until Ctrl-C.
 
     The centre is a recording on another machine, such as ipsys live, whose rig has the source zenoh:NAME. If
-    the centre or the network is away, the node records on, and sends the missing frames afterwards."""
+    the centre or the network is away, the node records on, and sends the missing frames afterwards.
+
+    Examples
+
+        ipsys node lab.toml --camera red         # on the host of this camera
+        ipsys node lab.toml --camera red --centre 192.168.1.10:7449
+        ipsys node lab.toml --camera red --detect     # send only the markers
+    """
     allow_interrupt("stopped before the first frame was recorded; no log was written")
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.capture.nodes.centre import is_of_node

@@ -14,7 +14,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.cli.console import console, remarks, say, warn
-from ipsys_log.cli.options import load_lab, split_calibration
+from ipsys_log.cli.lab_inputs import load_lab, split_calibration
 from ipsys_log.cli.signals import Interrupted, stop_on_signal
 from ipsys_log.units import format_bytes
 

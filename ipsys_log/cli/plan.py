@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.cli.console import console, print_json, say, warn
-from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations
+from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
@@ -44,10 +45,6 @@ Plot = Annotated[
 ]
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(plan)
-
-
 def plan(
     logs: Logs,
     places: Places = 5,
@@ -65,6 +62,10 @@ def plan(
     alone, without the noise of an image.
 
     If the log has no such model yet, the command fits one first.
+
+    Examples
+
+        ipsys plan calibration.mcap --places 5 --plot next.png
     """
     from ipsys_log.messages.channels import MODEL, RIG
     from ipsys_log.report.files import check_figure_file

@@ -28,6 +28,8 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
 _WAKE_S = 0.05
 _KEPT = "complete results are kept; nothing else is changed"
+# The normal end of a command that appends measured points.
+SAVED = "stopped; every saved point is in the log"
 _NOTHING_WRITTEN = "no file was changed"
 
 

@@ -13,18 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.cli.console import console, print_json, print_outcomes, progress_bar, say
-from ipsys_log.cli.options import (
-    AsJson,
-    Calibrations,
-    Logs,
-    RigFile,
-    annotate,
-    cameras_of,
-    check_present,
-    load_calibrations,
-    load_matching_rig,
-    log_option,
-)
+from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
+from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, annotate, check_present, log_option
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.stages import ENTRIES, parameters_until
 
@@ -35,7 +25,12 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
-_Path = Path | None
+STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
+
+
+def _stage_lines() -> str:
+    return "\n\n".join(f"{entry.name}: {entry.help}" for entry in ENTRIES)
+
 
 # The options of every stage, and of the printed results: type with help, and default.
 _SHARED: dict[str, tuple[Any, Any]] = {
@@ -52,7 +47,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "output": (
-        Annotated[_Path, log_option(help="Write the results to a new log, not to the last LOG.")],
+        Annotated[Path | None, log_option(help="Write the results to a new log, not to the last LOG.")],
         None,
     ),
     "jobs": (
@@ -73,7 +68,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
 _PRINTS: dict[str, tuple[Any, Any]] = {
     "plot": (
         Annotated[
-            _Path,
+            Path | None,
             typer.Option(metavar="FILE", help="Draw the floor and the errors: .png, .pdf, .svg or .jpg."),
         ],
         None,
@@ -89,7 +84,9 @@ _PRINTS: dict[str, tuple[Any, Any]] = {
         False,
     ),
     "plots": (
-        Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
+        Annotated[
+            Path | None, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")
+        ],
         None,
     ),
 }
@@ -99,25 +96,51 @@ _ORDER = (
     *("run", "output", "as_live", "skip_ambiguous", "jobs"),
 )
 
+# The end of a help text.
 MORE = "\n\nThe command runs missing stages first."
+_UNTIL = (
+    Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            metavar="STAGE",
+            help=f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse.",
+        ),
+    ],
+    None,
+)
+_REPLAY = f"""
+Run the missing stages of a log, append their results to it, and print the accuracy.
 
+With --until locate, fuse or smooth and without --model, the command continues the newest run, with its model
+and settings. These are all stages in their order; smooth only runs with --until smooth:
 
-def add_commands(app: typer.Typer) -> None:
-    """Add a command for each stage of the table, and the command of all stages."""
-    everything = options_until(None)
-    as_json = everything.pop("as_json")
-    app.command(
-        "replay",
-        help="Run the missing stages from detect to fuse, append their results, and print the accuracy.",
-    )(build_command({**everything, **_PRINTS, "as_json": as_json}, partial(_derive, None)))
-    for number, entry in enumerate(ENTRIES):
-        options = {**options_until(entry.name), **{name: _PRINTS[name] for name in entry.prints}}
-        text = entry.help + MORE * (number > 0)
-        app.command(entry.name, help=text)(build_command(options, partial(_derive, entry.name)))
+{_stage_lines()}
+
+Examples
+
+    ipsys replay calibration.mcap                      # fit and evaluate poly
+    ipsys replay calibration.mcap --model best --plot floor.png
+    ipsys replay monday.mcap --model-from calibration.mcap
+    ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
+    ipsys replay monday.mcap --until detect            # only the markers
+"""
+_EVALUATE = f"""
+Evaluate models: their errors, the learning curve and outliers of the measurements.
+
+The errors are on held-out calibration points and by cross-validation. Without --model, the command evaluates
+all models; joint only if the log has images or markers.{MORE}
+
+Examples
+
+    ipsys evaluate calibration.mcap                    # all models
+    ipsys evaluate calibration.mcap --details          # with details
+    ipsys evaluate calibration.mcap --model poly --model best --plots figures
+"""
 
 
 def options_until(name: str | None) -> dict[str, tuple[Any, Any]]:
-    """Return the options of a stage's command, with the parameters of all stages up to it; None: of all."""
+    """Return the options of a stage, with the parameters of all stages up to it; None: of all stages."""
     options = dict(_SHARED)
     as_json = options.pop("as_json")
     for parameter in parameters_until(name):
@@ -126,13 +149,16 @@ def options_until(name: str | None) -> dict[str, tuple[Any, Any]]:
     return {**ordered, **options, "as_json": as_json}
 
 
-def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that has only these options, by name: type with help, and default."""
+def build_command(
+    name: str, text: str, options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]
+) -> Callable[..., None]:
+    """Return a command with a help text and these options, by name: type with help, and default."""
 
     def command(**given: Any) -> None:
         work(**given)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
+    command.__name__, command.__doc__ = name, text
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(key, keyword, default=value, annotation=kind)
@@ -239,6 +265,20 @@ def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Se
     return added
 
 
+def _replay(until: str | None, **given: Any) -> None:
+    from ipsys_log.errors import IpsysError
+
+    if until is not None and until not in STAGE_NAMES:
+        raise IpsysError(f"--until {until}: is not a stage; use one of {', '.join(STAGE_NAMES)}")
+    unread = {parameter.name: parameter for parameter in parameters_until(None)}
+    for parameter in parameters_until(until):
+        del unread[parameter.name]
+    for name, parameter in unread.items():
+        if given.pop(name) != parameter.default:
+            raise IpsysError(f"--{name.replace('_', '-')}: has no effect on the stages up to {until}")
+    _derive(until, **given)
+
+
 def _derive(
     until: str | None,
     logs: Sequence[LogLocation],
@@ -323,3 +363,19 @@ def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
         say(f"results are in {target}")
     else:
         say("nothing to do: all results are up to date")
+
+
+_options = options_until(None)
+_json = _options.pop("as_json")
+replay = build_command(
+    "replay",
+    _REPLAY,
+    {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json},
+    _replay,
+)
+evaluate = build_command(
+    "evaluate",
+    _EVALUATE,
+    {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]},
+    partial(_derive, "evaluate"),
+)

@@ -222,9 +222,9 @@ def _trajectories_json(trajectories: Sequence[TrajectoryErrors]) -> dict[str, An
 
 def _trajectory_json(trajectory: TrajectoryErrors) -> dict[str, Any]:
     return {
-        "ate": {"3d": plain(trajectory.absolute_3d), "2d": plain(trajectory.absolute_2d)},
+        "ate": _errors_json(ErrorRow(POOLED, "truth", trajectory.absolute_3d, trajectory.absolute_2d)),
         "rpe": [
-            {"delta": one.delta, "unit": one.unit, "relation": one.relation, **plain(one.summary)}
+            {"delta": one.delta, "unit": one.unit, "relation": one.relation, **_statistics(one.summary, 1)}
             for one in trajectory.relative
         ],
     }
@@ -238,7 +238,12 @@ def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:
 def _errors_json(row: ErrorRow) -> dict[str, Any]:
     """Return the statistics and the RMSE of errors in space, if they are known, and on the floor."""
     kinds = {name: errors for name, errors in (("3d", row.space), ("2d", row.floor)) if errors is not None}
-    return {name: plain(errors) | plain({"rmse_m": row.rmse_m(errors)}) for name, errors in kinds.items()}
+    return {name: _statistics(errors, row.repeats) for name, errors in kinds.items()}
+
+
+def _statistics(errors: ErrorStatistics, repeats: int | None) -> dict[str, Any]:
+    rmse = {} if repeats is None else {"rmse_m": root_mean_square_m(errors, repeats)}
+    return {**plain(errors), **rmse}
 
 
 def _learning_json(point: LearningPoint) -> Any:

@@ -176,8 +176,8 @@ def _commands(session: Session, findings: Findings) -> dict[str, str]:
         "tracks": f"ipsys view {logs}",
         "info": f"ipsys info {logs}",
         "check": f"ipsys check {logs} --details",
-        "latency": f"ipsys latency {logs} --plot latency.png",
-        "runs": f"ipsys runs {logs}",
+        "latency": f"ipsys info --latency {logs} --plot latency.png",
+        "runs": f"ipsys info --runs {logs}",
     }
 
 

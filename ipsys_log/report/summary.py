@@ -79,10 +79,14 @@ def _trajectory_lines(accuracy: Accuracy) -> Iterator[str]:
     if not accuracy.trajectories:
         return
     pooled = pool_trajectories(accuracy.trajectories)
-    space_cm, floor_cm = cm(pooled.absolute_3d.rmse_m), cm(pooled.absolute_2d.rmse_m)
+    space_cm, floor_cm = (
+        cm(root_mean_square_m(pooled.absolute_3d)),
+        cm(root_mean_square_m(pooled.absolute_2d)),
+    )
     text = f"Absolute trajectory error (ATE): RMSE {space_cm} cm in 3D, {floor_cm} cm on the floor"
     relative = [
-        f"{cm(errors.summary.rmse_m)} cm over {errors.delta:g} {errors.unit}" for errors in pooled.relative
+        f"{cm(root_mean_square_m(errors.summary))} cm over {errors.delta:g} {errors.unit}"
+        for errors in pooled.relative
     ]
     yield f"{text}; relative pose error (RPE): RMSE {', '.join(relative)}." if relative else f"{text}."
 

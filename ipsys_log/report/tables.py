@@ -8,7 +8,7 @@ from textwrap import wrap
 
 import numpy as np
 
-from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.trajectory_errors import DELTAS, TrajectoryErrors, pool_trajectories
 from ipsys_log.messages import CameraEvaluation
 from ipsys_log.report.accuracy import Accuracy, ErrorRow, gather_outliers
@@ -219,6 +219,8 @@ def trajectory_table(accuracies: Sequence[Accuracy]) -> Rows | None:
 
 def _metrics(trajectory: TrajectoryErrors) -> list[str]:
     ate = trajectory.absolute_3d
-    values = (ate.rmse_m, ate.mean_m, ate.median_m, ate.std_m, ate.p95_m, ate.max_m)
-    relative = {(errors.delta, errors.unit): errors.summary.rmse_m for errors in trajectory.relative}
+    values = (root_mean_square_m(ate), ate.mean_m, ate.median_m, ate.std_m, ate.p95_m, ate.max_m)
+    relative = {
+        (errors.delta, errors.unit): root_mean_square_m(errors.summary) for errors in trajectory.relative
+    }
     return [str(ate.count), *map(cm, values), *(cm(relative.get(delta)) for delta in DELTAS)]

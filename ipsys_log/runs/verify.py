@@ -83,7 +83,7 @@ def verify(
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 f"to compute one: ipsys replay {shell_words(paths[-1])}; "
-                f"to list the runs: ipsys runs {shell_words(paths[-1])}"
+                f"to list the runs: ipsys info --runs {shell_words(paths[-1])}"
             )
         checked = {output.topic for record in records for output in record.outputs}
         repeated = [
@@ -97,7 +97,7 @@ def verify(
         if not repeated and not session.cuts:
             raise IpsysError(
                 f"{session}: has no run that can be verified; for the reasons: "
-                f"ipsys runs {shell_words(paths[-1])}"
+                f"ipsys info --runs {shell_words(paths[-1])}"
             )
         comparisons = []
         for name in sorted(names):
@@ -197,7 +197,7 @@ def _compared_runs(
     if not both:
         raise IpsysError(
             f"{one} and {other} have no run with the same name; to list the runs of one: "
-            f"ipsys runs {shell_words(*one.paths)}; "
+            f"ipsys info --runs {shell_words(*one.paths)}; "
             "give the runs with --run"
         )
     return both, both if runs[1] is None else names[1]

@@ -209,7 +209,7 @@ def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
     from ipsys_log.report.lab_calibration_text import lab_advice, lab_headline, lab_json, lab_table
 
     if plot is not None:
-        from ipsys_log.report.lab_calibration_figure import draw_lab
+        from ipsys_log.report.expected_error_figures import draw_lab
 
         draw_lab(lab, plot)
     if as_json:

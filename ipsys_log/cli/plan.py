@@ -94,7 +94,7 @@ def plan(
 
 def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
     if plot is not None:
-        from ipsys_log.report.plan_figure import draw_plan
+        from ipsys_log.report.expected_error_figures import draw_plan
 
         draw_plan(found, plot)
     if as_json:

@@ -25,9 +25,9 @@ from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.cameras import latency_table
 from ipsys_log.report.contents import runs_table, states_json
-from ipsys_log.report.figures import MOST_IN_LEGEND, style_axes
+from ipsys_log.report.figures import MOST_IN_LEGEND, new_figure, style_axes
 from ipsys_log.report.findings import Findings, gather_findings
-from ipsys_log.report.html_figures import new_figure, picture
+from ipsys_log.report.html_figures import picture
 from ipsys_log.report.latency_figure import draw_shares, draw_steps
 from ipsys_log.report.rows import Rows
 from ipsys_log.report.styles import camera_styles, shorten

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 from ipsys_log.messages import Floor
+from ipsys_log.report.calibration_figures import clocks_figure, poses_figure
+from ipsys_log.report.expected_error_figures import _panels
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.html_figures import joint_pictures, other_residual_pictures
-from ipsys_log.report.joint_figures import clocks_figure, poses_figure
-from ipsys_log.report.lab_calibration_figure import _panels
 from ipsys_log.report.learning_figure import _figure
 from ipsys_log.report.points_figure import draw_hulls
 from ipsys_log.simulation.settings import grid_names

@@ -62,15 +62,8 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
             f"{session}: no model was evaluated, because no calibration point is held "
             "out; measure more points"
         )
-    environment = Environment(
-        loader=PackageLoader("ipsys_log", "report"),
-        autoescape=True,  # names in a log may hold any text
-        finalize=_plain,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("session.html").render(
+    return render_page(
+        "session.html",
         **_text_values(findings),
         flat=html_sections.weak_points_table(_measured(session, findings)),
         **_figure_values(findings),
@@ -81,6 +74,19 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         commands=_commands(session, findings),
         most_cameras=MOST_IN_LEGEND,
     )
+
+
+def render_page(template: str, **values: Any) -> str:
+    """Return the page of a template; all texts are escaped, because names in a log may hold any text."""
+    environment = Environment(
+        loader=PackageLoader("ipsys_log", "report"),
+        autoescape=True,
+        finalize=_plain,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)
 
 
 def _recording_values(session: Session) -> dict[str, Any]:

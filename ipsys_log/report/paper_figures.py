@@ -182,32 +182,20 @@ def _ends_cm(errors: ErrorStatistics) -> list[float]:
     return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
 
 
-def _has_models(findings: Findings) -> bool:
-    return bool(findings.accuracies)
-
-
-def _has_cross_validation(findings: Findings) -> bool:
-    return any(accuracy.rows(True) for accuracy in findings.accuracies)
-
-
-def _has_published(findings: Findings) -> bool:
-    return has_published(findings.evaluations)
-
-
 # For each file: the condition to write it, and the function that returns its bytes.
 _FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
-    "table_1.csv": (_has_models, lambda f: paper_csv(f, in_space=True)),
-    "table_2.csv": (_has_models, lambda f: paper_csv(f, in_space=False)),
-    "cross_validation.csv": (_has_cross_validation, cross_validation_csv),
+    "table_1.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=True)),
+    "table_2.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=False)),
+    "cross_validation.csv": (lambda f: any(a.rows(True) for a in f.accuracies), cross_validation_csv),
     "figure_9.png": (lambda f: bool(f.training_m() or f.test_m()), lambda f: png(places_figure(f))),
     "figure_10.png": (
-        lambda f: _has_published(f) and f.in_space,
+        lambda f: has_published(f.evaluations) and f.in_space,
         lambda f: png(published_figure(f, in_space=True)),
     ),
-    "figure_11.png": (_has_published, lambda f: png(published_figure(f, in_space=False))),
+    "figure_11.png": (lambda f: has_published(f.evaluations), lambda f: png(published_figure(f, False))),
     "learning_curve.png": (lambda f: bool(mean_curves(f, False)), lambda f: png(learning_figure(f))),
     "errors_floor.png": (lambda f: bool(shown_models(f)), lambda f: png(residuals_figure(f))),
-    "models.png": (_has_models, lambda f: png(models_figure(f))),
+    "models.png": (lambda f: bool(f.accuracies), lambda f: png(models_figure(f))),
     "camera_poses.png": (
         lambda f: bool(f.calibrated),
         lambda f: png(calibration_figures.poses_figure(f.calibrated, f.rig)),

@@ -116,20 +116,12 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
     IpsysError
         The log has no robot run.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     from ipsys_log.report.figures import png, svg_data_uri
+    from ipsys_log.report.html import render_page
     from ipsys_log.report.robot_run_figure import draw_drive, draw_panels, draw_paths
 
     result = read_robot_run(session)
     panels = [png(draw_panels(session, result, robot), _PANELS_DPI) for robot in result.robots]
-    environment = Environment(
-        loader=PackageLoader("ipsys_log", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     robots = [
         {
             **_robot_values(robot, result.start_ns),
@@ -138,7 +130,8 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
         }
         for robot, image in zip(result.robots, panels, strict=True)
     ]
-    text = environment.get_template("robot_run.html").render(
+    text = render_page(
+        "robot_run.html",
         log=session.paths[-1].name,
         seconds=f"{(result.end_ns - result.start_ns) / NS_PER_S:.1f}",
         nearest=None if result.nearest_m is None else f"{result.nearest_m:.2f}",

@@ -9,7 +9,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors", "interrupts", "piped_process"),
+    ("errors", "piped_process"),
     ("arrays", "units", "plain_text", "extras", "atomic_files"),
     ("messages",),
     ("geometry", "rig"),

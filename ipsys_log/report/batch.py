@@ -75,7 +75,6 @@ def write_results(path: Path, results: Sequence[LogResult]) -> None:
         "messages": "int64",
         "trace": "string",
         "pieces": "int64",
-        "lost_attempts": "int64",
         "derived": "string",
     }
     rows = ({name: None if value == "" else value for name, value in asdict(one).items()} for one in results)

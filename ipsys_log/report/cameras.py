@@ -71,19 +71,17 @@ class LiveStatus:
         """The last check of each camera."""
         return self._monitor.checks
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Handle one recorded message."""
         self._announce(message)
         self._monitor(message)
-        if message is None:
-            return
         begin_ns, end_ns = self._span_ns or (message.log_time_ns, message.log_time_ns)
         self._span_ns = min(begin_ns, message.log_time_ns), max(end_ns, message.log_time_ns)
         self._overlap(message)
         if isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
 
-    def _announce(self, message: Message | None) -> None:
+    def _announce(self, message: Message) -> None:
         """Report the recording as soon as the file has grown by the first frame."""
         file = self._open_log()
         if self._say is None or file is None:
@@ -91,7 +89,7 @@ class LiveStatus:
         if self._size_with_frame and file.size >= self._size_with_frame:
             self._say(f"recording into {self._target}; Ctrl-C to end")
             self._say = None
-        elif not self._size_with_frame and message is not None:
+        elif not self._size_with_frame:
             frame = message.payload
             if isinstance(frame, (CompressedImage, CompressedVideo)):
                 self._size_with_frame = file.size + len(frame.data)

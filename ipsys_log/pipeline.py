@@ -57,7 +57,6 @@ from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.continuation import continue_newest
 from ipsys_log.runs.execute import sign
 from ipsys_log.runs.graph import stages_until
-from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.pieces import PieceWorkers
@@ -108,12 +107,10 @@ def replay(
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)
-    with (
-        open_target(paths, output) as (logs, target),
-        LocalWorkers(jobs) as local,
-        OnePass(request, stages[-1]) as one_pass,
-    ):
-        work = Replay(request, stages, models, logs, target, workers or local, one_pass, progress, say)
+    if workers is not None and workers.first_only and len(stages) > 1:
+        request, stages = replace(request, run=None), stages[:1]  # the given name is for the last stage
+    with open_target(paths, output) as (logs, target), LocalWorkers(jobs) as local:
+        work = Replay(request, stages, models, logs, target, workers or local, progress, say)
         work.compute()
     return work.outcomes
 

@@ -12,8 +12,6 @@ from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.messages import CompressedImage, Message, RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["WAIT_LIMIT_S", "SteppedClock", "cameras", "playing"]
-
 WAIT_LIMIT_S = 240.0
 _READING_NS = 1000
 _START_NS = 1_700_000_000 * NS_PER_S

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 from importlib.metadata import distribution, packages_distributions
 from pathlib import Path
 
-import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -94,17 +93,3 @@ def test_base_installation_stays_below_500_mb() -> None:
 
 def _size_mb(files: Iterable[Path]) -> float:
     return sum(512 * file.stat().st_blocks for file in files if file.is_file()) / (1 << 20)
-
-
-@pytest.mark.parametrize(
-    ("source", "module"),
-    [
-        ("import lz4.frame", "lz4"),
-        ("from google.protobuf import message", "google"),
-        ("def late():\n    import cv2 as cv", "cv2"),
-        ("import_module(f'foxglove_schemas_protobuf.{name}_pb2')", "foxglove_schemas_protobuf"),
-        ("importlib.import_module('gi.repository')", "gi"),
-    ],
-)
-def test_imports_of_every_form_are_seen(source: str, module: str) -> None:
-    assert list(imported_modules(source)) == [module]

@@ -218,12 +218,12 @@ def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
     for name, state in cameras.items():
         if state.format == MARKERS_FORMAT:
             raise IpsysError(
-                f"camera {name} sends only markers, but ipsys measure keeps frames: start its node without "
+                f"camera {name} sends only markers, but --points-only keeps frames: start its node without "
                 "--detect"
             )
         if state.format in ("h264", "h265"):
             raise IpsysError(
-                f"camera {name} sends {state.format}, but ipsys measure can keep short parts only of MJPEG: "
+                f"camera {name} sends {state.format}, but --points-only can keep short parts only of MJPEG: "
                 "set the camera to MJPEG, or record everything with 'ipsys record --measure'"
             )
 

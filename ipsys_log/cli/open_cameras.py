@@ -13,8 +13,8 @@ from threading import TIMEOUT_MAX, Timer
 from time import monotonic
 from typing import TYPE_CHECKING
 
-from ipsys_log.cli.console import console, remarks, say
-from ipsys_log.cli.options import load_lab, split_calibration
+from ipsys_log.cli.console import console, remarks, say, warn
+from ipsys_log.cli.lab_inputs import load_lab, split_calibration
 from ipsys_log.cli.signals import Interrupted, stop_on_signal
 from ipsys_log.units import format_bytes
 
@@ -54,13 +54,11 @@ def prepare_lab(
     lab = replace(lab, files=_files_of(lab, calibration))
     check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
-        remarks.print(line, style="yellow", markup=False)
+        warn(line)
     for camera in lab.cameras:
         if camera.width and camera.height and camera.width < camera.height:
             text = f"camera {camera.name}: {camera.width} x {camera.height} px is upright"
-            remarks.print(
-                f"{text}: check that width and height are not exchanged", style="yellow", markup=False
-            )
+            warn(f"{text}: check that width and height are not exchanged")
     return lab
 
 
@@ -157,7 +155,7 @@ def open_cameras(
             stack.enter_context(_on_screen(status))
         yield opened, status
     for line in () if doing else status.summary():
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def _say_room(opened: OpenLab, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
@@ -171,7 +169,7 @@ def _say_room(opened: OpenLab, room: DiskRoom, seconds: float | None, doing: str
             say(f"about {place} for each point; {free} free in {room.folder}")
         return
     short = room.is_short(seconds)
-    remarks.print(room.describe(seconds), style="bold red" if short else None, markup=False)
+    remarks.print(room.describe(seconds), style="bold red" if short else None)
     if advice := room.advise(opened.lab.cameras, opened.cameras.states):
         say(advice)
 

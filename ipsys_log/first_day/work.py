@@ -134,7 +134,7 @@ def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
 
 
 def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManager[object]], job: Job) -> None:
-    """Measure points with live cameras until the job is stopped (``ipsys measure``).
+    """Measure points with live cameras until the job is stopped (``ipsys record --measure --points-only``).
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ import pytest
 import simplejpeg
 
 from ipsys_log import pipeline
-from ipsys_log.cli.dashboard import serve_dashboard
+from ipsys_log.cli.pages import serve_dashboard
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, Latency, Message, Tracks

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
 from ipsys_log.analysis.pairs import locate_measurements
 from ipsys_log.errors import IpsysError
-from ipsys_log.interrupts import undivided
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC
 from ipsys_log.messages.channels import LATENCY, MEASUREMENTS
@@ -74,12 +72,12 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
         show_in_viewer(lambda write: _stream(session, shown, write))
         return shown
     partial = save.with_name(save.name + ".partial")
-    with ExitStack() as stack:
-        with undivided():
-            partial.touch()  # errors of the path are raised by this call, not by Rerun
-            stack.callback(partial.unlink, missing_ok=True)
+    try:
+        partial.touch()  # errors of the path are raised by this call, not by Rerun
         _save(session, shown, partial)
         partial.replace(save)
+    finally:
+        partial.unlink(missing_ok=True)
     return shown
 
 

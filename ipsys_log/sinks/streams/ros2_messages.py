@@ -23,7 +23,7 @@ from ipsys_log.sinks.streams.poses import StreamPose, Velocity
 from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from ipsys_log.analysis.floor_cameras import FloorCamera
+    from ipsys_log.geometry.posed_camera import PosedCamera
 
 # Jazzy and Kilted have the same definitions of these messages.
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -112,7 +112,7 @@ def encode_transforms(poses: Iterable[tuple[StreamPose, float]]) -> bytes:
     return encode(make("tf2_msgs/TFMessage", rows), TF)
 
 
-def encode_static(heights_m: Mapping[str, float], time_ns: int, cameras: Iterable[FloorCamera] = ()) -> bytes:
+def encode_static(heights_m: Mapping[str, float], time_ns: int, cameras: Iterable[PosedCamera] = ()) -> bytes:
     """Return the message of ``/tf_static``: a topic that keeps only its last message.
 
     Parameters

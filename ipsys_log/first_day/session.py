@@ -12,8 +12,7 @@ from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.extras import check_installed
 from ipsys_log.first_day import work
 from ipsys_log.first_day.alignment import AlignmentResult
-from ipsys_log.first_day.board_entry import BOARD_FIELDS, parse_board_entry
-from ipsys_log.first_day.board_search import BoardSearch
+from ipsys_log.first_day.board import BOARD_FIELDS, BoardSearch, parse_board_entry
 from ipsys_log.first_day.camera_address import parse_camera_address
 from ipsys_log.first_day.camera_choice import save_cameras, set_calibration
 from ipsys_log.first_day.camera_pictures import CameraPictures

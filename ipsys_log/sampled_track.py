@@ -111,7 +111,8 @@ def _source(session: Session, run: str | None) -> tuple[Channel, str]:
     known = sorted(name for name in session.run_names() if session.topics(TRACKS, name))
     wanted = f"run {run} has no tracks" if run else "no run has tracks"
     raise IpsysError(
-        f"{session}: {wanted} (they are in: {', '.join(known) or 'none'}); run: ipsys smooth LOG"
+        f"{session}: {wanted} (they are in: {', '.join(known) or 'none'}); "
+        "run: ipsys replay LOG --until smooth"
     )
 
 

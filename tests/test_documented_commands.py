@@ -43,7 +43,12 @@ def command_fault(words: list[str]) -> str | None:
     return f"{command.name} has no {', '.join(unknown)}" if unknown else None
 
 
-@pytest.mark.parametrize("page", staging["pages"](), ids=lambda path: str(path.relative_to(ROOT)))
+# Pages on the past name commands as they were.
+_HISTORY = ("CHANGELOG.md", "docs/decisions")
+_PAGES = [page for page in staging["pages"]() if not str(page.relative_to(ROOT)).startswith(_HISTORY)]
+
+
+@pytest.mark.parametrize("page", _PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_commands_of_a_page_exist(page: Path) -> None:
     commands = [words for words in documented(page.read_text(encoding="utf-8")) if words]
     assert [(words, fault) for words in commands if (fault := command_fault(words))] == []
@@ -55,7 +60,7 @@ def test_wrong_commands_are_found() -> None:
     )
     faults = [command_fault(words) for words in documented(text)]
     assert faults == ["no command detekt", "live has no --udb", "plan has no --x"]
-    assert command_fault(["import", "truth", "x.csv", "--into", "x.mcap"]) is None
+    assert command_fault(["batch", "replay", "logs", "--table", "x.parquet"]) is None
 
 
 def test_commands_of_the_pages_are_seen() -> None:

@@ -1,4 +1,4 @@
-"""``ipsys measure`` with cameras: the remaining data of a session, for every end."""
+"""``ipsys record --measure --points-only``: the remaining data of a session, for every end."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.waiting import wait_until
 
 PATIENCE_S = 240.0
 RATE_HZ = 10
-HEAD = ("measure", "--port", "0", "--rig")
+HEAD = ("record", "--measure", "--points-only", "--port", "0", "--rig")
 
 
 class Lab(NamedTuple):
@@ -211,17 +211,9 @@ def test_existing_log_is_kept_without_force(ipsys: Ipsys, still_lab: Lab, tmp_pa
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["measure"], "name a finished log, or give --rig lab.toml -o places.mcap"),
-        (["measure", "-o", "a.mcap"], "name a finished log, or give --rig lab.toml"),
-        (["measure", "--rig", "RIG", "-o", "a.mcap", "--places"], "--places is only for a finished log"),
-        (["measure", "--rig", "RIG", "-o", "a.mcap", "--csv", "s.csv"], "--csv is only for a finished log"),
-        (["measure", "LOG", "-o", "a.mcap"], "--output is only for live cameras"),
-        (["measure", "LOG", "--force"], "--force is only for --csv or live cameras; leave it out"),
-        (
-            ["measure", "--rig", "RIG", "-o", "LOG", "--model-from", "LOG", "--force"],
-            "is the log with the model",
-        ),
-        (["measure", "--rig", "RIG", "-o", "a.mcap"], "has no calibration"),
+        (["measure", "LOG", "--force"], "--force is only for --csv; leave it out"),
+        ([*HEAD, "RIG", "-o", "LOG", "--model-from", "LOG", "--force"], "is the log with the model"),
+        ([*HEAD, "RIG", "-o", "a.mcap"], "has no calibration"),
     ],
 )
 def test_incompatible_options_are_refused(
@@ -268,7 +260,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
 def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
     log, one = tmp_path / "places.mcap", still_lab.tape[0]
     a, b = (f"{100 * d.distance_m:.2f}" for d in one.distances)
-    command = ["measure", "--terminal", "--rig", str(still_lab.rig), "-o", str(log)]
+    command = [*HEAD, str(still_lab.rig), "--terminal", "-o", str(log)]
     answers = [
         ("marker", "99\n"), ("not in the rig", f"{one.marker_id}\n"),
         ("distance to A", f"{a}\n"), ("distance to B", f"{b}\n"),

@@ -214,7 +214,7 @@ class DiskRoom:
         ways = [f"a lower rate_hz in lab.toml ({rate_hz / 2:g} halves it)", "a smaller width and height"]
         if any(state.format == "jpeg" for state in states.values()):
             ways.append("a lower JPEG quality or H.264, if the camera supports it")
-        ways.append("ipsys measure, which keeps only about 1 s of frames of each point")
+        ways.append("ipsys record --measure --points-only, which keeps about 1 s of frames of each point")
         return "to use less disk space: " + "; ".join(ways)
 
 

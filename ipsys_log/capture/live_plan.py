@@ -27,6 +27,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
+from ipsys_log.stages.fit import model_run
 
 
 class LivePlan(NamedTuple):
@@ -148,6 +149,11 @@ def check_start(
     ]
 
 
+def shown_run(request: Request) -> str:
+    """Return the run of the first model: streams, viewers and the dashboard show one run."""
+    return model_run(wanted_models(request)[0])
+
+
 def check_model(model: Model, cameras: Collection[str]) -> None:
     """Check that a model has some of the cameras.
 
@@ -212,12 +218,12 @@ def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
     for name, state in cameras.items():
         if state.format == MARKERS_FORMAT:
             raise IpsysError(
-                f"camera {name} sends only markers, but ipsys measure keeps frames: start its node without "
+                f"camera {name} sends only markers, but --points-only keeps frames: start its node without "
                 "--detect"
             )
         if state.format in ("h264", "h265"):
             raise IpsysError(
-                f"camera {name} sends {state.format}, but ipsys measure can keep short parts only of MJPEG: "
+                f"camera {name} sends {state.format}, but --points-only can keep short parts only of MJPEG: "
                 "set the camera to MJPEG, or record everything with 'ipsys record --measure'"
             )
 

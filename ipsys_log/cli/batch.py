@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ipsys_log.cli.batch_options import DERIVED, EXPORT, FOLDER, LOGS, OUTDATED, RUN, WORKERS
-from ipsys_log.cli.console import console, remarks, say
+from ipsys_log.cli.console import console, print_json, remarks, say
 from ipsys_log.cli.options import check_present
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.cli.stages import build_command, options_until, replay_options
@@ -35,8 +34,10 @@ _REPEAT = " After a failure or an interrupt, repeat the command: it computes onl
 _RATE_PERIOD_S = 1800.0
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the group with its commands: the single commands on many logs."""
+def add_commands(
+    app: typer.Typer, panel: str, wrap: Callable[[Callable[..., None]], Callable[..., None]]
+) -> None:
+    """Add the group with its commands, each wrapped: the single commands on many logs."""
     group = typer.Typer(
         help="Run a command on many logs, with many processes or the workers of a Dask scheduler.",
         no_args_is_help=True,
@@ -44,7 +45,7 @@ def add_commands(app: typer.Typer) -> None:
 
     def add(name: str, text: str, work: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> None:
         options = {"logs": LOGS, **options, **WORKERS}
-        group.command(name, help=text)(build_command(options, work))
+        group.command(name, help=text)(wrap(build_command(name, text, options, work)))
 
     text = "Run the missing stages of each log, and append their results to it." + _MORE + _REPEAT
     add("replay", text, _replay, {**_stage_options(None), "output": FOLDER, "outdated": OUTDATED})
@@ -60,7 +61,7 @@ def add_commands(app: typer.Typer) -> None:
         + _REPEAT
     )
     add("export", text, _export, EXPORT)
-    app.add_typer(group, name="batch")
+    app.add_typer(group, name="batch", rich_help_panel=panel)
 
 
 def _stage_options(until: str | None) -> dict[str, tuple[Any, Any]]:
@@ -140,7 +141,7 @@ def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of :func:`ipsys_log.api.replay`; rig and intrinsics are read once."""
-    from ipsys_log.cli.options import load_calibrations, split_calibration
+    from ipsys_log.cli.lab_inputs import load_calibrations, split_calibration
     from ipsys_log.errors import IpsysError
     from ipsys_log.models.table import check_name
     from ipsys_log.rig.file import load_rig
@@ -227,13 +228,13 @@ def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> N
     from ipsys_log.report.batch import batch_json, batch_table, failure_lines, write_results
 
     if as_json:
-        print(json.dumps(batch_json(results), indent=2))  # noqa: T201
+        print_json(batch_json(results))
     else:
         console.print(batch_table(results))
         for line in failure_lines(results):
             console.print(line, style="red")
     for trace in {result.trace for result in results if result.trace}:
-        remarks.print(trace)
+        say(trace)
     if table is not None:
         write_results(table, results)
         say(f"{table} written: a row for each log")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
 from ipsys_log.cli.options import AsJson, LogList, log_argument
 
-_Path = Optional[Path]  # noqa: UP045
-_Text = Optional[str]  # noqa: UP045
+_Path = Path | None
+_Text = str | None
 LOGS = (
     Annotated[
         LogList,
@@ -59,7 +59,7 @@ WORKERS: dict[str, tuple[Any, Any]] = {
     ),
     "workers": (
         Annotated[
-            Optional[int],  # noqa: UP045
+            int | None,
             typer.Option(
                 min=1, metavar="N", help="Worker processes on this machine. Default: one for each core."
             ),

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
-from ipsys_log.cli.open_cameras import SENT_NOW, Lab, prepare_lab, record_now
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.cli.open_cameras import SENT_NOW, prepare_lab, record_now
 from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import CalibrationResult, Failure
+    from ipsys_log.capture.lab import Lab
 
 Sources = Annotated[
-    Optional[list[Path]],  # noqa: UP045
+    list[Path] | None,
     file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE"),
 ]
 RigNow = Annotated[
@@ -58,7 +59,7 @@ Lens = Annotated[
     ),
 ]
 Cameras = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         metavar="CAMERA",
         help="Use only this camera of the log or rig; repeat it for several. With images or a video: the "
@@ -72,7 +73,7 @@ Output = Annotated[
     ),
 ]
 Formats = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--format",
         metavar="NAME",
@@ -90,10 +91,6 @@ Force = Annotated[
         "--board; RMS above 2 px; fewer than 5 images; images of two cameras.",
     ),
 ]
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(calibrate)
 
 
 @say_kept(lambda written: f"written: {', '.join(written)}" if written else "no file was written")
@@ -119,6 +116,12 @@ def calibrate(
     The command writes one file for each camera that saw the board, with the name of the camera. If a camera
     has no result, the files of the others are written, and the exit code is 1. Sharp, different images are
     selected automatically; two dozen with the board in all parts of the image are enough.
+
+    Examples
+
+        ipsys calibrate photos/red --board 6x4              # a folder: red.yaml
+        ipsys calibrate --rig lab.toml --board 6x4          # use the cameras now
+        ipsys calibrate red.mp4 --board charuco:4x5 --camera red --plot red.png
     """
     from ipsys_log import api
     from ipsys_log.calibration.board import parse_board
@@ -184,14 +187,14 @@ def _print_outcomes(
         raise IpsysError(failures[0].reason)
     if as_json:
         shown = [_json(outcome, targets) for outcome in outcomes]
-        print(json.dumps(shown, indent=2, allow_nan=False))  # noqa: T201
+        print_json(shown)
     for outcome in [] if as_json else outcomes:
         if not isinstance(outcome, Failure):
             _show(outcome, list(targets[outcome.camera].values()), for_rig)
     if plot is not None and len(failures) < len(outcomes) and not as_json:
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
     for failure in failures:
-        remarks.print(f"no file for {failure.camera}: {failure.reason}", style="yellow", markup=False)
+        warn(f"no file for {failure.camera}: {failure.reason}")
     if len(failures) == len(outcomes) or any(failure.expected for failure in failures):
         raise typer.Exit(1)
 
@@ -216,7 +219,7 @@ def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
             "its cameras now"
         )
     lab = prepare_lab(rig, only, None, with_lenses=False)
-    return lab._replace(cameras=[show_board(camera, board) for camera in lab.cameras])
+    return replace(lab, cameras=[show_board(camera, board) for camera in lab.cameras])
 
 
 @contextmanager
@@ -286,11 +289,11 @@ def _show(one: CalibrationResult, files: list[Path], for_rig: bool) -> None:
 
     console.print(calibration_table(one))
     for line in calibration_lines(one):
-        console.print(line, markup=False)
+        console.print(line)
     for note in one.notes:
-        remarks.print(f"{one.camera}: {note}", style="yellow", markup=False)
+        warn(f"{one.camera}: {note}")
     for path in files:
-        console.print(f"{path} written", markup=False)
+        console.print(f"{path} written")
     if for_rig:
-        console.print(f'put into lab.toml, under [[cameras]] with name = "{one.camera}":', markup=False)
-        console.print(f'calibration = "{files[0].as_posix()}"\n', markup=False)
+        console.print(f'put into lab.toml, under [[cameras]] with name = "{one.camera}":')
+        console.print(f'calibration = "{files[0].as_posix()}"\n')

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
-from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
-from ipsys_log.cli.nominal_intrinsics import (
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.cli.lab_inputs import (
     FieldOfView,
     Focal,
     SaveNominal,
+    cameras_of,
+    load_calibrations,
+    load_matching_rig,
     nominal_lenses,
     nominal_lenses_of_logs,
     write_nominal,
@@ -31,19 +32,17 @@ from ipsys_log.cli.options import (
     NoLogs,
     Port,
     RigFile,
-    cameras_of,
-    load_calibrations,
-    load_matching_rig,
     log_argument,
     log_option,
 )
+from ipsys_log.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Rig
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Consumer
+    from ipsys_log.sinks.sink import Sink
     from ipsys_log.survey.lab_calibration import LabCalibration
 
 # Largest goal that still means something, in mm.
@@ -55,7 +54,7 @@ Goal = Annotated[
 ]
 Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 Output = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
 ]
 Plot = Annotated[
@@ -74,7 +73,7 @@ Sources = Annotated[
     ),
 ]
 Seconds = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option(min=1.0, metavar="SECONDS", help="Without LOG: stop the cameras after this time."),
 ]
 Terminal = Annotated[
@@ -85,10 +84,6 @@ Terminal = Annotated[
     ),
 ]
 _LEAST_POINTS = 2
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command("calibrate-lab")(calibrate_lab)
 
 
 def calibrate_lab(
@@ -118,6 +113,12 @@ def calibrate_lab(
 
     Without LOG, the command records the cameras of --rig into -o until Ctrl-C. Meanwhile it prints the
     expected error, and takes the measured points on a page.
+
+    Examples
+
+        ipsys calibrate-lab drive.mcap cal.mcap --plot floor.png
+        ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
+        ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.messages.channels import MODEL, RIG
@@ -212,18 +213,18 @@ def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
 
         draw_lab(lab, plot)
     if as_json:
-        print(json.dumps(lab_json(lab), indent=2, allow_nan=False))  # noqa: T201
+        print_json(lab_json(lab))
     else:
         for line in lab_headline(lab):
-            console.print(line, markup=False, highlight=False)
+            console.print(line)
         console.print()
         console.print(lab_table(lab))
         for line in lab_advice(lab):
-            console.print(line, markup=False, highlight=False)
+            console.print(line)
     for note in lab.notes:
-        remarks.print(note, style="yellow", markup=False)
+        warn(note)
     if plot is not None:
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
 
 
 def _record_drive(
@@ -262,18 +263,14 @@ def _record_drive(
     lab.lenses.update(nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
     check_target(output, force, lab.files)
     request = Request(corners=corners)
-    ready_to_measure(lab, request, None)
-    if page is not None:
-        from ipsys_log.web.server import check_port_free
-
-        check_port_free(*page)
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
-        scene = live_scene(settings, cameras, None)
+    ready_to_measure(lab, request, None, page)
+    with open_cameras(lab, output, seconds) as (opened, status):
+        scene = live_scene(opened, None)
         calibrating = LiveCalibration(lab.rig, lab.lenses, goal_m, say)
-        consumers: list[Consumer] = [status, scene, calibrating]
+        sinks: list[Sink] = [status, scene, calibrating]
         try:
-            with nullcontext() if page is None else serve_live_page(scene, *page):
-                pipeline.live(cameras, settings, output, request, "camera-frame", consumers, force)
+            with nullcontext() if page is None else serve_live_measuring(scene, *page):
+                pipeline.live(opened.cameras, opened.settings, output, request, "camera-frame", sinks, force)
         finally:
             calibrating.close()
     if page is None or (len(scene.history()) < _LEAST_POINTS and sys.stdin.isatty()):
@@ -286,9 +283,8 @@ def _ask_points(output: Path, request: Request) -> None:
     from ipsys_log.survey.from_log import open_finished_log
 
     with progress_bar() as progress, open_finished_log(output, request, progress, say) as scene:
-        remarks.print(
+        say(
             f"measure {_LEAST_POINTS} to 4 of the points at which a marker was stationary; s skips a point, "
             "q ends",
-            markup=False,
         )
         ask_places(scene)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from collections import Counter
@@ -66,7 +67,7 @@ class _Remarks(logging.Handler):
         text = record.getMessage()
         if text not in self._printed:
             self._printed.add(text)
-            remarks.print(text, style="yellow", markup=False)
+            remarks.print(text, style="yellow")
 
 
 @contextmanager
@@ -163,7 +164,17 @@ def _causal_stages() -> set[str]:
 
 def say(text: str) -> None:
     """Print a remark unchanged, separate from the results."""
-    remarks.print(text, markup=False)
+    remarks.print(text)
+
+
+def warn(text: str) -> None:
+    """Print a remark that the user should not miss."""
+    remarks.print(text, style="yellow")
+
+
+def print_json(value: Any) -> None:
+    """Print a result for programs."""
+    print(json.dumps(value, indent=2, allow_nan=False))  # noqa: T201
 
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:

@@ -1,95 +1,143 @@
-"""Commands that read all messages of a log: ``ipsys check``, ``du`` and ``cat``."""
+"""Contents of a log: ``ipsys info`` and ``ipsys cat``."""
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar
-from ipsys_log.cli.options import AsJson, LogList, ReadLogs, log_argument
+from ipsys_log.cli.console import console, print_json, progress_bar, say
+from ipsys_log.cli.options import AsJson, ReadLogs, figure_option
 from ipsys_log.cli.signals import writes_nothing
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.location import LogLocation
 
-Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
-_Seconds = Optional[float]  # noqa: UP045
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(check)
-    app.command()(du)
-    app.command()(cat)
+_Seconds = float | None
 
 
 @writes_nothing
-def check(
-    logs: Logs,
-    details: Annotated[
-        bool, typer.Option("--details", help="Also print notes: rates, unknown channels, current runs.")
+def info(
+    logs: ReadLogs,
+    runs: Annotated[
+        bool,
+        typer.Option("--runs", help="Show the runs with their inputs, parameters, versions and states."),
     ] = False,
+    sizes: Annotated[
+        bool, typer.Option("--sizes", help="Show the size of each channel of each log, the largest first.")
+    ] = False,
+    latency: Annotated[
+        bool,
+        typer.Option(
+            "--latency",
+            help="Show the latency of each step of a live run, from the frame to the position.",
+        ),
+    ] = False,
+    plot: Annotated[Path | None, figure_option("the processing steps of --latency")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Read logs completely and check them: file, channels, times, rates, references and runs.
+    """Show cameras, channels, counts, rates, gaps and runs of a log.
 
-    The exit code is 0 if all logs are sound, 1 if they are readable with remarks, and 2 if one is broken.
-    It is 3 if none is broken, but one could not be read, such as a URL without a connection. Runs may have
-    their inputs in another of the given logs."""
-    from ipsys_log.report.log_texts import check_json, check_lines
-    from ipsys_log.soundness.check import check_logs
-    from ipsys_log.soundness.finding import READABLE, SOUND, UNREAD, LogCheck
+    A run is current, out of date, not repeatable or unfinished. If it is out of date, the reason follows, and
+    ipsys replay makes a new run. Inputs of a run that is not repeatable are not in the log. The writer of an
+    unfinished run was stopped.
 
-    with progress_bar(()) as progress:
-        checks = check_logs(logs, progress)
+    In --sizes, the payload is counted before compression. A compressed chunk counts in proportion to the
+    bytes of its messages.
+
+    Examples
+
+        ipsys info monday.mcap
+        ipsys info monday.mcap --runs --sizes
+        ipsys info monday.mcap --latency --plot latency.pdf
+        ipsys info s3://lab/monday.mcap          # at a URL: docs/scale.md
+    """
+    from ipsys_log.errors import IpsysError
+
+    if plot is not None and not latency:
+        raise IpsysError(f"--plot {plot}: has no effect without --latency; add --latency")
+    parts: dict[str, Callable[[], tuple[Any, list[RenderableType]]]] = {}
+    if runs:
+        parts["runs"] = lambda: _runs(logs)
+    if sizes:
+        parts["sizes"] = lambda: _sizes(logs)
+    if latency:
+        parts["latency"] = lambda: _latency(logs, plot)
+    shown = {name: show() for name, show in (parts or {"": lambda: _contents(logs)}).items()}
     if as_json:
-        print(json.dumps(check_json(checks), indent=2))  # noqa: T201
-    else:
-        for one in checks:
-            for line in check_lines(one, details):
-                console.print(line)
-    code = {SOUND: 0, READABLE: 1, UNREAD: 3}.get(LogCheck.worst(checks), 2)
-    if code:
-        raise typer.Exit(code)
-
-
-@writes_nothing
-def du(logs: Logs, as_json: AsJson = False) -> None:
-    """Show the size of each channel of a log, the largest first.
-
-    The payload is counted before compression. A compressed chunk counts in proportion to the bytes of its
-    messages."""
-    from ipsys_log.report.log_texts import sizes_table
-
-    results = [_sizes(path) for path in logs]
-    if as_json:
-        print(json.dumps(results, indent=2))  # noqa: T201
+        results = {name: plain for name, (plain, _) in shown.items()}
+        print_json(results if len(results) > 1 else next(iter(results.values())))
         return
-    for number, result in enumerate(results):
+    for number, table in enumerate(table for _, tables in shown.values() for table in tables):
         if number:
             console.print()
-        console.print(sizes_table(result))
+        console.print(table)
 
 
-def _sizes(path: LogLocation) -> dict[str, Any]:
+def _contents(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
+    """Return the contents of a session as plain data and as tables."""
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.report.contents import contents_json, contents_tables
+
+    with Session(logs) as session:
+        contents = contents_json(session)
+    return contents, [*contents_tables(contents)]
+
+
+def _runs(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.report.contents import runs_table, states_json
+
+    with Session(logs) as session:
+        states = states_json(session)
+    return states, [runs_table(states)]
+
+
+def _sizes(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
     from ipsys_log.log.reader import LogReader
-    from ipsys_log.report.log_texts import sizes_json
+    from ipsys_log.report.log_texts import sizes_json, sizes_table
 
-    with LogReader(path) as reader, progress_bar(()) as progress:
-        sizes = reader.sizes(lambda done: progress("chunks", done, reader.chunk_count))
-        return sizes_json(str(path), reader.size, sizes)
+    def read(path: LogLocation) -> dict[str, Any]:
+        with LogReader(path) as reader, progress_bar(()) as progress:
+            sizes = reader.sizes(lambda done: progress("chunks", done, reader.chunk_count))
+            return sizes_json(str(path), reader.size, sizes)
+
+    results = [read(path) for path in logs]
+    return results, [sizes_table(result) for result in results]
+
+
+def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[RenderableType]]:
+    from dataclasses import asdict
+
+    from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
+    from ipsys_log.report.cameras import latency_table
+    from ipsys_log.report.files import check_figure_file
+
+    if plot is not None:
+        check_figure_file(plot, "--plot", logs)
+    times_s = step_times_s(recorded_latencies(logs))
+    steps = latency_percentiles(times_s)
+    if plot is not None:
+        from ipsys_log.report.latency_figure import draw_latency
+
+        draw_latency(times_s, plot)
+        say(f"{plot} drawn")
+    return {step: asdict(times) for step, times in steps.items()}, [latency_table(steps)]
 
 
 @writes_nothing
 def cat(
     logs: ReadLogs,
     topics: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--topics", metavar="TOPIC,...", help="Print only these topics, separated by commas."),
     ] = None,
     start_secs: Annotated[
@@ -112,7 +160,14 @@ def cat(
 ) -> None:
     """Print the messages of a log in log order, one line each: time (UTC), topic, schema and short content.
 
-    With --json, each line is a JSON object with all values; images are given by their size."""
+    With --json, each line is a JSON object with all values; images are given by their size.
+
+    Examples
+
+        ipsys cat monday.mcap --topics /events,/latency
+        ipsys cat monday.mcap --start-offset 10 --end-offset 12 | less
+        ipsys cat monday.mcap --topics /runs/poly/tracks --json > tracks.ndjson
+    """
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.log_texts import message_json, message_line
 

@@ -132,7 +132,7 @@ def _ask(question: str, field: str, usual: str, read: Read) -> str:
 
 def _complain(texts: Sequence[str], style: str = "red") -> None:
     for text in texts:
-        console.print(text, style=style, markup=False)
+        console.print(text, style=style)
 
 
 def ask_places(scene: MeasuringScene) -> None:
@@ -143,7 +143,7 @@ def ask_places(scene: MeasuringScene) -> None:
     check_references(scene.rig)
     with suppress(ImportError):  # arrow keys, if the system has readline
         import readline  # noqa: F401
-    console.print(HELP, style="dim", markup=False)
+    console.print(HELP, style="dim")
     _ask_baseline(scene)
     active = active_measurements(scene.history())
     saved: list[str] = []
@@ -233,10 +233,10 @@ def _measure(
         try:
             scene.add([now.measurement])
         except IpsysError as error:
-            console.print(str(error), style="red", markup=False)
+            console.print(str(error), style="red")
             continue
         saved.append(now.id)
-        console.print(f"{now.id} is in the log", style="green", markup=False)
+        console.print(f"{now.id} is in the log", style="green")
         return None
 
 
@@ -256,7 +256,7 @@ def _ask_point(scene: MeasuringScene, interval: int | None, before: TypedEntry |
     console.print()
     if interval is None:
         visible = visible_markers(scene.views(None), scene.rig)
-        console.print(f"visible markers: {', '.join(map(str, visible)) or 'none'}", markup=False)
+        console.print(f"visible markers: {', '.join(map(str, visible)) or 'none'}")
         usual = before.marker if before else str(visible[0]) if len(visible) == 1 else ""
         marker = ask_marker(scene.rig, usual)
     else:
@@ -264,9 +264,7 @@ def _ask_point(scene: MeasuringScene, interval: int | None, before: TypedEntry |
         marker = str(stationary.marker_id)
         console.print(f"Stationary interval {interval + 1} of {len(scene.intervals)}", style="bold")
     observations = observe_marker(scene.views(interval), int(marker))
-    console.print(
-        observations.text, style="green" if observations.state == "still" else "yellow", markup=False
-    )
+    console.print(observations.text, style="green" if observations.state == "still" else "yellow")
     return ask_numbers(scene.rig, marker, before)
 
 
@@ -274,20 +272,20 @@ def _show(checked: EntryCheck) -> None:
     from ipsys_log.units import CM_PER_M
 
     for fault in checked.faults:
-        console.print(fault.text, style="red", markup=False)
+        console.print(fault.text, style="red")
     if checked.point_m is not None:
         x_m, y_m, z_m = checked.point_m.tolist()
         known = "" if checked.sigma_m is None else f" +- {checked.sigma_m * CM_PER_M:.1f} cm"
         where = "" if checked.on_floor is None else ", on the floor area" if checked.on_floor else ""
         x_cm, y_cm, z_cm = x_m * CM_PER_M, y_m * CM_PER_M, z_m * CM_PER_M
-        console.print(f"x {x_cm:.1f} cm, y {y_cm:.1f} cm{known}, height {z_cm:.1f} cm{where}", markup=False)
+        console.print(f"x {x_cm:.1f} cm, y {y_cm:.1f} cm{known}, height {z_cm:.1f} cm{where}")
     for name, off_m in checked.residuals_m:
-        console.print(f"  residual of the distance to {name}: {off_m * CM_PER_M:+.1f} cm", markup=False)
+        console.print(f"  residual of the distance to {name}: {off_m * CM_PER_M:+.1f} cm")
     for prediction in checked.predictions:
         off_cm = prediction.off_m * CM_PER_M
-        console.print(f"  distance to the prediction of {prediction.camera}: {off_cm:.1f} cm", markup=False)
+        console.print(f"  distance to the prediction of {prediction.camera}: {off_cm:.1f} cm")
     for text in checked.warnings:
-        console.print(text, style="yellow", markup=False)
+        console.print(text, style="yellow")
 
 
 def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
@@ -311,9 +309,9 @@ def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
     try:
         scene.add([withdrawal_of(scene.history(), last.id)])
     except IpsysError as error:
-        console.print(str(error), style="red", markup=False)
+        console.print(str(error), style="red")
         return None
-    console.print(f"{last.id} is withdrawn", style="green", markup=False)
+    console.print(f"{last.id} is withdrawn", style="green")
     return last
 
 

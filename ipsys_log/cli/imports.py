@@ -2,64 +2,59 @@
 
 from __future__ import annotations
 
-import json
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.local_files import read_files
-from ipsys_log.cli.options import AsJson, Calibrations, NewLog, RigFile, appended_log_option, log_option
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.cli.lab_inputs import load_calibrations, read_lab, say_remark, say_unusual
+from ipsys_log.cli.options import AsJson, Calibrations, RigFile, appended_log_option, log_option, read_files
 from ipsys_log.plain_text import shell_words
 
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from ipsys_log.exchange.import_truth import TruthOptions
-    from ipsys_log.messages import CameraCalibration, Rig
-
 _MCAP_MAGIC = b"\x89MCAP"
+_LONGEST_HEADER = 10_000  # bytes
+_START = "2020-01-01T00:00:00Z"
+
+Sources = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="SOURCE",
+        help="A folder with a sub-folder of images per camera; a video of each camera (red=red.mp4); a bag "
+        "of ROS 1 (.bag) or ROS 2 (a folder or a .db3 file); a table (.csv); trajectories (.tum); or the "
+        "folder of the paper's data.",
+    ),
+]
+Kind = Annotated[
+    str | None,
+    typer.Option(
+        "--as",
+        metavar="KIND",
+        help="Kind of the source, if its name and content do not show it: images, videos, ros, truth, "
+        "detections, pairs or imsel (the data of the paper).",
+    ),
+]
 
 
-def add_commands(app: typer.Typer) -> None:
-    group = typer.Typer(help="Convert other recordings into a log.", no_args_is_help=True)
-    group.command("imsel")(imsel)
-    group.command("images")(images)
-    group.command("videos")(videos)
-    group.command("ros")(ros)
-    group.command("truth")(truth)
-    group.command("detections")(detections)
-    group.command("pairs")(pairs)
-    app.add_typer(group, name="import")
-
-
-def imsel(
-    folder: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="Folder of the paper's data, or a clone of its repository."),
-    ],
-    output: NewLog,
-) -> None:
-    """Import the data of the paper (Ou et al., Robotica 2023): .mat files and camera YAML files."""
-    _refuse_log(folder)
-    from ipsys_log.exchange.imsel import read_imsel
-    from ipsys_log.runs.output import write_log
-
-    counts = write_log(output, read_imsel(folder))
-    console.print(f"{output} written: {sum(counts.values())} messages on {len(counts)} channels")
-
-
-def images(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder with one sub-folder of images per camera.")
-    ],
-    output: NewLog,
+def import_(
+    sources: Sources,
+    output: Annotated[
+        Path | None, log_option(help="The log to write. Without --into, tables need --rig, too.")
+    ] = None,
+    into: Annotated[
+        Path | None,
+        appended_log_option(
+            help="For truth: the log of the same drive. For detections: a log without images. It gets a run."
+        ),
+    ] = None,
+    kind: Kind = None,
     rig: RigFile = None,
     calibration: Calibrations = None,
     rate: Annotated[
-        float, typer.Option(metavar="HZ", help="Images per second, if they have no times.")
-    ] = 1.0,
+        float | None, typer.Option(metavar="HZ", help="Images per second, if they have no times. Default: 1.")
+    ] = None,
     times: Annotated[
         str | None,
         typer.Option(
@@ -69,121 +64,44 @@ def images(
             "2024-05-31T12:30:00.25Z.",
         ),
     ] = None,
-) -> None:
-    """Import a folder of images. Without --times, images with the same number have the same time."""
-    from ipsys_log.exchange.calibration_files import announce_assumed
-    from ipsys_log.exchange.image_folders import find_images, find_times, read_images
-    from ipsys_log.runs.output import write_log
-
-    _refuse_log(folder)
-    pictures = find_images(folder)
-    taken_ns = find_times(pictures, times) if times else None
-    lab, lenses, assumed = _settings(rig, calibration, pictures)
-    write_log(output, announce_assumed(read_images(pictures, lab, lenses, rate, taken_ns), assumed))
-    if not times and len({len(paths) for paths in pictures.values()}) > 1:
-        remarks.print(
-            "the cameras have different numbers of images: images with the same number get the same time"
-        )
-    counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
-    console.print(f"{output} written: images: {counts}")
-
-
-def videos(
-    files: Annotated[
-        list[str], typer.Argument(metavar="CAMERA=FILE", help="A video for each camera: red=red.mp4.")
-    ],
-    output: NewLog,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
     start: Annotated[
-        str, typer.Option(metavar="TIME", help="Start of all videos: s since 1970, or ISO 8601.")
-    ] = "2020-01-01T00:00:00Z",
-) -> None:
-    """Import videos that start at the same time. The log gets MJPEG, H.264 and H.265 unchanged."""
-    from ipsys_log.capture.video_files import read_videos
-    from ipsys_log.exchange.calibration_files import announce_assumed
-    from ipsys_log.exchange.image_folders import parse_start
-    from ipsys_log.runs.output import write_log
-
-    for option in files:
-        _refuse_log(Path(option.rpartition("=")[2]))
-    paths = _by_camera(files)
-    lab, lenses, assumed = _settings(rig, calibration, paths)
-    messages = read_videos(paths, lab, lenses, parse_start(start), remarks.print)
-    counts = write_log(output, announce_assumed(messages, assumed))
-    text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
-    console.print(f"{output} written: frames: {text}")
-
-
-def ros(
-    bag: Annotated[
-        Path,
-        typer.Argument(metavar="BAG", help="A bag of ROS 1 (.bag) or ROS 2 (a folder or a .db3 file)."),
-    ],
-    output: NewLog,
+        str | None,
+        typer.Option(metavar="TIME", help="Start of all videos: s since 1970, or ISO 8601. Default: 2020."),
+    ] = None,
     camera: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             metavar="NAME=TOPIC",
-            help="Import the images of this topic as the camera NAME; repeat it for each camera. "
+            help="Import the images of this ROS topic as the camera NAME; repeat it for each camera. "
             "Default: all topics with images.",
         ),
     ] = None,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-) -> None:
-    """Import the images and intrinsics of a ROS bag. The times are the stamps of the images.
-
-    Images are CompressedImage, or Image with mono8, bgr8, rgb8 or an alpha channel; their bytes stay as they
-    are. The other commands read MCAP bags of ROS 2 without an import."""
-    from ipsys_log.extras import check_installed
-    from ipsys_log.runs.output import write_log
-
-    check_installed("import ros needs", "rosbags")
-    from ipsys_log.exchange.calibration_files import announce_assumed
-    from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
-
-    _refuse_log(bag)
-    cameras = find_bag_cameras(bag, _topic_of(camera or []))
-    lab, lenses, assumed = _settings(rig, calibration, cameras.images)
-    with progress_bar(("bag",)) as progress:
-        messages = read_bag(bag, cameras, lab, lenses, progress)
-        counts = write_log(output, announce_assumed(messages, assumed))
-    text = ", ".join(f"{counts.get(f'/cameras/{name}/image', 0)} of {name}" for name in cameras.images)
-    console.print(f"{output} written: images: {text}")
-
-
-def truth(
-    files: Annotated[
-        list[Path],
-        typer.Argument(metavar="FILE", help="A CSV table (.csv), or a TUM trajectory (.tum) of one robot."),
-    ],
-    into: Annotated[
-        Path | None, appended_log_option(help="The log of the same drive; it gets the ground truth.")
-    ] = None,
-    output: Annotated[
-        Path | None, log_option(help="A new log for the ground truth. Without --into, it needs --rig.")
-    ] = None,
     robot: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
-            metavar="NAME", help="The robot of a file that names none; repeat it in the order of the files."
+            metavar="NAME",
+            help="The robot of a trajectory that names none; repeat it in the order of the files.",
         ),
     ] = None,
     run: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Compare with the tracks of this run. Default: the newest."),
+        typer.Option(
+            metavar="NAME",
+            help="For truth: compare with the tracks of this run (default: the newest). For detections: name "
+            "of the new run.",
+        ),
     ] = None,
     align: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="2d|3d|none",
-            help="Estimate rotation and translation on the floor (2d), in space (3d), or none.",
+            help="For truth: estimate rotation and translation on the floor (2d, the default), in space "
+            "(3d), or none.",
         ),
-    ] = "2d",
+    ] = None,
     time_offset: Annotated[
         str | None,
-        typer.Option(metavar="S", help="Add this to the times of the files, instead of an estimate."),
+        typer.Option(metavar="S", help="For truth: add this to the times, instead of an estimate."),
     ] = None,
     time_unit: Annotated[
         str | None, typer.Option(metavar="s|ns", help="Unit of a time column whose header has none.")
@@ -191,147 +109,240 @@ def truth(
     length_unit: Annotated[
         str | None, typer.Option(metavar="m|mm", help="Unit of x, y and z whose header has none.")
     ] = None,
-    rig: RigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import the ground truth of another system, such as Vicon or OptiTrack, for scores of the tracks.
+    """Import recordings, tables or ground truth of other programs into a log.
 
-    The command estimates the time offset and the rigid alignment to the tracks of a run, without a scale.
-    An alignment hides constant errors of the tracks."""
-    from ipsys_log.exchange.import_truth import import_truth
+    Images, videos and ROS bags become a recording. Their bytes stay as they are. Without --times, images with
+    the same number have the same time. Videos start at the same time. The other commands read MCAP bags of
+    ROS 2 without an import.
+
+    truth: tracks of another system, such as Vicon or OptiTrack, for scores. The command estimates the time
+    offset and the rigid alignment to the tracks of a run. An alignment hides constant errors of the tracks.
+
+    detections: markers of another program, for all stages after the detection. The columns are those of
+    ipsys export --table markers.
+
+    pairs: calibration points with their camera points, for fit, evaluate and plan. The columns are those of
+    ipsys export --table pairs.
+
+    Examples
+
+        ipsys import photos -o lab.mcap --rig lab.toml      # images
+        ipsys import red=red.mp4 white=white.mp4 -o lab.mcap
+        ipsys import lab.bag -o lab.mcap                    # a ROS bag
+        ipsys import vicon.csv --into monday.mcap           # ground truth
+    """
+    from ipsys_log.errors import IpsysError
+
+    for source in sources:
+        _refuse_log(Path(str(source).rpartition("=")[2]))
+    kind = kind or _find_kind(sources[0])
+    if kind not in KINDS:
+        raise IpsysError(f"--as {kind}: is not a kind of source; use one of {', '.join(KINDS)}")
+    options: dict[str, Any] = {
+        "into": into, "rig": rig, "calibration": calibration, "rate": rate, "times": times, "start": start,
+        "camera": camera, "robot": robot, "run": run, "align": align, "time_offset": time_offset,
+        "time_unit": time_unit, "length_unit": length_unit, "as_json": as_json,
+    }  # fmt: skip
+    _import_as(kind, sources, output, options)
+
+
+def _import_as(kind: str, sources: list[Path], output: Path | None, options: dict[str, Any]) -> None:
+    """Call the importer of a kind with its options; refuse options that other kinds have."""
+    from ipsys_log.errors import IpsysError
+
+    importer = KINDS[kind]
+    read = {*inspect.signature(importer).parameters}
+    for name, value in options.items():
+        if value and name not in read:
+            option = {"as_json": "json"}.get(name, name.replace("_", "-"))
+            raise IpsysError(f"--{option}: has no effect for {kind}; leave it out")
+    if "sources" not in read and len(sources) > 1:
+        raise IpsysError(f"{sources[1]}: only one source of the kind {kind} can be imported at a time")
+    if "into" not in read and output is None:
+        raise IpsysError("-o is missing; give the name of the new log")
+    given = {"source": sources[0], "sources": sources, "output": output, **options}
+    importer(**{name: value for name, value in given.items() if name in read})
+
+
+def _find_kind(source: Path) -> str:
+    """Return the kind of a source by its name, its files, or the header of its table."""
+    from ipsys_log.errors import IpsysError
+
+    suffix = source.suffix.lower()
+    if not source.exists():
+        if "=" in str(source):
+            return "videos"
+        raise IpsysError(f"{source}: does not exist; name a file or a folder, or camera=file.mp4")
+    if source.is_dir():
+        if (source / "metadata.yaml").exists() or any(source.glob("*.db3")):
+            return "ros"
+        return "imsel" if any(source.rglob("testing.mat")) else "images"
+    if suffix in (".bag", ".db3"):
+        return "ros"
+    if suffix == ".csv":
+        with source.open("rb") as file:
+            header = file.readline(_LONGEST_HEADER)
+        return "pairs" if b"xc_m" in header else "detections" if b"x0_px" in header else "truth"
+    if suffix == ".tum":
+        return "truth"
+    raise IpsysError(
+        f"{source}: its kind is not known; name it with --as, or a video as camera={source.name}"
+    )
+
+
+def _import_imsel(source: Path, output: Path) -> None:
+    from ipsys_log.exchange.imsel import read_imsel
+    from ipsys_log.runs.output import write_log
+
+    counts = write_log(output, read_imsel(source))
+    console.print(f"{output} written: {sum(counts.values())} messages on {len(counts)} channels")
+
+
+def _import_images(
+    source: Path,
+    output: Path,
+    rig: Path | None,
+    calibration: list[str] | None,
+    rate: float | None,
+    times: str | None,
+) -> None:
+    from ipsys_log.exchange.calibration_files import announce_assumed
+    from ipsys_log.exchange.image_folders import find_images, find_times, read_images
+    from ipsys_log.runs.output import write_log
+
+    pictures = find_images(source)
+    taken_ns = find_times(pictures, times) if times else None
+    lab, lenses, assumed = read_lab(rig, calibration, pictures)
+    rate_hz = 1.0 if rate is None else rate
+    write_log(output, announce_assumed(read_images(pictures, lab, lenses, rate_hz, taken_ns), assumed))
+    if not times and len({len(paths) for paths in pictures.values()}) > 1:
+        say("the cameras have different numbers of images: images with the same number get the same time")
+    counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
+    console.print(f"{output} written: images: {counts}")
+
+
+def _import_videos(
+    sources: list[Path], output: Path, rig: Path | None, calibration: list[str] | None, start: str | None
+) -> None:
+    from ipsys_log.capture.video_files import read_videos
+    from ipsys_log.exchange.calibration_files import announce_assumed
+    from ipsys_log.exchange.image_folders import parse_start
+    from ipsys_log.runs.output import write_log
+
+    paths = _by_camera([str(source) for source in sources])
+    lab, lenses, assumed = read_lab(rig, calibration, paths)
+    messages = read_videos(paths, lab, lenses, parse_start(start or _START), say)
+    counts = write_log(output, announce_assumed(messages, assumed))
+    text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
+    console.print(f"{output} written: frames: {text}")
+
+
+def _import_ros(
+    source: Path, output: Path, camera: list[str] | None, rig: Path | None, calibration: list[str] | None
+) -> None:
+    from ipsys_log.extras import check_installed
+    from ipsys_log.runs.output import write_log
+
+    check_installed("import of ROS bags needs", "rosbags")
+    from ipsys_log.exchange.calibration_files import announce_assumed
+    from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
+
+    cameras = find_bag_cameras(source, _split_names(camera or [], "topic", "--camera red=/red/image_raw"))
+    lab, lenses, assumed = read_lab(rig, calibration, cameras.images)
+    with progress_bar(("bag",)) as progress:
+        messages = read_bag(source, cameras, lab, lenses, progress)
+        counts = write_log(output, announce_assumed(messages, assumed))
+    text = ", ".join(f"{counts.get(f'/cameras/{name}/image', 0)} of {name}" for name in cameras.images)
+    console.print(f"{output} written: images: {text}")
+
+
+def _import_truth(
+    sources: list[Path],
+    output: Path | None,
+    into: Path | None,
+    robot: list[str] | None,
+    run: str | None,
+    align: str | None,
+    time_offset: str | None,
+    time_unit: str | None,
+    length_unit: str | None,
+    rig: Path | None,
+    as_json: bool,
+) -> None:
+    from ipsys_log.exchange.ground_truth_files import TruthUnits, parse_offset
+    from ipsys_log.exchange.import_truth import TruthOptions, import_truth
     from ipsys_log.report.truth_import import truth_json, truth_lines
+    from ipsys_log.rig.file import load_rig
 
-    for file in files:
-        _refuse_log(file)
-    options = _truth_options(robot, run, align, time_offset, time_unit, length_unit, rig)
-    imported = import_truth(files, into, output, options)
+    options = TruthOptions(
+        tuple(robot or ()),
+        TruthUnits(time_unit, length_unit),
+        align or "2d",
+        None if time_offset is None else parse_offset(time_offset),
+        run,
+        load_rig(rig) if rig else None,
+    )
+    imported = import_truth(sources, into, output, options)
     if as_json:
-        print(json.dumps(truth_json(imported), indent=2, allow_nan=False))  # noqa: T201
+        print_json(truth_json(imported))
     else:
         for line in truth_lines(imported):
             console.print(line)
-    remarks.print(f"results are in {imported.path}", markup=False)
+    say(f"results are in {imported.path}")
 
 
-def detections(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A CSV table of markers, one row for each marker.")
-    ],
-    into: Annotated[
-        Path | None, appended_log_option(help="A log without images, which gets a new run.")
-    ] = None,
-    output: Annotated[
-        Path | None, log_option(help="A new log for the markers. Without --into, it needs --rig.")
-    ] = None,
-    run: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Name of the new run. Default: imported.")
-    ] = None,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
+def _import_detections(
+    source: Path,
+    output: Path | None,
+    into: Path | None,
+    run: str | None,
+    rig: Path | None,
+    calibration: list[str] | None,
 ) -> None:
-    """Import the detected markers of another program, for all stages after the detection.
-
-    The columns are time, camera, marker_id, and x0_px, y0_px to x3_px, y3_px of the corners, clockwise from
-    the top left of the marker. ipsys export --table markers writes such a table.
-    """
-    from ipsys_log.cli.options import load_calibrations, say_remark, say_unusual
     from ipsys_log.exchange.detection_tables import DetectionOptions, import_detections
     from ipsys_log.rig.file import load_rig
 
-    _refuse_log(file)
     lab = load_rig(rig) if rig else None
     cameras = [camera.name for camera in lab.cameras] if lab else []
     assumed: dict[str, str] = {}
     lenses = load_calibrations(calibration, lambda: cameras, assumed.__setitem__)
-    imported = import_detections(file, into, output, DetectionOptions(lab, lenses, run, rig, assumed))
+    imported = import_detections(source, into, output, DetectionOptions(lab, lenses, run, rig, assumed))
     for name in sorted(imported.assumed.keys() - assumed.keys()):
         say_remark(name, imported.assumed[name])
     say_unusual(imported.lenses)
     text = ", ".join(f"{count} of {camera}" for camera, count in imported.markers.items())
     console.print(f"run {imported.run}: markers: {text}")
     for line in imported.remarks:
-        remarks.print(line, style="yellow", markup=False)
-    remarks.print(f"results are in {imported.path}", markup=False)
+        warn(line)
+    say(f"results are in {imported.path}")
 
 
-def pairs(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE", help="A CSV table, one row for each camera that saw a calibration point."
-        ),
-    ],
-    output: NewLog,
-    rig: Annotated[Path, typer.Option("--rig", metavar="FILE", help="The rig file (lab.toml) of the lab.")],
-) -> None:
-    """Import calibration points with their camera points, for fit, evaluate and plan.
-
-    The columns are id, camera, xc_m, yc_m, zc_m in camera coordinates, and xw_m, yw_m, zw_m in the lab.
-    Optional columns are marker_id, splits and calibration_point. ipsys export --table pairs writes such a
-    table.
-    """
+def _import_pairs(source: Path, output: Path, rig: Path | None) -> None:
+    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.pair_tables import pair_messages, read_pairs
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.output import write_log
 
-    _refuse_log(file)
+    if rig is None:
+        raise IpsysError("--rig is missing; name the rig file (lab.toml) of the lab")
     lab = load_rig(rig)
-    table = read_pairs(file, lab)
-    write_log(output, pair_messages(table, file, lab))
+    table = read_pairs(source, lab)
+    write_log(output, pair_messages(table, source, lab))
     text = ", ".join(f"{count} of {camera}" for camera, count in table.cameras.items())
     console.print(f"{output} written: calibration points: {len(table.points)} (seen: {text})")
 
 
-def _truth_options(
-    robot: list[str] | None,
-    run: str | None,
-    align: str,
-    time_offset: str | None,
-    time_unit: str | None,
-    length_unit: str | None,
-    rig: Path | None,
-) -> TruthOptions:
-    from ipsys_log.exchange.ground_truth_files import TruthUnits, parse_offset
-    from ipsys_log.exchange.import_truth import TruthOptions
-    from ipsys_log.rig.file import load_rig
-
-    return TruthOptions(
-        tuple(robot or ()),
-        TruthUnits(time_unit, length_unit),
-        align,
-        None if time_offset is None else parse_offset(time_offset),
-        run,
-        load_rig(rig) if rig else None,
-    )
-
-
-def _settings(
-    rig: Path | None, calibration: list[str] | None, cameras: Collection[str]
-) -> tuple[Rig | None, dict[str, CameraCalibration], dict[str, str]]:
-    """Return the rig of an import, the intrinsics of its cameras, and texts on their assumed lens models.
-
-    The intrinsics are the given ones, else those of the files that the rig names, as far as they exist.
-    """
-    from ipsys_log.cli.options import load_calibrations, load_matching_rig, say_remark, say_unusual
-    from ipsys_log.exchange.lab_files import load_lenses
-
-    assumed: dict[str, str] = {}
-    lenses = load_calibrations(calibration, lambda: cameras, assumed.__setitem__)
-    lab = load_matching_rig(rig, lambda: cameras)
-    if rig is None or lab is None:
-        return lab, lenses, assumed
-    named = [camera for camera in lab.cameras if camera.name in cameras and camera.name not in lenses]
-    for camera in named:
-        if camera.calibration is not None and (rig.parent / camera.calibration).exists():
-            from_rig = load_lenses(rig, [camera], {}, report=assumed.__setitem__)
-            say_unusual(from_rig)
-            lenses |= from_rig
-        elif camera.calibration is not None:
-            text = f"{camera.calibration} of the rig does not exist; 'ipsys calibrate' writes it"
-            say_remark(camera.name, text)
-        if camera.name in assumed:
-            say_remark(camera.name, assumed[camera.name])
-    return lab, lenses, assumed
+KINDS: dict[str, Callable[..., None]] = {
+    "images": _import_images,
+    "videos": _import_videos,
+    "ros": _import_ros,
+    "truth": _import_truth,
+    "detections": _import_detections,
+    "pairs": _import_pairs,
+    "imsel": _import_imsel,
+}
 
 
 def _refuse_log(path: Path) -> None:
@@ -356,10 +367,6 @@ def _by_camera(files: list[str]) -> dict[str, Path]:
     paths = {camera: Path(name) for camera, name in named.items()}
     read_files([*paths.values()])
     return paths
-
-
-def _topic_of(options: list[str]) -> dict[str, str]:
-    return _split_names(options, "topic", "--camera red=/red/image_raw")
 
 
 def _split_names(options: list[str], kind: str, example: str) -> dict[str, str]:

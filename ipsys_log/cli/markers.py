@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
     from ipsys_log.report.prints import Print
 
 RigNow = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--rig", metavar="FILE", help="Print the markers of this rig file, in their true size."),
 ]
 Ids = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         metavar="LIST", help="Print these ids, such as 1,2,3 or 0-9, instead of the ids of the rig."
     ),
 ]
 Length = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option(metavar="METRES", help="Side of the black square, in m, instead of the lengths of the rig."),
 ]
 Dictionary = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         metavar="NAME",
         help="Dictionary of --ids without a rig (default: DICT_4X4_100) and of a ChArUco board "
@@ -36,7 +36,7 @@ Dictionary = Annotated[
     ),
 ]
 BoardName = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         metavar="COLUMNSxROWS",
         help="Print a board for ipsys calibrate: inner corners of a chessboard, such as 6x4, or "
@@ -49,7 +49,7 @@ MarkerScale = Annotated[
     typer.Option(metavar="SHARE", help="Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
 PageName = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--page", metavar="NAME", help="Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small."
     ),
@@ -59,10 +59,6 @@ Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing file
 
 _DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"
 _MOST = 2000
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(markers)
 
 
 def markers(
@@ -80,7 +76,14 @@ def markers(
     """Draw markers and calibration boards as a PDF at true size, with a ruler to check the print.
 
     Each marker has its white margin, cutting marks, its id and an arrow to its front: the direction of its
-    heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long."""
+    heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long.
+
+    Examples
+
+        ipsys markers --rig lab.toml                # all markers of the rig
+        ipsys markers --ids 0-11 --length 0.08 --page letter
+        ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
+    """
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_file, write_files
@@ -102,15 +105,12 @@ def markers(
     pages = lay_out(prints, paper)
     write_files(output.parent, {output.name: draw_pages(pages)})
     count = "1 page" if len(pages) == 1 else f"{len(pages)} pages"
-    console.print(f"{output} written: {count} of {paper.name}, {_contents(prints)}", markup=False)
+    console.print(f"{output} written: {count} of {paper.name}, {_contents(prints)}")
     if page is None and paper.name != "A4":
         console.print(
             "A4 is too small. Print on A3, or use --length 0.14 for markers that fit on A4",
-            markup=False,
         )
-    console.print(
-        'print at 100 % ("actual size"), and check that the printed ruler is 10 cm long', markup=False
-    )
+    console.print('print at 100 % ("actual size"), and check that the printed ruler is 10 cm long')
 
 
 def _marker_prints(

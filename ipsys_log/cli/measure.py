@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks, say
+from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
     Corners,
     Host,
-    ModelOfOther,
-    Only,
     Port,
     RigFile,
+    Terminal,
     appended_log_argument,
-    cameras_of,
-    load_calibrations,
-    load_matching_rig,
-    log_option,
 )
-from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.cli.pages import serve_measuring
+from ipsys_log.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
@@ -34,17 +30,7 @@ if TYPE_CHECKING:
     from ipsys_log.survey.from_log import FinishedLog
     from ipsys_log.survey.scene import MeasuringScene
 
-Log = Annotated[
-    Optional[Path],  # noqa: UP045
-    appended_log_argument(
-        help="A finished log, which gets the measurements. Without LOG: use the cameras of --rig now.",
-    ),
-]
-Output = Annotated[
-    Optional[Path],  # noqa: UP045
-    log_option(help="Without LOG: the log to write, with about 1 s of frames of each point."),
-]
-Terminal = Annotated[bool, typer.Option("--terminal", help="Ask in the terminal instead of on a page.")]
+Log = Annotated[Path, appended_log_argument(help="A finished log, which gets the measurements.")]
 Sheet = Annotated[
     Path | None,
     typer.Option(
@@ -53,27 +39,20 @@ Sheet = Annotated[
         help="Read the measurements from a sheet; docs/measuring.md shows the columns.",
     ),
 ]
-Insist = Annotated[
-    bool,
-    typer.Option(
-        "--force",
-        help="With --csv: write rows that look wrong, too. With cameras: overwrite an existing log of -o.",
-    ),
-]
+Insist = Annotated[bool, typer.Option("--force", help="With --csv: write rows that look wrong, too.")]
 Places = Annotated[
     bool,
     typer.Option(
         "--places", help="Only list the stationary intervals of the markers, with their numbers for a sheet."
     ),
 ]
-
 Baseline = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--ab",
         metavar="CM",
-        help="With LOG: the distance between the first two reference points, read with this tape, in cm. It "
-        "shows the scale of the tape if the rig has ab_sigma_m.",
+        help="The distance between the first two reference points, read with this tape, in cm. It shows the "
+        "scale of the tape if the rig has ab_sigma_m.",
     ),
 ]
 
@@ -81,15 +60,9 @@ Baseline = Annotated[
 _MODEL, _GOOD = "poly", 40
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(measure)
-    app.command()(exclude)
-
-
 @runs_until_stopped
 def measure(
-    log: Log = None,
-    output: Output = None,
+    log: Log,
     terminal: Terminal = False,
     csv: Sheet = None,
     places: Places = False,
@@ -97,80 +70,37 @@ def measure(
     host: Host = None,
     port: Port = 8000,
     rig: RigFile = None,
-    camera: Only = None,
     calibration: Calibrations = None,
     corners: Corners = None,
-    model_from: ModelOfOther = None,
     force: Insist = False,
     as_json: AsJson = False,
 ) -> None:
-    """Enter tape measurements: on a page for the phone, in the terminal, or from a sheet.
+    """Enter the tape measurements of a log: on a page for the phone, in the terminal, or from a sheet.
 
-    With --rig lab.toml -o places.mcap, the command uses the live cameras until Ctrl-C. It writes about a
-    second of frames for each measured point. With a finished LOG, the command goes through the stationary
-    intervals of the markers, and appends the measurements.
+    The command goes through the stationary intervals of the markers, and appends the measurements. It checks
+    each entry at once. Undo withdraws a measurement and erases nothing. To measure with live cameras:
+    ipsys record --measure.
 
-    The command checks each entry at once. Undo withdraws a measurement and erases nothing.
+    Examples
+
+        ipsys measure calibration.mcap                     # on a page
+        ipsys measure calibration.mcap --terminal          # in this terminal
+        ipsys measure calibration.mcap --csv places.csv    # from a sheet
     """
     ends = csv is not None or places or ab is not None
-    allow_interrupt(None if ends else "stopped; every saved point is in the log")
+    allow_interrupt(None if ends else SAVED)
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
+    from ipsys_log.runs.options import Request
+    from ipsys_log.survey.add_sheet import add_sheet, check_sheet
+    from ipsys_log.survey.from_log import open_finished_log
 
     if sum((terminal, csv is not None, places, ab is not None)) > 1:
         raise IpsysError("--terminal, --csv, --places and --ab cannot be used together; give one of them")
     if not (terminal or ends):
         check_installed("the measuring page needs", "starlette", "uvicorn")
-    if log is not None:
-        _refuse(
-            "live cameras; leave out LOG or this option",
-            output=output,
-            camera=camera,
-            model_from=model_from,
-        )
-        if csv is None:
-            _refuse("--csv or live cameras; leave it out", force=force)
-        _measure_log(log, terminal, csv, force, places, ab, host, port, rig, calibration, corners, as_json)
-        return
-    _refuse("a finished log; name the log", csv=csv, places=places, ab=ab)
-    if rig is None or output is None:
-        raise IpsysError(
-            "no log is given; name a finished log, or give --rig lab.toml -o places.mcap to use cameras"
-        )
-    from ipsys_log.cli.measure_live import measure_now
-
-    measured = measure_now(output, rig, camera, calibration, corners, model_from, force, terminal, host, port)
-    _show_count(output, measured, as_json)
-    _show_next(output, measured)
-
-
-def _refuse(where: str, **options: object) -> None:
-    """Refuse options that belong to another way of measuring."""
-    from ipsys_log.errors import IpsysError
-
-    for name, value in options.items():
-        if value:
-            raise IpsysError(f"--{name.replace('_', '-')} is only for {where}")
-
-
-def _measure_log(
-    log: Path,
-    terminal: bool,
-    csv: Path | None,
-    force: bool,
-    places: bool,
-    ab: str | None,
-    host: str | None,
-    port: int,
-    rig: Path | None,
-    calibration: list[str] | None,
-    corners: str | None,
-    as_json: bool,
-) -> None:
-    from ipsys_log.runs.options import Request
-    from ipsys_log.survey.add_sheet import add_sheet, check_sheet
-    from ipsys_log.survey.from_log import open_finished_log
-
+    if force and csv is None:
+        raise IpsysError("--force is only for --csv; leave it out")
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
     lab = load_matching_rig(rig, lambda: cameras_of([log]))
     request = Request(rig=lab, lenses=lenses, corners=corners)
@@ -189,37 +119,26 @@ def _measure_log(
             scene.add([read_baseline(ab, scene.rig, scene.history(), scene.start_ns)])
         elif csv is not None:
             for text in add_sheet(scene, csv, force):
-                remarks.print(text, style="yellow", markup=False)
+                warn(text)
         elif terminal:
             from ipsys_log.cli.dialog import ask_places
 
             ask_places(scene)
         else:
-            serve_page(scene, host, port)
-        _show_count(log, scene.history()[before:], as_json)
-        _show_next(log, scene.history())
+            _serve(scene, host, port)
+        show_measured(log, scene.history()[before:], scene.history(), as_json)
     if rig is not None:
-        remarks.print(
-            f"give --rig {rig} to ipsys replay, too: the measurements use its reference points", markup=False
-        )
+        say(f"give --rig {rig} to ipsys replay, too: the measurements use its reference points")
 
 
-def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
+def _serve(scene: MeasuringScene, host: str | None, port: int) -> None:
     """Serve the page until an interrupt."""
-    from ipsys_log.cli.measure_live import say_faults
-    from ipsys_log.web.server import qr_code, serve
-
     signals: list[None] = []  # a list: an Event takes a lock that the interrupted thread may hold
     stop_on_signal(lambda: signals.append(None))
-    with serve(scene, host, port) as page:
-        if host is not None:
-            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        console.print(f"open {page.url}", markup=False)
-        remarks.print("Ctrl-C ends the measuring; every saved point is already in the log")
-        try:
-            page.wait(lambda: bool(signals))
-        finally:
-            say_faults(page)
+    with serve_measuring(scene, host, port) as page:
+        console.print(f"open {page.url}")
+        say("Ctrl-C ends the measuring; every saved point is already in the log")
+        page.wait(lambda: bool(signals))
 
 
 def exclude(
@@ -241,54 +160,54 @@ def exclude(
 
     The command appends a message for each point. Models of the log are then out of date, and ipsys replay
     fits them again. A point that is excluded already causes no change.
+
+    Examples
+
+        ipsys exclude calibration.mcap p007 p012 --reason "the tape sagged"
+        ipsys exclude calibration.mcap p012 --readmit --reason "tape was straight"
     """
     from ipsys_log.survey import exclusion
 
     result = (exclusion.readmit if readmit else exclusion.exclude)(log, points, reason)
     done, before = ("re-admitted", "not excluded") if readmit else ("excluded", "excluded already")
     for name, text in result.unchanged.items():
-        remarks.print(f"{name} is {before}{f': {text}' if text else ''}", style="yellow", markup=False)
+        warn(f"{name} is {before}{f': {text}' if text else ''}")
     if as_json:
         key = "readmitted" if readmit else "excluded"
         rows = {"log": str(log), key: result.changed, "unchanged": [*result.unchanged]}
-        print(json.dumps({**rows, "active": result.active}))  # noqa: T201
+        print_json({**rows, "active": result.active})
         return
     if not result.changed:
-        console.print(f"{log} is unchanged", markup=False)
+        console.print(f"{log} is unchanged")
         return
-    console.print(
-        f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}", markup=False
-    )
-    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
+    console.print(f"{done}: {', '.join(result.changed)}; calibration points in use: {result.active}")
+    say(f"next: ipsys replay {shell_words(log)}")
 
 
-def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
-    withdrawn = sum(measurement.withdraws is not None for measurement in added)
-    count = sum(measurement.is_point for measurement in added)
-    if as_json:
-        print(json.dumps({"log": str(log), "measured": count, "withdrawn": withdrawn}))  # noqa: T201
-        return
-    baselines = sum(measurement.from_reference is not None for measurement in added)
-    also = f", {baselines} distance AB" if baselines else ""
-    also += f", {withdrawn} withdrawn" if withdrawn else ""
-    console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
-
-
-def _show_next(log: Path, history: Sequence[Measurement]) -> None:
-    """Print the next step for the number of points that a log has now."""
+def show_measured(
+    log: Path, added: Sequence[Measurement], history: Sequence[Measurement], as_json: bool
+) -> None:
+    """Print the number of added measurements, and the next step for the points that a log has now."""
     from ipsys_log.analysis.pairs import active_measurements
     from ipsys_log.models.table import min_pairs
 
-    count = len(active_measurements(history))
-    if not count:
-        return
-    if count < _GOOD:
-        remarks.print(
-            f"calibration points in the log: {count}; each camera must see {min_pairs(_MODEL)} or more for a "
-            f"model, and about {_GOOD} for a good one",
-            markup=False,
+    withdrawn = sum(measurement.withdraws is not None for measurement in added)
+    count = sum(measurement.is_point for measurement in added)
+    if as_json:
+        print_json({"log": str(log), "measured": count, "withdrawn": withdrawn})
+    else:
+        baselines = sum(measurement.from_reference is not None for measurement in added)
+        also = f", {baselines} distance AB" if baselines else ""
+        also += f", {withdrawn} withdrawn" if withdrawn else ""
+        console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}")
+    active = len(active_measurements(history))
+    if 0 < active < _GOOD:
+        say(
+            f"calibration points in the log: {active}; each camera must see {min_pairs(_MODEL)} or more for "
+            f"a model, and about {_GOOD} for a good one"
         )
-    remarks.print(f"next: ipsys replay {shell_words(log)}", markup=False)
+    if active:
+        say(f"next: ipsys replay {shell_words(log)}")
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:
@@ -296,6 +215,6 @@ def _show_places(scene: FinishedLog, as_json: bool) -> None:
 
     stops = intervals_json(scene)
     if as_json:
-        print(json.dumps(stops, indent=2))  # noqa: T201
+        print_json(stops)
     else:
         console.print(intervals_table(stops))

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import remarks, say
-from ipsys_log.cli.open_cameras import Lab, check_target, open_cameras, prepare_lab
+from ipsys_log.cli.console import say, warn
+from ipsys_log.cli.open_cameras import check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import Calibrations, Corners, Force, log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab
     from ipsys_log.capture.nodes.network import NodeNetwork
     from ipsys_log.runs.options import Request
 
 NodeLog = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     log_option(help="The log of this node. Default: the name of the camera and the time, in this folder."),
 ]
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(node)
 
 
 @runs_until_stopped
@@ -37,13 +34,13 @@ def node(
     ] = "",
     output: NodeLog = None,
     centre: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             "--centre", metavar="HOST:PORT", help="The address of the centre, instead of the rig's."
         ),
     ] = None,
     certificates: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--certificates", metavar="FOLDER", help="The folder of the certificates, instead of the rig's."
         ),
@@ -54,7 +51,7 @@ def node(
     calibration: Calibrations = None,
     corners: Corners = None,
     seconds: Annotated[
-        Optional[float],  # noqa: UP045
+        float | None,
         typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
     ] = None,
     force: Force = False,
@@ -62,7 +59,14 @@ def node(
     """Record one camera of this host, and send its frames to the centre, until Ctrl-C.
 
     The centre is a recording on another machine, such as ipsys live, whose rig has the source zenoh:NAME. If
-    the centre or the network is away, the node records on, and sends the missing frames afterwards."""
+    the centre or the network is away, the node records on, and sends the missing frames afterwards.
+
+    Examples
+
+        ipsys node lab.toml --camera red         # on the host of this camera
+        ipsys node lab.toml --camera red --centre 192.168.1.10:7449
+        ipsys node lab.toml --camera red --detect     # send only the markers
+    """
     allow_interrupt("stopped before the first frame was recorded; no log was written")
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.capture.nodes.centre import is_of_node
@@ -115,13 +119,14 @@ def _send(
 
     camera = lab.names[0]
     with (
-        open_cameras(lab, target, seconds) as (cameras, settings, status),
-        Node(camera, network, __version__, target, cameras.clock, say, request is not None) as sender,
+        open_cameras(lab, target, seconds) as (opened, status),
+        Node(camera, network, __version__, target, opened.cameras.clock, say, request is not None) as sender,
     ):
+        cameras, settings = opened.cameras, opened.settings
         if request is not None:
             pipeline.live(cameras, settings, target, request, "detect", [status, sender], force)
         else:
             pipeline.record(cameras, settings, target, [status, sender], force)
         left = sender.finish(not cameras.is_stopped)
     if left:
-        remarks.print(sender.describe_missing(left, status.log), style="yellow", markup=False)
+        warn(sender.describe_missing(left, status.log))

@@ -1,22 +1,22 @@
-"""Options that several commands share."""
+"""Options that several commands share, and the check of their values: logs, URLs, and names of files."""
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import remarks
-from ipsys_log.cli.local_files import appended_logs, is_url, read_files
+from ipsys_log.cli.console import say
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
-    from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 
     LogList = list[LogLocation]
     OneLog = LogLocation
@@ -25,8 +25,66 @@ if TYPE_CHECKING:
 else:
     LogList = list[str]  # typer knows no union of types
     OneLog = str
-    OtherLog = Optional[str]  # noqa: UP045
-    NoLogs = Optional[list[str]]  # noqa: UP045
+    OtherLog = str | None
+    NoLogs = list[str] | None
+
+
+# A path has lost one of the two slashes of a URL.
+_URL_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+
+Paths = list[Path] | Path | None
+
+
+def is_url(path: Path) -> bool:
+    """Return whether a path is a URL, and no file of such a name."""
+    return _URL_AS_PATH.match(str(path)) is not None and not path.exists()
+
+
+def read_files(given: Paths) -> Paths:
+    """Return the file, or the files, of an argument of a command that reads only files.
+
+    Raises
+    ------
+    IpsysError
+        A URL is among them.
+    """
+    _refuse(given, "is at a URL, but this command reads files; download them first")
+    return given
+
+
+def appended_logs(given: Paths) -> Paths:
+    """Return the log, or the logs, that a command extends or repairs.
+
+    Raises
+    ------
+    IpsysError
+        A URL is among them.
+    """
+    _refuse(given, "is at a URL, but this command writes into the log; download the log first")
+    return given
+
+
+def needs_local_files(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a command: it refuses a URL as the value of each parameter that is a path."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> Any:
+        for name, value in options.items():
+            option = "-o " if name == "output" else ""
+            _refuse(value, "is a URL; name a file or a folder on this machine", option)
+        return command(*arguments, **options)
+
+    return run
+
+
+def _refuse(given: object, why: str, option: str = "") -> None:
+    for path in given if isinstance(given, list) else [given]:
+        if isinstance(path, Path) and is_url(path):
+            from ipsys_log.errors import IpsysError
+            from ipsys_log.log.location import LogUrl
+
+            url = LogUrl(str(path).replace(":/", "://", 1))
+            raise IpsysError(f"{option}{url}: {why}")
 
 
 def build_option(parameter: StageParameter) -> Any:
@@ -108,8 +166,13 @@ def _named_as_log(path: Path | None) -> Path | None:
         page = "; ipsys report --html FILE writes a page" if path.suffix.lower() in (".html", ".htm") else ""
         raise IpsysError(f"-o {path}: the name of a new log ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
-    remarks.print(f"-o {path}: the log gets the name {named}", markup=False)
+    say(f"-o {path}: the log gets the name {named}")
     return named
+
+
+def figure_option(subject: str) -> Any:
+    """Return the option for the file of a figure, which is checked by `report.files.check_figure_file`."""
+    return typer.Option("--plot", metavar="FILE", help=f"Draw {subject}: .png, .pdf, .svg or .jpg.")
 
 
 # The options that every command uses for the name of a new log.
@@ -120,7 +183,7 @@ RigFile = Annotated[
     typer.Option("--rig", metavar="FILE", help="Use this rig file (lab.toml) instead of the rig in the log."),
 ]
 Calibrations = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
@@ -128,10 +191,10 @@ Calibrations = Annotated[
         "log with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
-Corners = Annotated[Optional[str], build_option(CORNERS)]  # noqa: UP045
+Corners = Annotated[str | None, build_option(CORNERS)]
 Method = Annotated[str, build_option(METHOD)]
 Only = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--camera", metavar="NAME", help="Use only this camera of the rig; repeat it for several."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing log of this name.")]
@@ -154,146 +217,18 @@ Port = Annotated[
 RigNow = Annotated[
     Path, typer.Option("--rig", metavar="FILE", help="The rig file, with a source for each camera.")
 ]
-ModelOfOther = Annotated[
-    OtherLog,
-    other_log_option(
-        "--model-from",
-        help="While measuring, compare each point with the model of this log, a file or a URL.",
+Terminal = Annotated[
+    bool, typer.Option("--terminal", help="Ask for the measurements in the terminal instead of on a page.")
+]
+FittedModels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--model",
+        metavar="NAME",
+        help="Model of this log, such as best; repeat it for several. The first one is shown, streamed and "
+        "used by robots. Default: poly, if the log has it.",
     ),
 ]
+Seconds = Annotated[float | None, typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time.")]
+Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-
-
-def load_calibrations(
-    options: list[str] | None,
-    cameras: Callable[[], Collection[str]],
-    assume: Callable[[str, str], None] = lambda camera, text: None,
-) -> dict[str, CameraCalibration]:
-    """Read intrinsics by camera from ``camera=file``, or from ``other.mcap`` for the given ``cameras``.
-
-    ``assume`` is called with a camera and a text if its file does not state the lens model. The text and
-    remarks on unusual values are printed.
-
-    Raises
-    ------
-    IpsysError
-        An option has another form, or a file contains no calibration.
-    """
-    if not options:
-        return {}
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.calibration_files import read_intrinsics
-    from ipsys_log.log.dataset import Session
-
-    def report(camera: str, text: str) -> None:
-        say_remark(camera, text)
-        assume(camera, text)
-
-    lenses: dict[str, CameraCalibration] = {}
-    for option in options:
-        camera, place = split_calibration(option)
-        if camera is not None:
-            calibrations = {camera: read_intrinsics(place, camera, report)}
-        elif place.suffix == ".mcap":
-            with Session([place]) as log:
-                known = [camera for camera in log.calibrations if camera in cameras()]
-            calibrations = {camera: read_intrinsics(place, camera, report) for camera in known}
-            if not calibrations:
-                raise IpsysError(
-                    f"--calibration {place}: has no calibration of these cameras; give another log"
-                )
-        else:
-            raise IpsysError(
-                f"--calibration {place}: has no camera name; write camera=file.yaml, or name a log (.mcap)"
-            )
-        for name in calibrations:
-            if name in lenses:
-                raise IpsysError(f"--calibration: camera {name!r} has two calibrations; give one")
-        lenses.update(calibrations)
-    say_unusual(lenses)
-    return lenses
-
-
-def say_remark(camera: str, text: str) -> None:
-    """Print a remark on the calibration of a camera."""
-    remarks.print(f"camera {camera}: {text}", style="yellow", markup=False)
-
-
-def say_unusual(lenses: Mapping[str, CameraCalibration]) -> None:
-    """Print remarks on unusual values of calibrations."""
-    from ipsys_log.geometry.plausible_lenses import calibration_remarks
-
-    for camera, lens in sorted(lenses.items()):
-        for text in calibration_remarks(lens):
-            say_remark(camera, text)
-
-
-def split_calibration(option: str) -> tuple[str | None, LogLocation]:
-    """Return the camera and the file of ``camera=file``; the camera is None if the option names only a log.
-
-    The query of a URL may have an equals sign, too.
-    """
-    from ipsys_log.log.location import LogUrl, parse_location
-
-    camera, equals, name = option.partition("=")
-    if not equals or isinstance(parse_location(option), LogUrl):
-        return None, parse_location(option)
-    return camera, parse_location(name)
-
-
-def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]]) -> Rig | None:
-    """Read a rig for cameras that are given by their images; None if no file is named.
-
-    A rig that describes only some of the cameras causes a remark.
-
-    Raises
-    ------
-    IpsysError
-        The rig cannot be read, or describes only other cameras.
-    """
-    if path is None:
-        return None
-    from ipsys_log.rig.file import check_rig_cameras, load_rig
-
-    rig = load_rig(path)
-    for text in check_rig_cameras(rig, cameras(), f"--rig {path}"):
-        remarks.print(text, style="yellow", markup=False)
-    return rig
-
-
-def load_lab(
-    rig: Path, calibration: list[str] | None, only: Collection[str], with_lenses: bool = True
-) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration], dict[str, str]]:
-    """Return the rig of a file, its cameras that have a source (or ``only`` some), and their intrinsics.
-
-    The intrinsics come from ``calibration``, else from the file that the rig names, relative to the rig file.
-    The files of the rig are read only ``with_lenses``. The last value has a text for each camera whose file
-    does not state the lens model.
-
-    Raises
-    ------
-    IpsysError
-        The rig has no such camera, or no camera with a source.
-    """
-    from ipsys_log.exchange.lab_files import load_cameras, load_lenses
-
-    lab, cameras = load_cameras(rig, only)
-    names = [camera.name for camera in cameras]
-    assumed: dict[str, str] = {}
-    given = load_calibrations(calibration, lambda: names, assumed.__setitem__)
-    from_files: dict[str, str] = {}
-    lenses = load_lenses(rig, cameras, given, with_lenses, from_files.__setitem__)
-    for camera, text in from_files.items():
-        say_remark(camera, text)
-    say_unusual({camera: lens for camera, lens in lenses.items() if camera not in given})
-    return lab, cameras, lenses, assumed | from_files
-
-
-def cameras_of(logs: Sequence[LogLocation]) -> set[str]:
-    """Return the cameras of which logs have frames or derived channels."""
-    from ipsys_log.log.contents import camera_of_topic
-    from ipsys_log.log.dataset import Session
-
-    with Session(logs) as session:
-        derived = {camera_of_topic(topic) for reader in session.readers for topic in reader.channels}
-        return set(session.images) | {camera for camera in derived if camera}

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.console import console, print_json, say, warn
+from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations
+from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _HIGHEST_M = 5.0
 Places = Annotated[int, typer.Option(metavar="N", help="Number of points to propose.")]
 Model = Annotated[str, typer.Option(metavar="NAME", help="The model to improve.")]
 Heights = Annotated[
-    Optional[list[float]],  # noqa: UP045
+    list[float] | None,
     typer.Option(
         "--height-m",
         metavar="METRES",
@@ -43,10 +43,6 @@ Plot = Annotated[
         metavar="FILE", help="Draw the error over the floor, before and after: .png, .pdf, .svg or .jpg."
     ),
 ]
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(plan)
 
 
 def plan(
@@ -66,6 +62,10 @@ def plan(
     alone, without the noise of an image.
 
     If the log has no such model yet, the command fits one first.
+
+    Examples
+
+        ipsys plan calibration.mcap --places 5 --plot next.png
     """
     from ipsys_log.messages.channels import MODEL, RIG
     from ipsys_log.report.files import check_figure_file
@@ -98,16 +98,16 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
 
         draw_plan(found, plot)
     if as_json:
-        print(json.dumps(_plan_json(found), indent=2, allow_nan=False))  # noqa: T201
+        print_json(_plan_json(found))
     else:
         console.print(_table(found))
         console.print(_headline(found))
         if found.drive is not None:
-            console.print(_drive_line(found.drive), highlight=False)
+            console.print(_drive_line(found.drive))
     for note in found.notes:
-        remarks.print(note, style="yellow", markup=False)
+        warn(note)
     if plot is not None:
-        remarks.print(f"{plot} drawn", markup=False)
+        say(f"{plot} drawn")
 
 
 def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
@@ -144,7 +144,7 @@ def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: S
 
 
 def _headline(found: PlannedFloor) -> str:
-    from ipsys_log.report.tables import means_cm
+    from ipsys_log.report.rows import means_cm
 
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
     subject = "this point" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} points"
@@ -154,7 +154,7 @@ def _headline(found: PlannedFloor) -> str:
 def _drive_line(drive: PlannedDrive) -> str:
     """Return the line of the drive that reduces the error most, with its effect without new points."""
     from ipsys_log.analysis.joint_plan import DRIVE_S
-    from ipsys_log.report.tables import means_cm
+    from ipsys_log.report.rows import means_cm
     from ipsys_log.units import CM_PER_M
 
     if not drive.is_useful:
@@ -170,7 +170,7 @@ def _drive_line(drive: PlannedDrive) -> str:
 def _table(found: PlannedFloor) -> Table:
     from rich.table import Table
 
-    from ipsys_log.report.tables import means_cm
+    from ipsys_log.report.rows import means_cm
     from ipsys_log.units import CM_PER_M
 
     title = f"Next points to measure, for the model {found.model} of run {found.run}"

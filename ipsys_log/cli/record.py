@@ -1,53 +1,58 @@
-"""Recording and live tracking: ``ipsys record`` and ``ipsys live``."""
+"""Recording, measuring and live tracking with the cameras of a rig: ``ipsys record`` and ``ipsys live``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from time import sleep
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import remarks, say
-from ipsys_log.cli.dashboard import Web, WebPort, first_run, plan_dashboard, serve_dashboard
+from ipsys_log.cli.console import say, warn
+from ipsys_log.cli.measure import show_measured
 from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
     Calibrations,
     Corners,
+    FittedModels,
     Force,
     Host,
     Method,
-    ModelOfOther,
     NewLog,
     OneLog,
     Only,
+    OtherLog,
     Port,
     RigNow,
+    Seconds,
+    Terminal,
     other_log_option,
 )
-from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
-from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
+from ipsys_log.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
+from ipsys_log.cli.signals import SAVED, allow_interrupt, runs_until_stopped
+from ipsys_log.cli.stream import StreamOptions, choose_streams, takes_streams
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.messages import Message
+    from ipsys_log.log.location import LogLocation
+    from ipsys_log.messages import Measurement, Model
+    from ipsys_log.runs.options import Request
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
+    from ipsys_log.survey.live import LiveScene
 
-Seconds = Annotated[
-    Optional[float],  # noqa: UP045
-    typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
-]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
 
+_TURN_S = 0.05
+# After this time, the markers in the images and their stationary intervals are known.
+_LOOK_S = 1.0
 _NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(record)
-    app.command()(live)
 
 
 @runs_until_stopped
@@ -64,54 +69,180 @@ def record(
             "--measure", help="Enter tape measurements during the recording, on a page for the phone."
         ),
     ] = False,
+    points_only: Annotated[
+        bool,
+        typer.Option(
+            "--points-only", help="With --measure: keep only about 1 s of frames of each measured point."
+        ),
+    ] = False,
+    terminal: Terminal = False,
     host: Host = None,
     port: Port = 8000,
-    model_from: ModelOfOther = None,
+    model_from: Annotated[
+        OtherLog,
+        other_log_option(
+            "--model-from",
+            help="With --measure: compare each point with the model of this log, a file or a URL.",
+        ),
+    ] = None,
     seconds: Seconds = None,
     force: Force = False,
+    as_json: Annotated[bool, typer.Option("--json", hidden=True)] = False,
 ) -> None:
-    """Record the camera frames, unchanged, until Ctrl-C."""
-    allow_interrupt(_NOT_BEGUN)
+    """Record the camera frames, unchanged, until Ctrl-C.
+
+    With --measure, the command checks each entry of a point at once. Undo withdraws a measurement and erases
+    nothing.
+
+    Examples
+
+        ipsys record -o monday.mcap                      # the cameras of lab.toml
+        ipsys record -o calibration.mcap --measure       # with tape readings
+        ipsys record -o cal.mcap --measure --points-only --host 0.0.0.0
+        ipsys record -o short.mcap --camera red --seconds 10
+    """
+    allow_interrupt(SAVED if points_only else _NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start
-    from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.runs.options import Request
 
-    if model_from is not None and not measure:
-        raise IpsysError(
-            f"--model-from {model_from}: has no effect without --measure; add --measure, or track with: "
-            "ipsys live"
-        )
-    if measure:
+    if not measure:
+        if model_from is not None:
+            raise IpsysError(
+                f"--model-from {model_from}: has no effect without --measure; add --measure, or track with: "
+                "ipsys live"
+            )
+        if points_only or terminal:
+            name = "points-only" if points_only else "terminal"
+            raise IpsysError(f"--{name}: has no effect without --measure; add --measure")
+    if measure and not terminal:
         check_installed("--measure needs", "starlette", "uvicorn")
     lab = prepare_lab(rig, camera, calibration)
     read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
     check_target(output, force, read)
     request = Request(corners=corners)
     if measure:
-        from ipsys_log.web.server import check_port_free
-
-        model = ready_to_measure(lab, request, model_from)
-        check_port_free(host, port)
-    elif detect:
+        page = None if terminal else (host, port)
+        history = _measure(lab, request, output, model_from, page, seconds, points_only, force)
+        if points_only:
+            show_measured(output, history, history, as_json)
+        return
+    if detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
+    with open_cameras(lab, output, seconds) as (opened, status):
+        cameras, settings = opened.cameras, opened.settings
         for name in sorted(set(lab.names) - set(lab.lenses)):
-            text = (
+            warn(
                 f"camera {name} has no calibration, but a replay needs one; write calibration = "
                 f'"{name}.yaml" into the rig file'
             )
-            remarks.print(text, style="yellow", markup=False)
-        if measure:
-            scene = live_scene(settings, cameras, model)
-            with serve_live_page(scene, host, port):
-                pipeline.live(cameras, settings, output, request, "camera-frame", [status, scene], force)
-        elif detect:
+        if detect:
             pipeline.live(cameras, settings, output, request, "detect", [status], force)
         else:
             pipeline.record(cameras, settings, output, [status], force)
+
+
+def _measure(
+    lab: Lab,
+    request: Request,
+    output: Path,
+    model_from: LogLocation | None,
+    page: tuple[str | None, int] | None,
+    seconds: float | None,
+    points_only: bool,
+    force: bool,
+) -> list[Measurement]:
+    """Record while points are measured; return the measurements.
+
+    Parameters
+    ----------
+    page : address and port of the measuring page; None: the terminal asks.
+    points_only : keep only about 1 s of frames of each point.
+    """
+    from ipsys_log import pipeline
+
+    model = ready_to_measure(lab, request, model_from, page)
+    ends = "q" if page is None else "Ctrl-C"
+    doing = f"measuring into {output}; {ends} to end" if points_only else None
+    with open_cameras(lab, output, seconds, doing, panel=page is not None) as (opened, status):
+        cameras, settings = opened.cameras, opened.settings
+        scene = live_scene(opened, model)
+        sinks: list[Sink] = [status, scene]
+        if points_only:
+            work: Callable[[], Any] = partial(
+                pipeline.measure, cameras, settings, output, request, sinks, force
+            )
+        else:
+            work = partial(pipeline.live, cameras, settings, output, request, "camera-frame", sinks, force)
+        if page is None:
+            _ask_beside(work, scene, cameras)
+        else:
+            with serve_live_measuring(scene, *page):
+                work()
+    return scene.history()
+
+
+def ready_to_measure(
+    lab: Lab, request: Request, model_from: LogLocation | None, page: tuple[str | None, int] | None
+) -> Model | None:
+    """Check that these cameras can measure points; return the newest model of the other log, if named.
+
+    ``page`` is the address and the port of the measuring page; None: there is no page.
+    """
+    import ipsys_log.models.poly  # noqa: F401 - the outliers need it, and no frame must wait for it
+    from ipsys_log.capture.live_plan import check_model, check_start
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.runs.select import fitted_in
+    from ipsys_log.survey.entry import check_references
+
+    check_references(lab.rig)
+    check_start(lab.rig, lab.names, lab.lenses, request, "camera-frame")
+    model = None
+    if model_from is not None:
+        with Session([model_from]) as other:
+            model, _ = fitted_in(other, None)
+        check_model(model, lab.names)
+    if page is not None:
+        from ipsys_log.web.server import check_port_free
+
+        check_port_free(*page)
+    return model
+
+
+def live_scene(opened: OpenLab, model: Model | None) -> LiveScene:
+    """Make the scene of the live cameras, for measuring."""
+    from ipsys_log.survey.live import LiveScene
+
+    return LiveScene(opened.rig, model, opened.cameras.states, opened.cameras.save)
+
+
+@contextmanager
+def serve_live_measuring(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
+    """Serve the measuring page of live cameras until the block ends, and print its address."""
+    with serve_measuring(scene, host, port) as page:
+        say(f"measure at {page.url}")
+        yield
+
+
+def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras) -> None:
+    """Ask in the terminal while the work runs in a thread, and stop the cameras after that."""
+    from ipsys_log.cli.dialog import ask_places
+
+    allow_interrupt(SAVED)  # this also ends an open question
+    with ThreadPoolExecutor(1) as pool:
+        working = pool.submit(work)
+        try:
+            with suppress(KeyboardInterrupt):
+                while not (working.done() or any(view.points for view in scene.views(None))):
+                    sleep(_TURN_S)
+                sleep(_LOOK_S)
+                if not working.done():
+                    ask_places(scene)
+        finally:
+            cameras.stop()
+        working.result()
 
 
 @runs_until_stopped
@@ -123,14 +254,7 @@ def live(
         other_log_option("--model-from", help="The log with the fitted model to apply, a file or a URL."),
     ],
     rig: RigNow = Path("lab.toml"),
-    model: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            "--model",
-            metavar="NAME",
-            help="Model of this log, such as best; repeat it for several. Default: poly, if the log has it.",
-        ),
-    ] = None,
+    model: FittedModels = None,
     camera: Only = None,
     calibration: Calibrations = None,
     corners: Corners = None,
@@ -143,14 +267,21 @@ def live(
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
-    """Track robots live: record, and process every frame with all stages up to fuse, until Ctrl-C."""
+    """Track robots live: record, and process every frame with all stages up to fuse, until Ctrl-C.
+
+    Examples
+
+        ipsys live --model-from calibration.mcap -o monday.mcap
+        ipsys live --model-from calibration.mcap --model best --view -o b.mcap
+        ipsys live --model-from calibration.mcap -o monday.mcap --udp 9870
+        ipsys live --model-from calibration.mcap -o monday.mcap --web
+    """
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
-    from ipsys_log.capture.live_plan import check_start
+    from ipsys_log.capture.live_plan import check_start, shown_run
     from ipsys_log.extras import check_installed
-    from ipsys_log.messages.channels import TRACKS
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.streams.settings import check_streams, open_streams
+    from ipsys_log.sinks.streams.settings import check_streams, open_live_streams
 
     for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
         if is_wanted:
@@ -162,47 +293,42 @@ def live(
     models = tuple(dict.fromkeys(model or ()))
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
-        remarks.print(line, style="yellow", markup=False)
+        warn(line)
     planned = plan_dashboard(web, streams["host"], web_port, request)
     streamed = choose_streams(lab.rig, rig.parent, has_page=web, **streams)
     for line in check_streams(streamed):
         say(line)
-    robots = lab.rig.robot_heights_m()
-    if streamed and not robots:
+    if streamed and not lab.rig.robot_heights_m():
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
-        remarks.print(text, style="yellow", markup=False)
-    shown_run = first_run(request)
+        warn(text)
+    run = shown_run(request)
     with (
-        open_cameras(lab, output, seconds) as (cameras, settings, status),
-        open_streams(
-            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, heights_m=robots
-        ) as senders,
-        _page_viewer(settings, cameras, shown_run, streamed) as pages,
-        serve_dashboard(planned, (cameras, settings, status), output, shown_run, senders) as dashboards,
+        open_cameras(lab, output, seconds) as (opened, status),
+        open_live_streams(streamed, opened, run) as senders,
+        _page_viewer(opened, run, streamed) as pages,
+        serve_dashboard(planned, opened, status, output, run, senders) as dashboards,
     ):
-        viewer = [_viewer(settings, cameras, shown_run)] if view else []
-        sinks: list[Sink] = [*viewer, *pages, *dashboards, *senders]
-        pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
+        viewer = [_viewer(opened, run)] if view else []
+        sinks: list[Sink] = [status, *viewer, *pages, *dashboards, *senders]
+        pipeline.live(opened.cameras, opened.settings, output, request, None, sinks, force)
 
 
-def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView:
+def _viewer(opened: OpenLab, run: str) -> LiveView:
     from ipsys_log.sinks.rerun.live import LiveView
 
-    return LiveView(settings[0].payload, cameras.states, run, say)
+    return LiveView(opened.rig, opened.cameras.states, run, say)
 
 
 @contextmanager
-def _page_viewer(
-    settings: list[Message], cameras: LiveCameras, run: str, streamed: StreamSettings
-) -> Iterator[list[LiveView]]:
+def _page_viewer(opened: OpenLab, run: str, streamed: StreamSettings) -> Iterator[list[LiveView]]:
     """Show the recording on a page for a browser of this machine, if the user asked for it."""
     if not streamed.rerun:
         yield []
         return
     from ipsys_log.sinks.rerun.live import LiveView
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
-    shown = cameras.states if streamed.images else ()
+    shown = opened.cameras.states if streamed.images else ()
     with closing(ViewerPage()) as page:
         say(page.describe())
-        yield [LiveView(settings[0].payload, shown, run, say, page.show, page.name)]
+        yield [LiveView(opened.rig, shown, run, say, page.show, page.name)]

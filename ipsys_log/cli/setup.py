@@ -1,69 +1,34 @@
-"""Setup of a lab: ``ipsys setup`` on a page, ``ipsys init`` and ``ipsys simulate``."""
+"""Setup of a lab: ``ipsys setup`` on a page, ``ipsys init`` and ``ipsys cameras``."""
 
 from __future__ import annotations
 
-import inspect
 import shlex
-from collections.abc import Callable
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.measure_live import say_faults
-from ipsys_log.cli.options import Host, NewLog, OtherLog, Port, other_log_option
-from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
+from ipsys_log.cli.console import console, print_json, say
+from ipsys_log.cli.options import AsJson, Host, OtherLog, Port, other_log_option
+from ipsys_log.cli.pages import print_code, say_faults
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.plain_text import HIDDEN, shell_words
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.usb_bus import UsbCamera
     from ipsys_log.log.location import LogLocation
 
-# The settings of the simulated lab that have an option: default, help. The defaults equal those of the
-# library, and a test checks this; importing the library only for a help text is too slow.
-SETTINGS: dict[str, tuple[int | float, str]] = {
-    "seed": (0, "Seed of the random numbers. The same seed gives the same bytes."),
-    "width": (1920, "Width of a frame, in px. The focal length scales with it."),
-    "height": (1080, "Height of a frame, in px."),
-    "markers": (3, "Number of markers on the floor at the same time."),
-    "stations": (50, "Approximate number of calibration points that each camera sees."),
-    "frames_per_station": (5, "Frames of each camera in a stationary interval."),
-    "rate_hz": (30.0, "Frames per second."),
-    "row_time_ns": (0, "Rolling shutter: time between the exposures of two rows, in ns; 31000 is typical."),
-    "exposure_s": (0.0, "Motion blur: exposure time of each row, in s; 0.0167 is typical."),
-    "drive_s": (15.0, "Driving time of the robots after the calibration points, in s."),
-    "drive_speed_m_s": (0.5, "Speed of the robots, in m/s."),
-    "psf_sigma_px": (0.7, "Blur of the optics: sigma of the point spread function, in px."),
-    "black": (35.0, "Grey level of black on a marker, 0 to 255."),
-    "white": (205.0, "Grey level of white on a marker, 0 to 255."),
-    "noise_sigma": (2.0, "Sensor noise (standard deviation), in grey levels."),
-    "gamma": (1.0, "Gamma of the cameras; 1 is linear."),
-    "jpeg_quality": (90, "JPEG quality of the frames, 1 to 100."),
-    "mount_height_m": (2.1, "Height of the cameras above the floor, in m."),
-    "marker_length_m": (0.2, "Side of a marker's black square, in m."),
-    "tape_sigma_m": (0.003, "Standard deviation of the tape readings, in m."),
-}
-
-_Grid = Annotated[
-    str | None,
-    typer.Option(
-        metavar="GRID",
-        help="Columns x rows of the cameras of a hall, such as 6x4; otherwise, the lab has three cameras.",
-    ),
-]
+_NONE = """no USB camera is attached
+  for a network camera, put its address into lab.toml: source = "rtsp://..." or "http://..."
+  without a camera, source = "sim:red" is a simulated one: ipsys init lab.toml --simulated"""
 _PORT = 8000
 
 _Folder = Annotated[
     Path,
     typer.Argument(metavar="FOLDER", help="The folder of the lab: it gets lab.toml, intrinsics and logs."),
 ]
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command()(setup)
-    app.command()(init)
-    app.command("simulate", help=simulate.__doc__)(_simulate_command())
 
 
 def init(
@@ -81,7 +46,14 @@ def init(
         ),
     ] = False,
 ) -> None:
-    """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
+    """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log.
+
+    Examples
+
+        ipsys init lab.toml                      # an example with comments
+        ipsys init lab.toml --from monday.mcap   # the rig of a log
+        ipsys init lab.toml --simulated          # to try all commands
+    """
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.lab_files import write_new
     from ipsys_log.rig.file import example_toml
@@ -95,9 +67,7 @@ def init(
     write_new({path: text})
     console.print(f"{path} written: edit it to describe your lab")
     if HIDDEN in text:
-        console.print(
-            f"a log has no passwords: in each source, replace {HIDDEN} by its password", markup=False
-        )
+        console.print(f"a log has no passwords: in each source, replace {HIDDEN} by its password")
 
 
 def _init_simulated(path: Path) -> None:
@@ -107,11 +77,9 @@ def _init_simulated(path: Path) -> None:
     write_new(texts)
     tape = tape_sheet_path(path)
     lines = texts[tape].splitlines()
-    console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
-    console.print(
-        f"{tape} written: the tape measurements of its {len(lines) - 1} stationary markers", markup=False
-    )
-    console.print(f"next: ipsys align --rig {shell_words(path)}", markup=False)
+    console.print(f"{path} written: the simulated lab, with three cameras")
+    console.print(f"{tape} written: the tape measurements of its {len(lines) - 1} stationary markers")
+    console.print(f"next: ipsys align --rig {shell_words(path)}")
 
 
 def _rig_of(log: LogLocation) -> str:
@@ -124,29 +92,18 @@ def _rig_of(log: LogLocation) -> str:
         return rig_toml(replace(rig_with_offsets(session), stream=None))
 
 
-def simulate(output: Path, cameras: str | None, **settings: Any) -> None:
-    """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
-
-    The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m. With --cameras
-    6x4, it is a hall: 24 cameras, 5 m above a floor of 20 x 15 m."""
-    from ipsys_log.runs.output import write_log
-    from ipsys_log.simulation.lab import simulate
-    from ipsys_log.simulation.settings import LabSettings, hall_settings, parse_grid
-
-    lab = LabSettings(**settings) if cameras is None else hall_settings(*parse_grid(cameras), **settings)
-    text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
-    with say_kept(lambda _: text), progress_bar(frame_steps=("simulate",)) as progress:
-        counts = write_log(output, simulate(lab, progress))
-    frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
-    console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")
-
-
 @runs_until_stopped
 def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
     """Set a lab up on a page, step by step: rig, cameras, intrinsics, points, fit, and the live view.
 
     Each step does what its command does, and names it. The state comes from the files of FOLDER: you can
-    leave at any time, continue later, and use the commands in between. Ctrl-C ends the page."""
+    leave at any time, continue later, and use the commands in between. Ctrl-C ends the page.
+
+    Examples
+
+        ipsys setup lab                          # all steps of the first day
+        ipsys setup lab --host 0.0.0.0           # also on a tablet
+    """
     allow_interrupt("stopped; every finished step is in the folder")
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
@@ -156,7 +113,7 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
     check_folder(folder, "FOLDER")
     from ipsys_log.first_day.lab_folder import LabFolder
     from ipsys_log.web.first_day.app import SetupApp
-    from ipsys_log.web.server import check_port_free, qr_code, serve_app
+    from ipsys_log.web.server import check_port_free, serve_app
 
     check_port_free(host, port)
     try:
@@ -167,48 +124,85 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
     signals: list[None] = []  # a list: an Event takes a lock that the interrupted thread may hold
     with serve_app(page.app, host, port, has_viewers=True) as server:
         stop_on_signal(lambda: signals.append(None))
-        if host is not None:
-            console.print(qr_code(server.url), style="#ffffff on #000000", markup=False)
-        console.print(f"open {server.url}", markup=False)
+        print_code(server.url, host is not None)
+        console.print(f"open {server.url}")
         if server.view_url is not None:
-            remarks.print(f"to view only: {server.view_url}", markup=False)
-        remarks.print(f"Ctrl-C ends; to continue: {_command(folder, host, port)}", markup=False)
+            say(f"to view only: {server.view_url}")
+        say(f"Ctrl-C ends; to continue: {_command(folder, host, port)}")
         try:
             server.wait(lambda: bool(signals))
         finally:
             page.session.close()
             say_faults(server, "the setup page")
             for bug in page.session.jobs.bugs:
-                remarks.print(bug, markup=False, highlight=False)
+                say(bug)
     if page.session.jobs.bugs:
         raise typer.Exit(1)
 
 
-def _simulate_command() -> Callable[..., None]:
-    """Build the command of :func:`simulate` with an option for each setting."""
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    parameters = [
-        inspect.Parameter("context", keyword, annotation=typer.Context),
-        inspect.Parameter("output", keyword, annotation=NewLog),
-        inspect.Parameter("cameras", keyword, default=None, annotation=_Grid),
-    ]
-    for name, (default, text) in SETTINGS.items():
-        annotation = Annotated[type(default), typer.Option(help=text)]  # type: ignore[valid-type]
-        parameters.append(inspect.Parameter(name, keyword, default=default, annotation=annotation))
+@writes_nothing
+def cameras(
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig", metavar="FILE", help="Check that USB is fast enough for the cameras of this rig."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the USB cameras with device, modes, bus and hub, and check that USB is fast enough for all.
 
-    def command(context: typer.Context, **given: Any) -> None:
-        # A hall has other defaults than the lab of the paper, so only options of the user count.
-        chosen = {name: given[name] for name in SETTINGS if _is_chosen(context, name)}
-        simulate(given["output"], given["cameras"], **chosen)
+    Without --rig, the check uses the largest mode of each camera. Network cameras are not listed.
 
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {p.name: p.annotation for p in parameters}
-    return command
+    Examples
+
+        ipsys cameras                    # the source of each camera
+        ipsys cameras --rig lab.toml     # is USB fast enough for the rig?
+    """
+    from ipsys_log.capture.usb_bus import advise_bandwidth, list_demands
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.rig.file import load_rig
+
+    if sys.platform != "linux":
+        raise IpsysError(
+            "ipsys cameras: lists cameras only on Linux; on this system, write usb:0, usb:1 and so on"
+        )
+    from ipsys_log.capture.usb_bus import find_cameras
+
+    attached = find_cameras()
+    advice = advise_bandwidth(list_demands(attached, load_rig(rig) if rig else None))
+    if as_json:
+        print_json({"cameras": [_plain(camera) for camera in attached], "advice": advice})
+        return
+    for camera in attached:
+        console.print(_describe(camera))
+    if not attached:
+        console.print(_NONE)
+    for line in advice:
+        console.print(line)
 
 
-def _is_chosen(context: typer.Context, name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name != "DEFAULT"
+def _plain(camera: UsbCamera) -> dict[str, Any]:
+    plug = camera.plug._asdict() if camera.plug else None
+    return camera._asdict() | {"plug": plug, "modes": [mode._asdict() for mode in camera.modes]}
+
+
+def _describe(camera: UsbCamera) -> str:
+    lines = [f'{camera.name}: source = "usb:{camera.stable or camera.device}"']
+    if camera.stable:
+        lines.append(f"  {camera.device}")
+    if camera.plug:
+        bus, port, speed_mbit_s, hub, _ = camera.plug
+        lines.append(f"  USB bus {bus}, port {port}, {speed_mbit_s:g} Mbit/s; hub: {hub}")
+    rates: dict[tuple[str, int, int], list[float]] = {}
+    for mode in camera.modes:
+        rates.setdefault(mode[:3], []).append(mode.rate_hz)
+    for (name, width, height), each in rates.items():
+        text = ", ".join(f"{rate:.3g}" for rate in sorted(set(each), reverse=True))
+        lines.append(f"  {name:<5}{width:>5} x {height:<5}{text} frames/s")
+    if camera.fault:
+        lines.append(f"  its modes cannot be read: {camera.fault}")
+    return "\n".join(lines)
 
 
 def _command(folder: Path, host: str | None, port: int) -> str:

@@ -19,6 +19,8 @@ from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _KEPT = "complete results are kept; nothing else is changed"
+# The normal end of a command that appends measured points.
+SAVED = "stopped; every saved point is in the log"
 _NOTHING_WRITTEN = "no file was changed"
 _AT_ONCE = "ended at once; if a log was being recorded, complete it with: ipsys repair LOG"
 _SHOW_CURSOR = "\x1b[?25h"

@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
-from ipsys_log.cli.options import (
-    AsJson,
-    Calibrations,
-    Logs,
-    RigFile,
-    annotate,
-    cameras_of,
-    check_present,
-    load_calibrations,
-    load_matching_rig,
-    log_option,
-)
+from ipsys_log.cli.console import console, print_json, print_outcomes, progress_bar, say
+from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
+from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, annotate, check_present, log_option
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.stages import ENTRIES, parameters_until
 
@@ -36,7 +25,12 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
-_Path = Optional[Path]  # noqa: UP045
+STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
+
+
+def _stage_lines() -> str:
+    return "\n\n".join(f"{entry.name}: {entry.help}" for entry in ENTRIES)
+
 
 # The options of every stage, and of the printed results: type with help, and default.
 _SHARED: dict[str, tuple[Any, Any]] = {
@@ -45,7 +39,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
     "calibration": (Calibrations, None),
     "run": (
         Annotated[
-            Optional[str],  # noqa: UP045
+            str | None,
             typer.Option(
                 "--run", metavar="NAME", help="Name of the new run, instead of edges, poly, poly_2 ..."
             ),
@@ -53,12 +47,12 @@ _SHARED: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "output": (
-        Annotated[_Path, log_option(help="Write the results to a new log, not to the last LOG.")],
+        Annotated[Path | None, log_option(help="Write the results to a new log, not to the last LOG.")],
         None,
     ),
     "jobs": (
         Annotated[
-            Optional[int],  # noqa: UP045
+            int | None,
             typer.Option(
                 "--jobs",
                 metavar="N",
@@ -74,7 +68,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
 _PRINTS: dict[str, tuple[Any, Any]] = {
     "plot": (
         Annotated[
-            _Path,
+            Path | None,
             typer.Option(metavar="FILE", help="Draw the floor and the errors: .png, .pdf, .svg or .jpg."),
         ],
         None,
@@ -90,7 +84,9 @@ _PRINTS: dict[str, tuple[Any, Any]] = {
         False,
     ),
     "plots": (
-        Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
+        Annotated[
+            Path | None, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")
+        ],
         None,
     ),
 }
@@ -100,25 +96,51 @@ _ORDER = (
     *("run", "output", "as_live", "skip_ambiguous", "jobs"),
 )
 
+# The end of a help text.
 MORE = "\n\nThe command runs missing stages first."
+_UNTIL = (
+    Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            metavar="STAGE",
+            help=f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse.",
+        ),
+    ],
+    None,
+)
+_REPLAY = f"""
+Run the missing stages of a log, append their results to it, and print the accuracy.
 
+With --until locate, fuse or smooth and without --model, the command continues the newest run, with its model
+and settings. These are all stages in their order; smooth only runs with --until smooth:
 
-def add_commands(app: typer.Typer) -> None:
-    """Add a command for each stage of the table, and the command of all stages."""
-    everything = options_until(None)
-    as_json = everything.pop("as_json")
-    app.command(
-        "replay",
-        help="Run the missing stages from detect to fuse, append their results, and print the accuracy.",
-    )(build_command({**everything, **_PRINTS, "as_json": as_json}, partial(_derive, None)))
-    for number, entry in enumerate(ENTRIES):
-        options = {**options_until(entry.name), **{name: _PRINTS[name] for name in entry.prints}}
-        text = entry.help + MORE * (number > 0)
-        app.command(entry.name, help=text)(build_command(options, partial(_derive, entry.name)))
+{_stage_lines()}
+
+Examples
+
+    ipsys replay calibration.mcap                      # fit and evaluate poly
+    ipsys replay calibration.mcap --model best --plot floor.png
+    ipsys replay monday.mcap --model-from calibration.mcap
+    ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
+    ipsys replay monday.mcap --until detect            # only the markers
+"""
+_EVALUATE = f"""
+Evaluate models: their errors, the learning curve and outliers of the measurements.
+
+The errors are on held-out calibration points and by cross-validation. Without --model, the command evaluates
+all models; joint only if the log has images or markers.{MORE}
+
+Examples
+
+    ipsys evaluate calibration.mcap                    # all models
+    ipsys evaluate calibration.mcap --details          # with details
+    ipsys evaluate calibration.mcap --model poly --model best --plots figures
+"""
 
 
 def options_until(name: str | None) -> dict[str, tuple[Any, Any]]:
-    """Return the options of a stage's command, with the parameters of all stages up to it; None: of all."""
+    """Return the options of a stage, with the parameters of all stages up to it; None: of all stages."""
     options = dict(_SHARED)
     as_json = options.pop("as_json")
     for parameter in parameters_until(name):
@@ -127,13 +149,16 @@ def options_until(name: str | None) -> dict[str, tuple[Any, Any]]:
     return {**ordered, **options, "as_json": as_json}
 
 
-def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that has only these options, by name: type with help, and default."""
+def build_command(
+    name: str, text: str, options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]
+) -> Callable[..., None]:
+    """Return a command with a help text and these options, by name: type with help, and default."""
 
     def command(**given: Any) -> None:
         work(**given)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
+    command.__name__, command.__doc__ = name, text
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(key, keyword, default=value, annotation=kind)
@@ -240,6 +265,20 @@ def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Se
     return added
 
 
+def _replay(until: str | None, **given: Any) -> None:
+    from ipsys_log.errors import IpsysError
+
+    if until is not None and until not in STAGE_NAMES:
+        raise IpsysError(f"--until {until}: is not a stage; use one of {', '.join(STAGE_NAMES)}")
+    unread = {parameter.name: parameter for parameter in parameters_until(None)}
+    for parameter in parameters_until(until):
+        del unread[parameter.name]
+    for name, parameter in unread.items():
+        if given.pop(name) != parameter.default:
+            raise IpsysError(f"--{name.replace('_', '-')}: has no effect on the stages up to {until}")
+    _derive(until, **given)
+
+
 def _derive(
     until: str | None,
     logs: Sequence[LogLocation],
@@ -258,7 +297,7 @@ def _derive(
     else:
         _print(accuracies, details)
     for line in drawn:
-        remarks.print(line)
+        say(line)
 
 
 def _check_figures(logs: Sequence[LogLocation], plot: Path | None, plots: Path | None) -> None:
@@ -297,13 +336,13 @@ def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> 
 
     stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
     results = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
-    print(json.dumps(results, indent=2, allow_nan=False))  # noqa: T201
+    print_json(results)
 
 
 def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
     """Print the answer first, then one table, and on request all numbers."""
-    from ipsys_log.report.summary import answer_text, models_table
-    from ipsys_log.report.tables import accuracy_tables, trajectory_table
+    from ipsys_log.report.summary import answer_text
+    from ipsys_log.report.tables import accuracy_tables, models_table, trajectory_table
 
     parts = [answer_text(accuracies), models_table(accuracies)]
     further = [*accuracy_tables(accuracies), trajectory_table(accuracies)] if details else []
@@ -312,7 +351,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
             console.print(part)
             console.print()
     if accuracies and not details:
-        remarks.print("--details prints errors by camera, every outlier and models by number of points")
+        say("--details prints errors by camera, every outlier and models by number of points")
 
 
 def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
@@ -321,6 +360,22 @@ def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
     if target is None:
         return
     if any(outcome.fresh for outcome in outcomes):
-        remarks.print(f"results are in {target}", markup=False)
+        say(f"results are in {target}")
     else:
-        remarks.print("nothing to do: all results are up to date")
+        say("nothing to do: all results are up to date")
+
+
+_options = options_until(None)
+_json = _options.pop("as_json")
+replay = build_command(
+    "replay",
+    _REPLAY,
+    {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json},
+    _replay,
+)
+evaluate = build_command(
+    "evaluate",
+    _EVALUATE,
+    {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]},
+    partial(_derive, "evaluate"),
+)

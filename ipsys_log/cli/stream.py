@@ -1,21 +1,46 @@
-"""The player: ``ipsys stream``."""
+"""Positions for other programs: ``ipsys stream``, its keys, and the options of all streams."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+import os
+import re
+import select
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ipsys_log.cli.console import say
-from ipsys_log.cli.dashboard import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.cli.options import LogList, log_argument
+from ipsys_log.cli.pages import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
-from ipsys_log.cli.stream_options import StreamOptions, choose_streams, takes_streams
+
+if TYPE_CHECKING:
+    from ipsys_log.messages import Rig
+    from ipsys_log.player import Player
+    from ipsys_log.sinks.streams.settings import StreamSettings
+
+# The options of the streams, by the names of `choose_streams`.
+StreamOptions = dict[str, Any]
+
+_PANEL = "Streams of positions"
+_SEEK_S = 5.0
+_TURN_S = 0.1
+_LEFT, _RIGHT = "\x1b[D", "\x1b[C"
+# An arrow sends three characters.
+_KEY = re.compile(r"\x1b\[[A-D]|.", re.DOTALL)
+_RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
 RigFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),
 ]
 Rate = Annotated[
@@ -28,11 +53,11 @@ StartOffset = Annotated[
     typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first position."),
 ]
 Run = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option("--run", metavar="NAME", help="Play the tracks of this run. Default: the newest."),
 ]
 Topics = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--topics",
         metavar="TOPIC",
@@ -49,8 +74,158 @@ Restamp = Annotated[
 ]
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(stream)
+def _option(kind: Any, flag: str, metavar: str | None, text: str, **limits: Any) -> Any:
+    return Annotated[kind, typer.Option(flag, metavar=metavar, help=text, rich_help_panel=_PANEL, **limits)]
+
+
+def _port(flag: str, text: str) -> Any:
+    return _option(int | None, flag, "PORT", text, min=1, max=65535)
+
+
+# The options by their names: the type with help, the default, and the name for `choose_streams`.
+_OPTIONS: dict[str, tuple[Any, Any, str]] = {
+    "udp": (
+        _option(
+            list[str] | None, "--udp", "HOST:PORT",
+            "Send positions as JSON datagrams to this address; repeat it for several. 239.255.0.1:9870 is a "
+            "multicast group. docs/streams.md has receivers in Python and for ESP32.",
+        ), None, "udp",
+    ),
+    "key": (
+        _option(Path | None, "--key", "FILE", "Sign the datagrams with the key in this file (HMAC-SHA256)."),
+        None, "key",
+    ),
+    "vrpn": (
+        _option(
+            bool, "--vrpn", None,
+            "Serve positions over VRPN on port 3883, as a motion-capture system: for ROS 2, MATLAB, Unity.",
+        ), False, "is_vrpn",
+    ),
+    "vrpn_port": (_port("--vrpn-port", "Serve VRPN on another port."), None, "vrpn"),
+    "mavlink": (
+        _option(
+            list[str] | None, "--mavlink", "ROBOT=HOST:PORT",
+            "Send the pose of a robot to its autopilot (PX4, ArduPilot); repeat it for several. With "
+            "/vision at the end, the message is VISION_POSITION_ESTIMATE instead of ODOMETRY.",
+        ), None, "mavlink",
+    ),
+    "ros2": (
+        _option(
+            bool, "--ros2", None,
+            "Publish positions to nodes of ROS 2 with rmw_zenoh, without ROS on this machine: /tf, and a "
+            "pose and odometry for each robot.",
+        ), False, "is_ros2",
+    ),
+    "ros2_port": (
+        _port(
+            "--ros2-port",
+            "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router.",
+        ), None, "ros2",
+    ),
+    "ros2_domain": (
+        _option(int | None, "--ros2-domain", "ID", "Publish to this domain ID of ROS 2. Default: 0."),
+        None, "ros2_domain",
+    ),
+    "foxglove": (
+        _option(
+            bool, "--foxglove", None,
+            "Serve positions to Foxglove on port 8765. The printed address has a new secret at each start.",
+        ), False, "is_foxglove",
+    ),
+    "foxglove_port": (_port("--foxglove-port", "Serve Foxglove on another port."), None, "foxglove"),
+    "rerun": (
+        _option(bool, "--rerun", None, "Show positions in Rerun, in a browser of this machine."),
+        False, "rerun",
+    ),
+    "images": (
+        _option(bool, "--images", None, "Show images, too, in Foxglove and in Rerun."), False, "images",
+    ),
+    "host": (
+        _option(
+            str | None, "--host", "ADDRESS",
+            "Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. "
+            "The dashboard of --web is then open to the network, too. Default: only this machine.",
+        ), None, "host",
+    ),
+    "robot": (
+        _option(
+            list[str] | None, "--robot", "NAME", "Send only this robot; repeat it for several. Default: all.",
+        ), None, "robots",
+    ),
+}  # fmt: skip
+
+
+def takes_streams(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of the streams, in place of its keyword ``streams``."""
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [p for own in signature.parameters.values() for p in _expand(own)]
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        streams = {name: given.pop(option) for option, (_, _, name) in _OPTIONS.items()}
+        command(**given, streams=streams)
+
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
+
+
+def _expand(parameter: inspect.Parameter) -> Iterator[inspect.Parameter]:
+    if parameter.name != "streams":
+        yield parameter
+        return
+    for option, (kind, default, _) in _OPTIONS.items():
+        yield inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+def choose_streams(
+    rig: Rig | None, folder: Path, *, has_page: bool = False, **options: Any
+) -> StreamSettings:
+    """Return the streams of the options; where an option is missing, those of the rig file.
+
+    Parameters
+    ----------
+    rig : the rig of a file, never of a log: a log opens no socket.
+    folder : the folder of the rig file.
+    has_page : the command also serves a page at the address of ``host``.
+    options : fields of `StreamSettings`, and ``is_vrpn``, ``is_ros2`` and ``is_foxglove`` for the usual
+        port; None, False and empty lists are missing.
+
+    Raises
+    ------
+    IpsysError
+        There is no stream for an option, or the rig has no such robot.
+    """
+    from ipsys_log.rig.file import check_robots
+    from ipsys_log.sinks.streams.settings import PORTS, settings_of_rig
+
+    for name, port in PORTS.items():
+        if options.pop(f"is_{name}", False):
+            options[name] = options.get(name) or port
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in options.items()
+        if value is not None and value is not False and value != []
+    }
+    settings = replace(settings_of_rig(None if rig is None else rig.stream, folder), **given)
+    _check_effect(given.keys() - {"host"} if has_page else given, settings)
+    if rig is not None:
+        check_robots(rig, settings.named_robots, "--robot")
+    return settings
+
+
+def _check_effect(given: Collection[str], settings: StreamSettings) -> None:
+    """Check that each option belongs to a stream."""
+    from ipsys_log.errors import IpsysError
+
+    names = {"robots": "robot", "ros2_domain": "ros2-domain"}
+    if given and not settings:
+        name = names.get(next(iter(given)), next(iter(given)))
+        raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
+    if "ros2_domain" in given and settings.ros2 is None:
+        raise IpsysError("--ros2-domain: has no effect without ROS 2; add --ros2")
+    if "images" in given and not settings.has_viewer:
+        raise IpsysError("--images: has no effect without a viewer; add --foxglove or --rerun")
 
 
 @runs_until_stopped
@@ -76,9 +251,14 @@ def stream(
     The positions are those of a run; the command computes none. Keys: space pauses, . plays the next
     position, left and right move by 5 s, + and - change the rate, l loops, q ends. With --rig lab.toml, the
     command opens the streams of this file; a log itself opens no stream. With --web, a page shows the log.
+
+    Examples
+
+        ipsys stream monday.mcap --udp 127.0.0.1:9870 --rate 2
+        ipsys stream monday.mcap --udp 192.168.1.20:9870 --host 0.0.0.0 --loop
+        ipsys stream monday.mcap --vrpn --start-offset 20    # port 3883
     """
     allow_interrupt("stopped before the first position was sent")
-    from ipsys_log.cli.keys import read_keys
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.player import Player
@@ -104,3 +284,71 @@ def stream(
         with read_keys(player, say):
             say(f"playing {', '.join(player.runs) or 'ground truth'}: {player.duration_s:.1f} s")
             player.wait()
+
+
+@contextmanager
+def read_keys(player: Player, say: Callable[[str], None]) -> Iterator[None]:
+    """Let the keys of the terminal control a player; without a terminal, or in the background, do nothing.
+
+    The terminal gets its settings back at the end of the block.
+    """
+    if not (sys.stdin.isatty() and _is_in_foreground(sys.stdin.fileno())):
+        yield
+        return
+    import termios  # only this function needs a terminal, and some systems have none
+    import tty
+
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+    ended = threading.Event()
+    reader = threading.Thread(target=_read, args=(terminal, player, say, ended), name="keys", daemon=True)
+    try:
+        tty.setcbreak(terminal, termios.TCSANOW)  # keys that wait are kept
+        reader.start()
+        yield
+    finally:
+        ended.set()
+        reader.join()
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def _is_in_foreground(terminal: int) -> bool:
+    """Return False for a background job: the system stops one that changes or reads its terminal."""
+    try:
+        return os.tcgetpgrp(terminal) == os.getpgrp()
+    except OSError:  # the terminal of no other job
+        return True
+
+
+def _read(terminal: int, player: Player, say: Callable[[str], None], ended: threading.Event) -> None:
+    while not ended.is_set():
+        if select.select([terminal], [], [], _TURN_S)[0]:
+            pressed = os.read(terminal, 16).decode(errors="replace")
+            if not pressed:  # the terminal was closed
+                return
+            for key in _KEY.findall(pressed):
+                press(player, key)
+            state = "paused" if player.is_paused else f"rate {player.rate:g}"
+            loops = ", loop" if player.loop else ""
+            say(f"{player.position_s:.2f} of {player.duration_s:.2f} s, {state}{loops}")
+
+
+def press(player: Player, key: str) -> None:
+    """Carry out the command of a key; ignore all other keys."""
+    if key == " ":
+        if player.is_paused:
+            player.resume()
+        else:
+            player.pause()
+    elif key == ".":
+        player.step()
+    elif key in (_LEFT, _RIGHT):
+        player.seek(player.position_s + (_SEEK_S if key == _RIGHT else -_SEEK_S))
+    elif key == "+":
+        player.rate = min((rate for rate in _RATES if rate > player.rate), default=player.rate)
+    elif key == "-":
+        player.rate = max((rate for rate in _RATES if rate < player.rate), default=player.rate)
+    elif key == "l":
+        player.loop = not player.loop
+    elif key == "q":
+        player.stop()

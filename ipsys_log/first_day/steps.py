@@ -188,7 +188,7 @@ def _alignment_step(alignment: LogFacts | None, cameras: tuple[RigCamera, ...], 
 
 def _points_step(rig: Rig | None, logs: tuple[LogFacts, ...], missing: str) -> StepState:
     count = sum(log.points for log in logs)
-    title, command = "Calibration points", "ipsys measure --rig lab.toml -o calibration.mcap"
+    title, command = "Calibration points", "ipsys record --measure --points-only -o calibration.mcap"
     if rig is not None and not missing:
         try:
             check_references(rig)

@@ -8,12 +8,11 @@ from functools import partial
 
 import numpy as np
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.checked_chunk import CheckedMessage, Entries, Rows, check_messages
 from ipsys_log.log.chunks import check_compression, parse_chunk_contents, unpack
 from ipsys_log.log.contents import RawMessage
-from ipsys_log.log.hashing import WORTH_COMBINING
 from ipsys_log.log.order import Cursor
 from ipsys_log.log.records import (
     CHUNK_HEAD_SIZE,
@@ -29,6 +28,8 @@ ALWAYS = (0, (1 << 64) - 1)  # ns
 _GAP = 4096  # bytes: to read a smaller gap costs less than another system call
 _RUN = 256 << 10  # bytes read at once
 _LONG = 16 << 10  # bytes: to copy a longer message costs more than another system call
+Rows = NDArray[np.uint64]  # shape (N, 2): log time in ns, offset in the chunk or the file
+Entries = Mapping[int, Rows]  # by channel id
 Run = tuple[int, int]  # start and end of a byte range
 
 
@@ -200,7 +201,7 @@ class _Messages:
             self.spare -= length
             if self.spare < 0:
                 raise self.view.fault(self.chunk_offset, "its message indexes name bytes more than once")
-            yield _new(RawMessage, (topic, time, published, payload, None))
+            yield _new(RawMessage, (topic, time, published, payload))
 
 
 @dataclass(slots=True)
@@ -239,20 +240,14 @@ def open_chunk(
     topics: Mapping[int, str],
     span: tuple[int, int],
     is_checked: bool = False,
-    next_chunk: ChunkRef | None = None,
 ) -> Cursor:
     """Return a cursor over the messages of the channels in `topics` with start <= log time <= end.
 
-    With `is_checked`, the chunk is read as a whole, and its CRC is checked. `next_chunk` is the chunk to be
-    read from the disk meanwhile.
+    With `is_checked`, the chunk is read as a whole, and its CRC is checked.
     """
-    if next_chunk is not None:
-        view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
     offset, size = chunk.offset, chunk.uncompressed_size
     check_compression(view, chunk.compression)
     entries = chunk_entries(view, chunk, cache.searched)
-    if is_checked and size >= sum(map(len, entries.values())) * WORTH_COMBINING > 0:
-        return _open_checked(view, chunk, entries, topics, span)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
     if is_checked or chunk.compression:
@@ -263,38 +258,6 @@ def open_chunk(
     times, offsets = rows.T.tolist()
     messages = _Messages(view, topics, offset, times, offsets, ranges, fetch, records.read, size)
     return Cursor(offset, times, offsets, messages.read_rows)
-
-
-@dataclass(slots=True)
-class _CheckedMessages:
-    """The wanted messages of one chunk, by row, with their CRC-32."""
-
-    topics: Mapping[int, str]
-    data: memoryview
-    rows: list[CheckedMessage]
-
-    def read_rows(self, first: int, stop: int) -> Iterator[RawMessage]:
-        """Yield the messages of rows `first` to `stop`."""
-        for key, log_ns, publish_ns, _, start, end, crc in self.rows[first:stop]:
-            yield RawMessage(self.topics[key], log_ns, publish_ns, bytes(self.data[start:end]), crc)
-
-
-def _open_checked(
-    view: LogBytes, chunk: ChunkRef, entries: Entries, topics: Mapping[int, str], span: tuple[int, int]
-) -> Cursor:
-    """Return a cursor over the long messages of a chunk; one pass computes all CRCs."""
-    head = parse_chunk_head(view, chunk.offset)[1]
-    data = unpack(view, chunk.offset, head, is_crc_checked=False)
-    messages, _ = check_messages(view, chunk.offset, data, entries, head.crc)
-    rows = [one for one in messages if one.channel in topics and span[0] <= one.log_time_ns <= span[1]]
-    rows.sort(key=lambda one: (one.log_time_ns, one.offset))
-    longest = max((one.end - one.start for one in rows), default=0)
-    if longest > view.read_limits.max_payload:
-        raise view.refusal(
-            f"one of its messages has {longest} bytes, more than {view.read_limits.max_payload}"
-        )
-    times, offsets = [one.log_time_ns for one in rows], [one.offset for one in rows]
-    return Cursor(chunk.offset, times, offsets, _CheckedMessages(topics, memoryview(data), rows).read_rows)
 
 
 def open_unchunked(

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -19,10 +18,10 @@ from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import ReadLimits
 from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
-from ipsys_log.log.checked_chunk import Rows
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
     RangeCache,
+    Rows,
     chunk_entries,
     open_chunk,
     open_unchunked,
@@ -154,7 +153,6 @@ class LogReader:
         topics: Collection[str] | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
-        without: Collection[int] = (),
         is_checked: bool = False,
     ) -> Iterator[RawMessage]:
         """Return the messages in log order: by log time, then by offset in the file.
@@ -165,10 +163,8 @@ class LogReader:
             The topics to read; None means all topics. A topic that is not in the log has no messages.
         start_ns, end_ns
             Half-open range of log time in ns: start <= log time < end.
-        without
-            Offsets of chunks that are left out.
         is_checked
-            Read each chunk as a whole, and check its CRC. The next chunk is read from the disk meanwhile.
+            Read each chunk as a whole, and check its CRC.
 
         Raises
         ------
@@ -181,19 +177,15 @@ class LogReader:
         chunks = [
             chunk
             for chunk in self._chunks_with(wanted)
-            if chunk.start_ns <= span[1] and chunk.end_ns >= span[0] and chunk.offset not in without
+            if chunk.start_ns <= span[1] and chunk.end_ns >= span[0]
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
-        next_chunks = self._next_chunks(chunks) if is_checked else {}
         pending = [
             PendingChunk(
                 chunk.start_ns,
                 chunk.offset,
-                partial(
-                    open_chunk,
-                    *(view, self._cache, chunk, wanted, span, is_checked, next_chunks.get(chunk.offset)),
-                ),
+                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
             )
             for chunk in chunks
         ]
@@ -202,12 +194,6 @@ class LogReader:
             unchunked = partial(open_unchunked, view, self._cache, entries, wanted, span, contents.data_end)
             pending.append(PendingChunk(0, 0, unchunked))
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
-
-    @staticmethod
-    def _next_chunks(chunks: Sequence[ChunkRef]) -> dict[int, ChunkRef]:
-        """Return the chunk that is read after each chunk, by its offset."""
-        ordered = sorted(chunks, key=lambda chunk: (chunk.start_ns, chunk.offset))
-        return {before.offset: chunk for before, chunk in pairwise(ordered)}
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""

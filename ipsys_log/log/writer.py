@@ -230,13 +230,10 @@ class LogWriter:
         self._channels[topic] = (channel.id, self._images if image else self._small)
         self._declared[topic] = schema, message_encoding
 
-    def adopt_channel(
-        self, channel: mcap.Channel, schema: mcap.Schema | None, is_distinct: bool = False
-    ) -> int:
+    def adopt_channel(self, channel: mcap.Channel, schema: mcap.Schema | None) -> int:
         """Declare a channel of another log; return its id here, which is the same if this id is free.
 
-        A channel with the same topic and schema is continued, with `is_distinct` only if its metadata are the
-        same, too.
+        A channel with the same topic, schema and metadata is continued.
 
         Raises
         ------
@@ -247,14 +244,7 @@ class LogWriter:
         own = Schema(schema.name, schema.encoding, schema.data) if schema else None
         self._check_kind(channel.topic, own, channel.message_encoding)
         known = (c for c in self._contents.channels.values() if c.topic == channel.topic)
-        same = next(
-            (
-                c
-                for c in known
-                if self._schema_of(c) == own and not (is_distinct and c.metadata != channel.metadata)
-            ),
-            None,
-        )
+        same = next((c for c in known if self._schema_of(c) == own and c.metadata == channel.metadata), None)
         if same is None:
             schema_id = self._schema_id(own, schema.id) if own and schema else 0
             key = self._free_id(self._contents.channels, channel.id)
@@ -318,12 +308,8 @@ class LogWriter:
         """Return the hash of the messages that this writer has written to a channel."""
         return self._hashes.get(topic, ChannelHash())
 
-    def write(
-        self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes, crc: int | None = None
-    ) -> None:
+    def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Add a message to a channel that was declared with `add_channel`; times in ns.
-
-        `crc` is the CRC-32 of the data if the caller knows it.
 
         Raises
         ------
@@ -345,7 +331,7 @@ class LogWriter:
         state = self._hashes.get(topic)
         if state is None:
             state = self._hashes[topic] = self._hash_so_far(topic)
-        crc = zlib.crc32(data) if crc is None else crc
+        crc = zlib.crc32(data)
         state.add_row(log_time_ns, publish_time_ns, len(data), crc)
         sequence = state.count & 0xFFFFFFFF
         if self._contents.unchunked:

@@ -44,7 +44,7 @@ def marker_corners(session: Session) -> dict[tuple[str, int], list[NDArray[np.fl
     if run is None:
         raise IpsysError(
             f"{session}: has no markers, which --blur keeps sharp; run: "
-            f"ipsys detect {shell_words(*session.paths)}"
+            f"ipsys replay --until detect {shell_words(*session.paths)}"
         )
     return {
         (str(message.camera), message.log_time_ns): [

@@ -34,7 +34,7 @@ def kept_channels(session: Session, without_images: bool) -> set[str]:
     elif session.images:
         raise IpsysError(
             f"{session}: has no markers, which a pack without images needs; run: "
-            f"ipsys detect {shell_words(*session.paths)}"
+            f"ipsys replay --until detect {shell_words(*session.paths)}"
         )
     return kept
 

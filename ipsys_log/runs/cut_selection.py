@@ -217,7 +217,8 @@ def _frames_with(session: Session, robots: Collection[str]) -> dict[str, Times]:
                     times.setdefault(str(message.camera), []).append(message.log_time_ns)
             return {camera: np.array(of_one, np.int64) for camera, of_one in times.items()}
     raise IpsysError(
-        f"{session}: has no markers, so the robots in its frames are not known; run: ipsys detect"
+        f"{session}: has no markers, so the robots in its frames are not known; run: "
+        "ipsys replay --until detect"
     )
 
 

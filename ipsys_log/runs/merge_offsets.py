@@ -77,8 +77,8 @@ def _estimate(session: Session, earlier: Sequence[MarkerPath], own: Sequence[Mar
     except FitError as error:
         raise IpsysError(
             f"{session}: its clock offset cannot be estimated from markers in its images and in those of the "
-            f"earlier logs: {error}; let a robot stop and go where both see it, run ipsys detect on a log "
-            f"with skipped frames, or give {option}"
+            f"earlier logs: {error}; let a robot stop and go where both see it, run ipsys replay --until "
+            f"detect on a log with skipped frames, or give {option}"
         ) from None
     return LogOffset(round(estimate.offset_s * NS_PER_S), estimate.sigma_s)
 
@@ -94,8 +94,9 @@ def _marker_paths(session: Session, zero_ns: int) -> list[MarkerPath]:
     run = newest_run(session, MARKERS)
     if run is None:
         raise IpsysError(
-            f"{session}: has no markers, so its clock offset cannot be estimated; run: ipsys detect "
-            f"{shell_words(*session.paths)}, or give all offsets: --offset {session.paths[0].stem}=SECONDS"
+            f"{session}: has no markers, so its clock offset cannot be estimated; run: "
+            f"ipsys replay --until detect {shell_words(*session.paths)}, or give all offsets: "
+            f"--offset {session.paths[0].stem}=SECONDS"
         )
     rows: defaultdict[tuple[str, int], list[tuple[int, float, float]]] = defaultdict(list)
     for message in session.messages(session.topics(MARKERS, run)):

@@ -83,7 +83,8 @@ def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
     wanted = f"model {name}" if name else "model"
     option = f" --model {name}" if name else ""
     raise IpsysError(
-        f"{other}: has no fitted {wanted}; to fit one: ipsys fit {shell_words(*other.paths)}{option}"
+        f"{other}: has no fitted {wanted}; to fit one: "
+        f"ipsys replay {shell_words(*other.paths)} --until fit{option}"
     )
 
 

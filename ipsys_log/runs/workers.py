@@ -204,7 +204,8 @@ def serve() -> None:
     """Compute the pieces with the numbers from the pipe, until it ends. A worker's main function."""
     receiver, sender = parent_pipe()
     try:
-        _serve(*receiver.recv(), receiver, sender)
+        run, pieces = receiver.recv()
+        _serve(run, pieces, receiver, sender)
     except (EOFError, ConnectionError):
         os._exit(0)  # the process that waits for results has ended
 

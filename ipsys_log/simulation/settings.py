@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+import tomllib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
 from enum import IntEnum
+from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
 
@@ -188,6 +191,40 @@ class LabSettings:
         if self.grid is None:
             return FLOOR_M, FLOOR_M
         return self.grid[0] * _HALL_SPACING_M[0], self.grid[1] * _HALL_SPACING_M[1]
+
+
+def read_settings(file: Path | None, changes: Iterable[str]) -> dict[str, Any]:
+    """Read settings of `LabSettings` by name, from a TOML file and then from texts such as ``stations=25``.
+
+    Raises
+    ------
+    IpsysError
+        The file or a text is not TOML, has no such setting, or a value of another type.
+    """
+    given: dict[str, Any] = {}
+    texts = [] if file is None else [(str(file), file.read_bytes())]
+    texts += [(f"--set {change}", change.encode()) for change in changes]
+    for where, text in texts:
+        try:
+            table = tomllib.loads(text.decode())
+        except ValueError as error:
+            raise IpsysError(f"{where}: is not TOML ({error}); write a setting as stations = 25") from error
+        given |= dict(_typed(table, where))
+    return given
+
+
+def _typed(table: dict[str, Any], where: str) -> Iterator[tuple[str, Any]]:
+    """Yield settings with the types of their defaults: TOML has 1 for 1.0, and arrays for tuples."""
+    defaults: dict[str, Any] = {f.name: f.default for f in fields(LabSettings) if f.name != "grid"}
+    for name, value in table.items():
+        if name not in defaults:
+            raise IpsysError(f"{where}: there is no setting {name!r}; use one of {', '.join(defaults)}")
+        default = defaults[name]
+        is_convertible = (type(value), type(default)) in ((list, tuple), (int, float))
+        typed = type(default)(value) if is_convertible else value
+        if type(typed) is not type(default):
+            raise IpsysError(f"{where}: {name} is {value!r}; give a value such as {default!r}")
+        yield name, typed
 
 
 def parse_grid(text: str) -> tuple[int, int]:

@@ -185,7 +185,7 @@ def _check_stage(session: Session, stage: Recorded) -> LogFinding:
         return LogFinding("run", REMARK, text, "", topic)
     if stage.state == "unfinished" or stage.out_of_date:
         return LogFinding("run", REMARK, text, "ipsys replay computes it again", topic)
-    if any(not topic.endswith(f"/{_IMAGE_NAME}") for topic in missing) and not (is_copy or stage.is_part):
+    if any(not topic.endswith(f"/{_IMAGE_NAME}") for topic in missing) and not (is_copy or stage.is_copied):
         text = f"run {run.run}, {run.stage}: its input {missing[0]} is not in the log"
         return LogFinding("run", REMARK, text, "give the log with this input too", topic)
     return LogFinding("run", NOTE, text, "", topic)

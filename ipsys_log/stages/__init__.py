@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageParameter:
-    """A parameter of a stage that the user sets, as an option of its command and of those of later stages.
+    """A parameter of a stage that the user sets, as an option of ``ipsys replay``.
 
     Attributes
     ----------
@@ -41,16 +41,15 @@ class StageEntry:
 
     Attributes
     ----------
-    name : of its command and of its row. The module with the row has underscores instead of dashes.
-    help : of its command.
+    name : of its row, and for ``ipsys replay --until``. The module with the row has underscores instead of
+        dashes.
+    help : one sentence.
     parameters : those that its plan reads; later stages have them too.
-    prints : names of further options of its command, about its printed result.
     """
 
     name: str
     help: str
     parameters: tuple[StageParameter, ...] = ()
-    prints: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
@@ -113,8 +112,6 @@ SEED = StageParameter(
     least=0,
 )
 
-_CONTINUES = "\n\nWithout --model, the command continues the newest run, with its model and settings."
-
 # Each stage comes after the stages that write its channels.
 ENTRIES: tuple[StageEntry, ...] = (
     StageEntry(
@@ -134,18 +131,11 @@ ENTRIES: tuple[StageEntry, ...] = (
     ),
     StageEntry(
         name="evaluate",
-        help="Evaluate models: their errors, the learning curve and outliers of the measurements.\n\n"
-        "The errors are on held-out calibration points and by cross-validation. Without --model, the command "
-        "evaluates all models; joint only if the log has images or markers.",
-        prints=("plots", "details"),
+        help="Evaluate models: their errors, the learning curve and outliers of the measurements.",
     ),
-    StageEntry(name="locate", help="Apply a model: compute world positions from each camera." + _CONTINUES),
-    StageEntry(
-        name="fuse", help="Filter the positions of all cameras into one track per robot." + _CONTINUES
-    ),
-    StageEntry(
-        name="smooth", help="Smooth the tracks by the sightings before and after each pose." + _CONTINUES
-    ),
+    StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),
+    StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),
+    StageEntry(name="smooth", help="Smooth the tracks by the sightings before and after each pose."),
 )
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,10 @@ import pytest
 import typer.main
 
 from ipsys_log import pipeline
-from ipsys_log.cli.app import app
-from ipsys_log.cli.setup import SETTINGS
+from ipsys_log.cli.app import app, present_words
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.rig.file import check_rig, load_rig
 from ipsys_log.runs.options import Request
-from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT, Ipsys
 
 
@@ -67,26 +65,95 @@ def test_init_writes_a_rig_that_can_be_read(ipsys: Ipsys, tmp_path: Path) -> Non
     assert path.read_text() == text
 
 
-def test_the_defaults_of_simulate_are_those_of_the_library() -> None:
-    defaults = {field.name: field.default for field in fields(LabSettings)}
-    assert {name: default for name, (default, _) in SETTINGS.items()} == {n: defaults[n] for n in SETTINGS}
+# Old forms of commands, which work for one release, with the present ones.
+OLD_FORMS = [
+    ("runs a.mcap --json", "info --runs a.mcap --json"),
+    ("du a.mcap b.mcap", "info --sizes a.mcap b.mcap"),
+    ("latency a.mcap --plot a.png", "info --latency a.mcap --plot a.png"),
+    ("diff a.mcap b.mcap --run poly", "verify --compare a.mcap b.mcap --run poly"),
+    ("diff a.mcap --run poly --run best", "verify --compare a.mcap --run poly --run best"),
+    ("compact a.mcap --dry-run", "cut --compact a.mcap --dry-run"),
+    ("detect a.mcap --corners stock", "replay --until detect a.mcap --corners stock"),
+    ("camera-frame a.mcap", "replay --until camera-frame a.mcap"),
+    ("fit a.mcap --model best", "replay --until fit a.mcap --model best"),
+    ("locate a.mcap", "replay --until locate a.mcap"),
+    ("fuse a.mcap", "replay --until fuse a.mcap"),
+    ("smooth a.mcap", "replay --until smooth a.mcap"),
+    ("import imsel data -o a.mcap", "import --as imsel data -o a.mcap"),
+    ("import images -o a.mcap data", "import --as images -o a.mcap data"),
+    ("import videos red=a.mp4 -o a.mcap", "import --as videos red=a.mp4 -o a.mcap"),
+    ("import ros a.bag -o a.mcap", "import --as ros a.bag -o a.mcap"),
+    ("import truth a.csv --into a.mcap", "import --as truth a.csv --into a.mcap"),
+    ("import detections a.csv --into a.mcap", "import --as detections a.csv --into a.mcap"),
+    ("import pairs a.csv -o a.mcap", "import --as pairs a.csv -o a.mcap"),
+    (
+        "measure --rig lab.toml --output a.mcap --json",
+        "record --measure --points-only --rig lab.toml --output a.mcap --json",
+    ),
+    ("simulate -o a.mcap --seed 3 --drive-s=4", "simulate -o a.mcap --seed 3 --set drive_s=4"),
+    ("simulate --width 960 -o a.mcap", "simulate --set width=960 -o a.mcap"),
+]
 
 
-def test_simulate_gives_the_same_bytes_for_a_seed(ipsys: Ipsys, tmp_path: Path) -> None:
-    small = {
-        "width": 640,
-        "height": 360,
-        "stations": 4,
-        "frames-per-station": 1,
-        "rate-hz": 5,
-        "drive-s": 0.4,
+@pytest.mark.parametrize(("old", "present"), OLD_FORMS, ids=[old.split()[0] for old, _ in OLD_FORMS])
+def test_old_form_is_a_present_command(old: str, present: str) -> None:
+    assert present_words(old.split()) == present.split() == present_words(present.split())
+    name, *words = present.split()
+    typer.main.get_group(app).commands[name].make_context(name, words)
+
+
+def test_old_and_present_name_give_the_same_result(ipsys: Ipsys, replayed_lab: Path) -> None:
+    old, present = ipsys("runs", replayed_lab, "--json"), ipsys("info", replayed_lab, "--runs", "--json")
+    assert old == present
+    both = json.loads(ipsys("info", replayed_lab, "--runs", "--sizes", "--json").out)
+    assert both["runs"] == json.loads(present.out)
+    assert [both["sizes"]] == [json.loads(ipsys("du", replayed_lab, "--json").out)]
+
+
+def test_folder_with_the_name_of_a_kind_is_a_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("images").mkdir()
+    words = ["import", "images", "-o", "a.mcap"]
+    assert present_words(words) == words
+
+
+def test_first_help_screen_has_few_commands_and_lists_the_others(ipsys: Ipsys) -> None:
+    first, _, more = ipsys("--help").out.partition("More commands")
+    names = set(typer.main.get_group(app).commands)
+    described = {
+        line.split()[1] for line in first.splitlines() if line.startswith("│ ") and line[2].isalpha()
     }
-    options = [word for name, value in small.items() for word in (f"--{name}", value)]
-    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
-        assert ipsys("simulate", "-o", tmp_path / f"{name}.mcap", "--seed", seed, *options).code == 0
-    a, b, c = (tmp_path / f"{name}.mcap" for name in "abc")
-    assert a.read_bytes() == b.read_bytes()
-    assert a.read_bytes() != c.read_bytes()
+    assert described <= names
+    assert len(described) <= 18
+    lines = re.findall(r"^ +[A-Z][a-z ]+: ([a-z, -]+)$", more.split("The help of")[0], re.MULTILINE)
+    listed = {name.strip() for line in lines for name in line.split(",")}
+    assert described | listed == names
+
+
+def test_simulate_reads_settings_from_a_file(ipsys: Ipsys, tmp_path: Path) -> None:
+    small = "width = 640\nheight = 360\nstations = 4\nframes_per_station = 1\nrate_hz = 5\ndrive_s = 0.4\n"
+    (tmp_path / "small.toml").write_text(small)
+    logs = [tmp_path / f"{name}.mcap" for name in "abc"]
+    for log, seed in zip(logs, (7, 7, 8), strict=True):
+        done = ipsys("simulate", "-o", log, "--seed", seed, "--settings", tmp_path / "small.toml")
+        assert done.code == 0, done.err
+    same, again, other = (log.read_bytes() for log in logs)
+    assert same == again != other
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ("bright=3", "there is no setting 'bright'; use one of seed, width"),
+        ("width=wide", "is not TOML"),
+        ("width=1.5", "width is 1.5; give a value such as 1920"),
+        ("width=10", "simulator setting width is 10"),
+    ],
+)
+def test_wrong_setting_is_refused(ipsys: Ipsys, tmp_path: Path, change: str, text: str) -> None:
+    done = ipsys("simulate", "-o", tmp_path / "a.mcap", "--set", change)
+    assert done.code == 1
+    assert text in done.err
 
 
 def test_info_says_what_is_in_a_log(ipsys: Ipsys, replayed_lab: Path) -> None:

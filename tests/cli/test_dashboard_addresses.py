@@ -7,8 +7,8 @@ from threading import Thread
 import pytest
 from rich.console import Console
 
-from ipsys_log.cli import dashboard
-from ipsys_log.cli.dashboard import _print_addresses
+from ipsys_log.cli import pages
+from ipsys_log.cli.pages import _print_addresses
 from ipsys_log.web.server import PageServer, ServerExceptions, qr_code
 
 VIEW, OPERATE = "http://10.0.0.7:8000/?key=abc", "http://10.0.0.7:8000/?key=def"
@@ -19,8 +19,8 @@ def printed(
 ) -> tuple[list[str], list[str]]:
     """Return the lines of the output and those of the remarks."""
     shown, said = Console(width=width, record=True), Console(width=200, record=True)
-    monkeypatch.setattr(dashboard, "console", shown)
-    monkeypatch.setattr(dashboard, "remarks", said)
+    monkeypatch.setattr(pages, "console", shown)
+    monkeypatch.setattr("ipsys_log.cli.console.remarks", said)
     _print_addresses(PageServer(url, Thread(), ServerExceptions(), view_url), is_secret)
     return shown.export_text().splitlines(), said.export_text().splitlines()
 

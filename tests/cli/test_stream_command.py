@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 import ipsys_log
-from ipsys_log.cli.keys import press, read_keys
+from ipsys_log.cli.stream import press, read_keys
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigMarker, RigStream
 from ipsys_log.messages.channels import RIG, TRACKS

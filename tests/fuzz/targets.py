@@ -38,8 +38,6 @@ from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
 from tests.web.test_measuring_page import Recording
 
-__all__ = ["TARGETS", "Target", "attack"]
-
 _MOST_CPU_S = 5.0
 
 Target = tuple[st.SearchStrategy[Any], Callable[[Any], None]]

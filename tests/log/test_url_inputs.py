@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import api
-from ipsys_log.cli.options import load_calibrations
+from ipsys_log.cli.lab_inputs import load_calibrations
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session

@@ -1,6 +1,6 @@
 """A stage for tests, in the form of a new stage: one file, one entry, and one channel.
 
-Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.damping damp LOG``.
+Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.damping replay LOG``.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from ipsys_log.messages import Message, Tracks, channels
 from ipsys_log.messages.channels import TRACKS, Channel
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.stages import StageEntry, StageParameter
-
-__all__ = ["DAMPED_TRACKS", "ENTRY", "STAGE"]
 
 DAMPED_TRACKS = Channel(name="damped_tracks", topic="/runs/{run}/damped_tracks", payloads=(Tracks,))
 ENTRY = StageEntry(

@@ -21,7 +21,7 @@ from typing import TypeVar
 import pytest
 import uvicorn
 
-from ipsys_log.cli.measure_live import say_faults
+from ipsys_log.cli.pages import say_faults
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.survey.scene import CameraView

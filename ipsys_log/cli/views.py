@@ -1,24 +1,24 @@
-"""Commands that show or repair a log: ``ipsys info``, ``runs``, ``view``, ``report`` and ``repair``."""
+"""Views of a log in other programs: ``ipsys view``, ``report`` and ``export``."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
-from ipsys_log.cli.options import AsJson, ReadLogs, appended_log_argument
-from ipsys_log.cli.signals import writes_nothing
+from ipsys_log.cli.console import console, progress_bar, say
+from ipsys_log.cli.options import ReadLogs
 from ipsys_log.cli.stages import MORE, build_command, derive, options_until
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
 
+_COUNTED = ("bag", "video", "pictures")
 Runs = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),
 ]
 Save = Annotated[
@@ -37,90 +37,21 @@ FoxgloveLayout = Annotated[
 ]
 _HTML = (
     Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--html", metavar="FILE", help="The page to write. Default: the log's name with .html."),
     ],
     None,
 )
-_HELP = (
-    "Write an HTML page on a session: its accuracy, its recording and its runs.\n\n"
-    "The page needs no network. Without calibration points, it has no accuracy. For a log of ipsys drive, "
-    f"it has the errors of the robots, and figure 12 of the paper.{MORE}"
-)
+_REPORT = f"""
+Write an HTML page on a session: its accuracy, its recording and its runs.
 
+The page needs no network. Without calibration points, it has no accuracy. For a log of ipsys drive, it has
+the errors of the robots, and figure 12 of the paper.{MORE}
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(info)
-    app.command()(runs)
-    app.command()(repair)
-    app.command()(view)
-    options = options_until("evaluate")
-    del options["as_json"]
-    app.command("report", help=_HELP)(build_command({**options, "html": _HTML}, _report))
+Examples
 
-
-@writes_nothing
-def info(logs: ReadLogs, as_json: AsJson = False) -> None:
-    """Show cameras, channels, counts, rates, gaps and runs of a log."""
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.report.contents import contents_json, contents_tables
-
-    with Session(logs) as session:
-        contents = contents_json(session)
-    if as_json:
-        print(json.dumps(contents, indent=2))  # noqa: T201
-    else:
-        for number, table in enumerate(contents_tables(contents)):
-            if number:
-                console.print()
-            console.print(table)
-
-
-@writes_nothing
-def runs(logs: ReadLogs, as_json: AsJson = False) -> None:
-    """Show the runs of a log: stage, inputs, parameters, version of ipsys, and state.
-
-    A run is current, out of date, not repeatable or unfinished. If it is out of date, the reason follows, and
-    ipsys replay makes a new run. Inputs of a run that is not repeatable are not in the log. The writer of an
-    unfinished run was stopped.
-    """
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.report.contents import runs_table, states_json
-
-    with Session(logs) as session:
-        states = states_json(session)
-    if as_json:
-        print(json.dumps(states, indent=2))  # noqa: T201
-    else:
-        console.print(runs_table(states))
-
-
-def repair(
-    log: Annotated[Path, appended_log_argument(help="A damaged or incomplete log.")],
-) -> None:
-    """Repair a log in place: keep all complete records, report the losses, and complete its runs.
-
-    The removed bytes are kept in <log>.damaged. A log that cannot be repaired is not changed. If ipsys live
-    or record --detect was killed, the command also processes the recorded frames that have no results. For
-    this it computes the runs again. After Ctrl-C, ipsys replay can do this instead.
-    """
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.log.repair import repair as repair_log
-    from ipsys_log.report.repair import repair_lines
-
-    for part in repair_lines(repair_log(log)):
-        console.print(part, markup=False)
-    try:
-        with Session([log]) as session:
-            if not session.run_names():
-                return  # there is no run to complete, so the stages are not imported
-        from ipsys_log.restore import finish_runs
-
-        with progress_bar() as progress:
-            print_outcomes(finish_runs(log, progress))
-    except IpsysError as error:  # the log itself is complete
-        remarks.print(f"unfinished runs cannot be completed: {error}", style="yellow", markup=False)
+    ipsys report calibration.mcap                      # calibration.html
+"""
 
 
 def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: FoxgloveLayout = None) -> None:
@@ -145,9 +76,9 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
     for kind, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
         named = ", ".join(name for name in names if name)
         if named:
-            remarks.print(f"{kind:<21} run {named}")
+            say(f"{kind:<21} run {named}")
     if save is not None:
-        remarks.print(f"{save} written; to view it: rerun {save}")
+        say(f"{save} written; to view it: rerun {save}")
 
 
 def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
@@ -164,7 +95,7 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
         layout = make_layout(session, runs)
     with replacement_of(path) as file:
         file.write(json.dumps(layout, indent=2).encode() + b"\n")
-    remarks.print(f"{path} written; in Foxglove: Layouts, Import from file")
+    say(f"{path} written; in Foxglove: Layouts, Import from file")
 
 
 def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
@@ -194,7 +125,7 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
 
     with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
         write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
-    console.print(f"{target} written: open it in a browser", markup=False)
+    console.print(f"{target} written: open it in a browser")
 
 
 def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
@@ -209,8 +140,8 @@ def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
             return False
         page = render_report(session, ())
     write_files(target.parent, {target.name: page.encode()})
-    console.print(f"{target} written: open it in a browser", markup=False)
-    remarks.print("the session has no calibration points: the page shows the recording and its runs")
+    console.print(f"{target} written: open it in a browser")
+    say("the session has no calibration points: the page shows the recording and its runs")
     return True
 
 
@@ -228,5 +159,96 @@ def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
         check_file(picture, "--html", logs)
         page, panels = render_robot_run(session)
     write_files(target.parent, {target.name: page.encode(), picture.name: panels})
-    console.print(f"{target} and {picture} written", markup=False)
+    console.print(f"{target} and {picture} written")
     return True
+
+
+_options = options_until("evaluate")
+del _options["as_json"]
+report = build_command("report", _REPORT, {**_options, "html": _HTML}, _report)
+
+
+def export(
+    logs: ReadLogs,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
+            "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
+        ),
+    ],
+    format_: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
+        ),
+    ] = None,
+    table: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
+        ),
+    ] = "tracks",
+    run: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--run", metavar="NAME", help="Export this run instead of the newest; repeat it for several."
+        ),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Export only this robot."),
+    ] = None,
+    without_images: Annotated[
+        bool, typer.Option("--without-images", help="Leave the images out of a ROS 2 bag.")
+    ] = False,
+    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames per second of a video.")] = 25.0,
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a video in pixels, two even numbers.")
+    ] = "1280x720",
+) -> None:
+    """Export positions, images or another channel to a file for other programs.
+
+    A table has one row for each robot and instant; units are in the names of the columns, times are in UTC. A
+    ROS 2 bag has images, intrinsics, poses, odometry and transforms. A video shows the cameras with their
+    markers, and the robots on the floor. A COCO data set has the images and the corners of their markers.
+
+    Examples
+
+        ipsys export monday.mcap -o tracks.csv
+        ipsys export monday.mcap -o tracks.parquet --run poly --run best
+        ipsys export monday.mcap -o robot.tum --robot robot_0    # for evo
+        ipsys export monday.mcap -o truth.tum --robot robot_0 --table truth
+        ipsys export monday.mcap -o bag.mcap --format ros2       # with images
+        ipsys export monday.mcap -o view.mp4 --size 1920x1080
+        ipsys export monday.mcap -o markers --format coco        # a new folder
+    """
+    from ipsys_log import api
+    from ipsys_log.log_export import find_format, parse_size
+    from ipsys_log.report.files import check_file
+
+    wanted = find_format(output, format_)
+    if wanted.suffix is not None:
+        check_file(output, "-o", logs)
+    with api.open(*logs) as log, progress_bar(_COUNTED) as progress:
+        exported = log.export(
+            output,
+            table,
+            run,
+            robot,
+            format=format_,
+            with_images=not without_images,
+            rate_hz=frame_rate,
+            size_px=parse_size(size),
+            progress=progress,
+        )
+    console.print(
+        f"{output} written: {exported.rows} {exported.content}"
+        + (f", run {' and '.join(exported.runs)}" if exported.runs else "")
+    )

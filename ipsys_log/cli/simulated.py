@@ -1,17 +1,16 @@
-"""Robots in the simulated lab, each controlled by a program of its own: ``ipsys drive``."""
+"""The simulated lab: ``ipsys simulate`` renders a session, ``ipsys drive`` lets robots drive in it."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, say
+from ipsys_log.cli.console import console, print_json, progress_bar, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
 from ipsys_log.cli.options import AsJson, Force, NewLog, OneLog, other_log_option
-from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.options import Request
 
 Models = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--model",
         metavar="NAME",
@@ -28,21 +27,70 @@ Models = Annotated[
     ),
 ]
 Paths = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--path", metavar="ROBOT=X,Y...", help='Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'
     ),
 ]
 Failures = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--fail", metavar="CAMERA=START:SECONDS", help="Let a camera fail: white=20:5 is at 20 s, for 5 s."
     ),
 ]
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command()(drive)
+def simulate(
+    output: NewLog,
+    cameras: Annotated[
+        str | None,
+        typer.Option(
+            metavar="GRID",
+            help="Columns x rows of the cameras of a hall, such as 6x4. Default: a lab with three cameras.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Seed of the random numbers. The same seed gives the same bytes."),
+    ] = None,
+    settings: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Read settings from a TOML file; docs/data.md lists them.",
+        ),
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change a setting, such as drive_s=4; repeat it for several.",
+        ),
+    ] = None,
+) -> None:
+    """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
+
+    The default is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m. With --cameras
+    6x4, it is a hall: 24 cameras, 5 m above a floor of 20 x 15 m.
+
+    Examples
+
+        ipsys simulate -o lab.mcap
+        ipsys simulate -o lab.mcap --set stations=25 --set drive_s=4
+        ipsys simulate -o hall.mcap --cameras 6x4 --settings hall.toml
+    """
+    from ipsys_log.runs.output import write_log
+    from ipsys_log.simulation import lab
+    from ipsys_log.simulation.settings import LabSettings, hall_settings, parse_grid, read_settings
+
+    given = read_settings(settings, changes or ()) | ({} if seed is None else {"seed": seed})
+    chosen = LabSettings(**given) if cameras is None else hall_settings(*parse_grid(cameras), **given)
+    text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
+    with say_kept(lambda _: text), progress_bar(frame_steps=("simulate",)) as progress:
+        counts = write_log(output, lab.simulate(chosen, progress))
+    frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
+    console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} calibration points")
 
 
 @runs_until_stopped
@@ -58,7 +106,7 @@ def drive(
     robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--program", metavar="FILE", help="The program of the robots (default: the example of ipsys)."
         ),
@@ -92,7 +140,15 @@ def drive(
     """Let robots drive in the simulated lab, each by a program that gets only streamed positions.
 
     This is the robot experiment of the paper (sect. 4.3). Images are drawn, recorded, processed and streamed
-    as by live. The log has the commands of the robots and the ground truth, too."""
+    as by live. The log has the commands of the robots and the ground truth, too.
+
+    Examples
+
+        ipsys drive --model-from cal.mcap -o run.mcap      # robot run of the paper
+        ipsys drive --model-from cal.mcap -o run.mcap --model poly --model best
+        ipsys drive --model-from cal.mcap -o three.mcap --robots 3 --lockstep
+        ipsys drive --model-from cal.mcap -o run.mcap --loss 0.05 --fail white=20:5
+    """
     allow_interrupt("stopped before the drive began; no log was written")
     from ipsys_log.closed_loop.settings import PROGRAM, RobotRun, choose_paths, parse_failure, read_lab
     from ipsys_log.runs.options import Request
@@ -127,7 +183,7 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
     with Session([output]) as session:
         result = read_robot_run(session)
     if as_json:
-        print(json.dumps(robot_run_json(result), indent=2))  # noqa: T201
+        print_json(robot_run_json(result))
         return
     console.print(robot_run_tables(result))
-    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}", markup=False)
+    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}")

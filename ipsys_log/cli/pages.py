@@ -1,33 +1,34 @@
-"""The dashboard beside a recording or a playback: ``ipsys live --web``, ``ipsys stream LOG --web``."""
+"""Pages that a command serves: measuring, and the dashboard beside a recording or a playback."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, Optional
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.measure_live import say_faults
+from ipsys_log.cli.console import console, remarks, say
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.messages import Message, Model
+    from ipsys_log.capture.lab import OpenLab
+    from ipsys_log.messages import Model
     from ipsys_log.player import Player
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Sink
+    from ipsys_log.sinks.streams.settings import Stream
+    from ipsys_log.survey.scene import MeasuringScene
     from ipsys_log.web.dashboard.state import Dashboard
     from ipsys_log.web.server import PageServer
 
 _USUAL_PORT = 8000
 _GAP = 4
+_CODE_STYLE = "#ffffff on #000000"
 
 Web = Annotated[bool, typer.Option("--web", help="Show a page, the dashboard, for any number of browsers.")]
 WebPort = Annotated[
-    Optional[int],  # noqa: UP045
+    int | None,
     typer.Option(
         "--web-port",
         min=0,
@@ -36,6 +37,34 @@ WebPort = Annotated[
         help="Serve the dashboard on this port instead of 8000; 0 for any free port.",
     ),
 ]
+
+
+def print_code(url: str, is_open: bool) -> None:
+    """Print the address as a code for a phone, if the page is open to the network."""
+    from ipsys_log.web.server import qr_code
+
+    if is_open:
+        console.print(qr_code(url), style=_CODE_STYLE)
+
+
+def say_faults(page: PageServer, name: str = "the measuring page") -> None:
+    """Print the faults of the page's server at the end, when the screen is free for a traceback."""
+    if page.exceptions.count:
+        remarks.print(f"internal errors of {name}: {page.exceptions.count}; the first one:", style="red")
+        say(page.exceptions.first)
+
+
+@contextmanager
+def serve_measuring(scene: MeasuringScene, host: str | None, port: int) -> Iterator[PageServer]:
+    """Serve the measuring page until the block ends."""
+    from ipsys_log.web.server import serve
+
+    with serve(scene, host, port) as page:
+        print_code(page.url, host is not None)
+        try:
+            yield page
+        finally:
+            say_faults(page)
 
 
 class DashboardPlan(NamedTuple):
@@ -71,29 +100,21 @@ def plan_dashboard(
     return DashboardPlan(host, port, copy_model(request, first)[1])
 
 
-def first_run(request: Request) -> str:
-    """Return the run of the first model: streams, the viewer and the dashboard show one run."""
-    from ipsys_log.runs.select import wanted_models
-    from ipsys_log.stages.fit import model_run
-
-    first, *_ = wanted_models(request)
-    return model_run(first)
-
-
 @contextmanager
 def serve_dashboard(
     plan: DashboardPlan | None,
-    opened: tuple[LiveCameras, list[Message], LiveStatus],
+    opened: OpenLab,
+    status: LiveStatus,
     log: Path,
     run: str,
-    streams: Sequence[Sink],
+    streams: Sequence[Stream],
 ) -> Iterator[list[Dashboard]]:
     """Serve the dashboard of a live recording until the end of the block, and print its address.
 
     Parameters
     ----------
     plan : None: there is no dashboard.
-    opened : the cameras, the first messages of the log, and the status on the screen.
+    opened, status : the open cameras, and the status on the screen.
     log, run, streams : the log that is written, the run of the shown tracks, and the streams of positions.
     """
     if plan is None:
@@ -101,8 +122,7 @@ def serve_dashboard(
         return
     from ipsys_log.web.dashboard.sources import dashboard_of_recording
 
-    cameras, settings, status = opened
-    dashboard = dashboard_of_recording(cameras, settings, status.checks, log, plan.model, run, streams)
+    dashboard = dashboard_of_recording(opened, status.checks, log, plan.model, run, streams)
     with _serve(dashboard, plan.host, plan.port, has_viewers=True):
         yield [dashboard]
 
@@ -168,9 +188,8 @@ def _print_addresses(page: PageServer, is_secret: bool) -> None:
     from ipsys_log.web.server import qr_code
 
     if page.view_url is None:
-        if is_secret:
-            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        remarks.print(f"dashboard at {page.url}", markup=False)
+        print_code(page.url, is_secret)
+        say(f"dashboard at {page.url}")
         return
     codes = [
         [*qr_code(url).splitlines(), name] for url, name in ((page.view_url, "view"), (page.url, "operate"))
@@ -180,6 +199,6 @@ def _print_addresses(page: PageServer, is_secret: bool) -> None:
     if len(codes[0]) != len(codes[1]) or 2 * width > console.width:
         rows = [*codes[0], *codes[1]]  # one above the other
     for row in rows:
-        console.print(row, style="#ffffff on #000000", markup=False)
-    remarks.print(f"dashboard, to view:    {page.view_url}", markup=False)
-    remarks.print(f"dashboard, to operate: {page.url}", markup=False)
+        console.print(row, style=_CODE_STYLE)
+    say(f"dashboard, to view:    {page.view_url}")
+    say(f"dashboard, to operate: {page.url}")

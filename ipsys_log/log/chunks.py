@@ -163,6 +163,10 @@ class ChunkContents:
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
+    def in_order(self) -> list[tuple[int, int]]:
+        """Return the offset and the channel id of each message, in the order of the file."""
+        return sorted((offset, key) for key, rows in self.entries.items() for _, offset in rows)
+
     def add(self, view: LogBytes, record: RecordAt, offset: int, body: bytes) -> None:
         """Add one record of type Schema, Channel or Message; ignore other types."""
         if record.opcode == Opcode.MESSAGE:

@@ -30,7 +30,6 @@ from ipsys_log.log.chunk_messages import (
 )
 from ipsys_log.log.chunks import has_wrong_crc
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
-from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.file_check import FileCheck, check_file
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
@@ -40,6 +39,7 @@ from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
 from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
 from ipsys_log.log.summary import NoFooterError
+from ipsys_log.log.survey import Watch
 from ipsys_log.plain_text import shell_words
 
 _logger = logging.getLogger(__name__)

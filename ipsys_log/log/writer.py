@@ -60,7 +60,14 @@ class LogWriter:
     ['/a', '/runs/poly/b']
     """
 
-    def __init__(self, path: Path, output: Output, contents: Contents, limits: ChunkLimits) -> None:
+    def __init__(
+        self,
+        path: Path,
+        output: Output,
+        contents: Contents,
+        limits: ChunkLimits,
+        hashes: Mapping[str, ChannelHash] | None = None,
+    ) -> None:
         self.path = path
         self._output = output
         self._contents = contents
@@ -71,7 +78,7 @@ class LogWriter:
         self._declared: dict[str, tuple[Schema | None, str]] = {}
         # A live run grows for days. Until its end, only its summary needs these.
         self._packed_chunks: list[bytes] = []
-        self._hashes: dict[str, ChannelHash] = {}
+        self._hashes: dict[str, ChannelHash] = dict(hashes or {})
         self._stored: dict[str, ChannelHash] = {}
         self._open = True
 
@@ -256,6 +263,39 @@ class LogWriter:
         self._channels[channel.topic] = (same.id, self._images if image else self._small)
         self._declared.pop(channel.topic, None)
         return same.id
+
+    def define(self, record: mcap.Schema | mcap.Channel) -> None:
+        """Write a definition of a damaged log as it is; its id must be free here.
+
+        Raises
+        ------
+        LogError
+            The log has the topic of the channel with a schema of another name, or another encoding.
+        """
+        if isinstance(record, mcap.Schema):
+            self._contents.schemas[record.id] = record
+        else:
+            self._check_kind(record.topic, self._schema_of(record), record.message_encoding)
+            self._contents.channels[record.id] = record
+        self._output.emit(to_bytes(record))
+
+    def defines(self, record: mcap.Schema | mcap.Channel) -> bool:
+        """Return whether the log has exactly this definition."""
+        if isinstance(record, mcap.Schema):
+            return self._contents.schemas.get(record.id) == record
+        return self._contents.channels.get(record.id) == record
+
+    def has_channel(self, channel_id: int) -> bool:
+        return channel_id in self._contents.channels
+
+    def use(self, channel_id: int) -> str:
+        """Write the next messages of a topic to this one of its channels; return the topic."""
+        channel = self._contents.channels[channel_id]
+        schema = self._schema_of(channel)
+        image = schema is not None and schema.name in IMAGE_SCHEMAS
+        self._channels[channel.topic] = (channel_id, self._images if image else self._small)
+        self._declared.pop(channel.topic, None)
+        return channel.topic
 
     def copy_chunk(
         self,

@@ -8,7 +8,7 @@ from math import ceil
 from ipsys_log.log.chunk_builder import IMAGE_SCHEMAS
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import RepairReport
+from ipsys_log.log.recovery import RepairReport
 from ipsys_log.report.rows import Rows
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
@@ -28,9 +28,9 @@ def repair_lines(report: RepairReport) -> Iterator[str | Rows]:
         yield f"{report.path} {'repaired' if report.changed else 'is undamaged and unchanged'}: {kept}"
     yield from _about_the_loss(report)
     if report.unchecked:
-        yield f"{report.unchecked} of them are from damaged chunks: no CRC confirms them"
+        yield f"{report.unchecked} of them are from damaged parts: no CRC confirms them"
     if report.damaged_file is not None:
-        yield f"the removed bytes are in {report.damaged_file}"
+        yield f"the old data are in {report.damaged_file}"
     yield from report.notes[:_MOST_NOTES]
     if len(report.notes) > _MOST_NOTES:
         yield f"and {len(report.notes) - _MOST_NOTES} more notes"

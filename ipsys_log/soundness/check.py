@@ -8,11 +8,11 @@ from contextlib import ExitStack, suppress
 from ipsys_log.errors import IpsysError, UnreadError, os_error_text, reason_without
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.contents import StoredChannel, camera_of_topic
-from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
+from ipsys_log.log.survey import Watch
 from ipsys_log.messages import IMPORTED
 from ipsys_log.messages.channels import IMAGES, MODEL, RECORD, clock_topic
 from ipsys_log.plain_text import shell_words

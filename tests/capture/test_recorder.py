@@ -16,7 +16,7 @@ from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import Disk
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     EVENTS_TOPIC,

@@ -28,7 +28,7 @@ from ipsys_log.images.video import Video
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage, CompressedVideo
 from ipsys_log.rig.file import load_rig

@@ -20,7 +20,7 @@ from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Markers, RawImage
 from tests.conftest import ROOT

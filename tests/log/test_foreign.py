@@ -12,7 +12,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents, Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, to_bytes
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, as_row, linear_rows, stock_rows

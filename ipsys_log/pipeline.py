@@ -149,7 +149,6 @@ def record(
     ):
         for arrived in write_each(source, log):
             show(arrived)
-    _report_rename(log, source.say)
     log.check_disk()
     show.check()
     return log.counts
@@ -199,7 +198,6 @@ def measure(
     ):
         for message in _through(plan.stages, chain(settings, frames)):
             _show_all(show, frames.take_events(), *(() if message is TICK else (message,)))
-    _report_rename(log, cameras.say)
     log.check_disk()
     show.check()
     return log.counts
@@ -260,11 +258,8 @@ def live(
             for message in arriving:
                 _show_all(show, events(), None if message is TICK else message)
         _show_all(show, events())
-    _report_rename(log, cameras.say)
     log.check_file()
     path = log.path
-    if path is None:
-        raise IpsysError(f"{target}: its runs have no records yet; find the log, and run: ipsys repair LOG")
     if fault is not None:
         raise IpsysError(
             f"{fault}; {path} has all frames; to process them: ipsys replay {shell_words(path)}"
@@ -346,13 +341,6 @@ def _contradictions(say: Callable[[str], None]) -> Consumer:
             say(message.payload.text)
 
     return print_text
-
-
-def _report_rename(log: Recording, say: Callable[[str], None]) -> None:
-    """Report the present name of a log that another program has renamed."""
-    text = log.describe_rename()
-    if text is not None:
-        say(text)
 
 
 def _route_of(message: Message) -> Route | None:

@@ -1,4 +1,4 @@
-"""The disk of a recording: its remaining time, periodic sync, a full disk, and a file that is renamed."""
+"""The disk of a recording: its remaining time, periodic sync, a full disk, and a file that is taken away."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ _LAST_S = 1.0
 # The function is called with None when the earlier data are on the disk, or with the error of the disk.
 Confirm = Callable[[OSError | None], None]
 # Linux names the present path of each open file here; other systems do not.
-_OPEN_FILES = Path("/proc/self/fd")
 
 
 class Syncer:
@@ -247,7 +246,7 @@ def free_room(target: Path, bytes_per_s: float) -> DiskRoom:
 
 
 class RecordedFile:
-    """An open file that is found again: another program can rename, move or delete it while it grows.
+    """An open file that another program can rename, move or delete while it grows.
 
     Parameters
     ----------
@@ -283,23 +282,13 @@ class RecordedFile:
         except OSError:
             return False
 
-    def find(self) -> Path | None:
-        """Return the present path; None if the file is deleted, or the system does not tell its path."""
-        if self._is_at(self._path):
-            return self._path
+    @property
+    def is_renamed(self) -> bool:
+        """True if the file is not at its path any more."""
         try:
-            present = (_OPEN_FILES / str(self._fd)).readlink()
+            return not os.path.samestat(os.fstat(self._fd), self._path.stat())
         except OSError:
-            return None
-        # A name in the same folder keeps the form in which the user gave the folder.
-        candidates = (self._path.with_name(present.name), present)
-        return next((path for path in candidates if self._is_at(path)), None)
-
-    def _is_at(self, path: Path) -> bool:
-        try:
-            return os.path.samestat(os.fstat(self._fd), path.stat())
-        except (OSError, ValueError):
-            return False
+            return True
 
 
 def _frame_bytes(state: CameraState) -> float:

@@ -98,9 +98,9 @@ class LiveStatus:
                 self._size_with_frame = file.size + 1
 
     def close(self) -> None:
-        """Note the path and the size of the finished log."""
+        """Note the size of the finished log."""
         if self._file is not None:
-            self.log, self._size = self._file.find() or self._target, self._file.size
+            self._size = self._file.size
             self._file.close()
             self._file = None
 

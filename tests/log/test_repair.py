@@ -431,7 +431,7 @@ class Replacing(NoSync):
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def fsync(self, fd: int) -> None:
+    def fsync(self, fd: int) -> None:  # noqa: ARG002
         other = self.path.with_name("other")
         other.write_bytes(b"another log")
         other.rename(self.path)

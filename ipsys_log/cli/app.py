@@ -112,9 +112,7 @@ class Commands(TyperGroup):
         """Return the name, the command and its words."""
         words = present_words(args)
         if words != args and remarks.is_terminal:
-            say(
-                f"ipsys {args[0]} is an old name, which works until the next release: ipsys {shlex.join(words)}"
-            )
+            say(f"ipsys {args[0]} is an old name until the next release; now: ipsys {shlex.join(words)}")
         return super().resolve_command(ctx, words)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

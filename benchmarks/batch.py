@@ -31,15 +31,7 @@ from scenes import CACHE, drawn
 
 from ipsys_log.batch.execution import run_batch
 from ipsys_log.batch.log_work import check_log, replay_log
-from ipsys_log.batch.tasks import (
-    BatchTask,
-    LogPieces,
-    LogResult,
-    PieceState,
-    perform,
-    perform_or_divide,
-    perform_piece,
-)
+from ipsys_log.batch.tasks import BatchTask, LogResult, perform
 from ipsys_log.batch.workers import Workers, WorkerSettings, open_workers
 from ipsys_log.simulation.settings import LabSettings
 
@@ -66,23 +58,10 @@ def return_at_once(path: Path) -> LogResult:
 def lap(task: BatchTask, logs: Sequence[Path], workers: Workers | None) -> Spent:
     """Do a task on logs by workers, or in this process."""
     wall_s, cpu_s = time.perf_counter(), _cpu_s(workers)
-    results = run_batch(workers, task, logs) if workers else (_perform_here(task, log) for log in logs)
+    results = run_batch(workers, task, logs) if workers else (perform(task, log) for log in logs)
     failures = [result for result in results if not result.good]
     assert not failures, failures[0]
     return Spent(time.perf_counter() - wall_s, _cpu_s(workers) - cpu_s)
-
-
-def _perform_here(task: BatchTask, log: Path) -> LogResult:
-    """Do a task in this process; the pieces of a long log come one after the other."""
-    if not task.divides:
-        return perform(task, log)
-    answer = perform_or_divide(task, log)
-    while isinstance(answer, LogPieces):
-        for piece in answer.tasks:
-            state = perform_piece(task, log, piece)
-            assert state == PieceState(), state
-        answer = perform_or_divide(task, log)
-    return answer
 
 
 def _cpu_s(workers: Workers | None) -> float:

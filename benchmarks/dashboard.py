@@ -46,7 +46,7 @@ from ipsys_log.messages import (
     Tracks,
     image_topic,
 )
-from ipsys_log.sinks.sink import LiveSinks
+from ipsys_log.sinks.sink import FanOut
 from ipsys_log.web.dashboard.app import build_dashboard
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
@@ -163,14 +163,14 @@ def _draw(seconds: float) -> float:
 
 
 @contextmanager
-def _served() -> Iterator[tuple[LiveSinks, str]]:
+def _served() -> Iterator[tuple[FanOut, str]]:
     """Serve a dashboard; yield its sinks and its address."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "live.mcap"
         log.write_bytes(bytes(1000))
         dashboard = _dashboard(log)
         with (
-            LiveSinks([dashboard], lambda kind, text: None) as show,
+            FanOut([dashboard], lambda kind, text: None) as show,
             serve_app(build_dashboard(dashboard), port=0) as page,
         ):
             yield show, page.url
@@ -185,7 +185,7 @@ def _dashboard(log: Path) -> Dashboard:
 
 
 def _feed(
-    show: LiveSinks, jpeg: bytes, seconds: float, fed_s: list[float], ended: threading.Event | None = None
+    show: FanOut, jpeg: bytes, seconds: float, fed_s: list[float], ended: threading.Event | None = None
 ) -> None:
     """Send the messages at their times; note the processor time that making them took.
 

@@ -23,8 +23,9 @@ sys.path.append(str(Path(__file__).resolve().parent.parent))
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
 from ipsys_log.analysis.drift import MeanCorners
-from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, shift_floor_map
+from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.analysis.reference_markers import Window
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.messages import Floor, Markers
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.units import MM_PER_M, NS_PER_S
@@ -98,11 +99,8 @@ def _name(week: int) -> str:
     return f"week {week}"
 
 
-def _floor_cameras(lab: GeometricLab) -> dict[str, FloorCamera]:
-    return {
-        one.name: FloorCamera(one.name, one.lens, one.camera_from_world[:3, :3], one.origin_m)
-        for one in lab.cameras
-    }
+def _floor_cameras(lab: GeometricLab) -> dict[str, PosedCamera]:
+    return {one.name: PosedCamera.at_pose(one.name, one.lens, one.camera_from_world) for one in lab.cameras}
 
 
 def _windows(lab: GeometricLab, settings: WeekSettings, week: int) -> list[Window]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,10 +14,13 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.floor_error import GRID_M, SightingErrors
+sys.path.append(str(Path(__file__).resolve().parent.parent))
+
+from ipsys_log.analysis.floor_grid import GRID_M
 from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.styles import shorten
 from ipsys_log.simulation.settings import FLOOR_M
+from tests.geometric.floor_error import SightingErrors
 
 __all__ = ["draw_floor_map"]
 

@@ -10,14 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rendered_labs import rendered_lab
 
-from ipsys_log.analysis.floor_error import (
-    KnownSightings,
-    Locator,
-    compute_errors,
-    grid_nodes,
-    locate_with_model,
-    summarize,
-)
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.poses import transform
@@ -35,6 +27,14 @@ from tests.geometric.corner_noise import (
     corner_covariances,
     draw_corner_noise,
     edge_sigma_px,
+)
+from tests.geometric.floor_error import (
+    KnownSightings,
+    Locator,
+    compute_errors,
+    grid_nodes,
+    locate_with_model,
+    summarize,
 )
 from tests.geometric.lab import (
     GeometricLab,

@@ -28,19 +28,19 @@ from rounds import Row
 from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.expected_error import mean_lengths
-from ipsys_log.analysis.floor_error import (
-    KnownSightings,
-    SightingErrors,
-    compute_errors,
-    region_shares,
-    summarize,
-)
 from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.observations import Observations
 from ipsys_log.joint.payload import joint_payload
 from ipsys_log.joint.start import PlacedCamera, place_cameras
 from ipsys_log.log.codec import encode
 from ipsys_log.simulation.settings import hall_settings
+from tests.geometric.floor_error import (
+    KnownSightings,
+    SightingErrors,
+    compute_errors,
+    region_shares,
+    summarize,
+)
 from tests.geometric.lab import GeometricLab, GeometricSettings
 
 __all__ = ["measure"]

@@ -7,7 +7,7 @@
 
 Most labs have no images: markers have the noise that detect has in rendered labs (see
 ipsys_log/simulation/corner_noise.py). Some labs are rendered, to confirm this. Each lab has another seed, and
-all calibrations get the same labs. The error over the floor is defined in ipsys_log/analysis/floor_error.py.
+all calibrations get the same labs. The error over the floor is defined in tests/geometric/floor_error.py.
 The script prints a table, and writes JSON with -o.
 """
 
@@ -39,8 +39,8 @@ from results import Report, command
 from rounds import Row
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.analysis.floor_error import KnownSightings, Locator, SightingErrors, compute_errors, summarize
 from ipsys_log.errors import FitError
+from tests.geometric.floor_error import KnownSightings, Locator, SightingErrors, compute_errors, summarize
 
 __all__ = ["measure"]
 

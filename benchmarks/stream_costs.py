@@ -18,7 +18,7 @@ from rounds import Row
 from stream_server import free_ports
 
 from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.sinks.sink import LiveSinks, PromptSink, Sink, send_all
+from ipsys_log.sinks.sink import FanOut, InlineSink, Sink
 from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
 
 __all__ = ["ROBOT", "cost_rows", "hand_over_rows"]
@@ -34,26 +34,29 @@ ROBOT, _TOPIC = "robot_0", "/runs/poly/tracks"
 _MESSAGES = 1000
 
 
-class _Prompt:
+class _Inline:
     """A stream that notes when it has sent a message."""
 
-    def __init__(self, stream: PromptSink, note: Callable[[], None]) -> None:
-        self.name, self.payloads, self.finish = stream.name, stream.payloads, stream.finish
+    def __init__(self, stream: InlineSink, note: Callable[[], None]) -> None:
+        self.name, self.payloads = stream.name, stream.payloads
         self._stream, self._note = stream, note
 
     def send(self, message: Message) -> None:
         self._stream.send(message)
         self._note()
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        send_all(self, messages)
-
 
 class _Queued:
     """The same as a sink with a queue and a thread."""
 
-    def __init__(self, prompt: _Prompt) -> None:
-        self.name, self.payloads, self.consume = prompt.name, prompt.payloads, prompt.consume
+    def __init__(self, inline: _Inline) -> None:
+        self.name, self.payloads = inline.name, inline.payloads
+        self._inline = inline
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        for message in messages:
+            if message is not None:
+                self._inline.send(message)
 
 
 @contextmanager
@@ -89,9 +92,9 @@ def _delays_ms(count: int, is_queued: bool) -> list[float]:
 
     delays_ms = []
     with open_streams(_all_streams(), {_TOPIC}, lambda: 0, lambda kind, text: None, 1) as streams:
-        prompt = [_Prompt(stream, note) for stream in streams if isinstance(stream, PromptSink)]
-        sinks: Sequence[Sink] = [_Queued(sink) for sink in prompt] if is_queued else prompt
-        with LiveSinks(sinks, lambda kind, text: None) as show, _busy():
+        inline = [_Inline(stream, note) for stream in streams]
+        sinks: Sequence[Sink] = [_Queued(sink) for sink in inline] if is_queued else inline
+        with FanOut(sinks, lambda kind, text: None) as show, _busy():
             for number in range(count):
                 time.sleep(_PERIOD_S)
                 begin_s = time.perf_counter()
@@ -122,8 +125,8 @@ def hand_over_rows(rounds: int, count: int) -> list[Row]:
             for way in (True, False)
         )
         ratios = tuple(a / b for a, b in zip(queued, prompt, strict=True))
-        rows.append(Row(f"queues / prompt, to the last stream, {title}", ratios))
-        rows.append(Row(f"prompt, to the last stream, {title}", prompt, "ms"))
+        rows.append(Row(f"queues / inline, to the last stream, {title}", ratios))
+        rows.append(Row(f"inline, to the last stream, {title}", prompt, "ms"))
     return rows
 
 
@@ -149,9 +152,11 @@ def cost_rows(rounds: int) -> list[Row]:
 def _cost_ms(settings: StreamSettings) -> float:
     messages = [_message(number) for number in range(_MESSAGES)]
     with open_streams(settings, {_TOPIC}, lambda: 0, lambda kind, text: None, 1) as (stream,):
-        stream.consume(iter(messages[:10]))
+        for message in messages[:10]:
+            stream.send(message)
         begin_s = time.process_time()
-        stream.consume(iter(messages[10:]))
+        for message in messages[10:]:
+            stream.send(message)
         return _MS_PER_S * (time.process_time() - begin_s) / (_MESSAGES - 10)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from track_contenders import RobotTrack
 from track_drives import SeenDrive
 
-from ipsys_log.analysis.floor_error import region_shares
+from tests.geometric.floor_error import region_shares
 
 __all__ = [
     "Figures",

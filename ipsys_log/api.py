@@ -456,51 +456,27 @@ def live(
 
     def track(tracker: Tracker) -> list[Outcome]:
         from ipsys_log import pipeline
-        from ipsys_log.capture.devices import check_devices, check_sources, source_opener
-        from ipsys_log.capture.first_messages import first_messages, fitting_lenses
-        from ipsys_log.capture.frames import Clock
-        from ipsys_log.capture.live_plan import check_start
-        from ipsys_log.capture.multiplexer import LiveCameras
-        from ipsys_log.exchange.lab_files import load_cameras, load_lenses
-        from ipsys_log.messages.channels import TRACKS
-        from ipsys_log.runs.select import wanted_models
-        from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
-        from ipsys_log.stages.fit import model_run
+        from ipsys_log.capture.lab import open_lab
+        from ipsys_log.capture.live_plan import check_start, shown_run
+        from ipsys_log.exchange.lab_files import read_lab
+        from ipsys_log.sinks.streams.settings import check_streams, open_live_streams, settings_of_rig
 
-        lab, wanted = load_cameras(Path(rig), cameras)
-        assumed: dict[str, str] = {}
-        lenses = load_lenses(Path(rig), wanted, calibrations or {}, report=assumed.__setitem__)
-        for camera, text in assumed.items():
+        lab = read_lab(Path(rig), cameras, calibrations or {})
+        for camera, text in lab.assumed.items():
             say(f"camera {camera}: {text}")
-        check_devices(wanted)
-        check_sources(wanted)
-        names = [camera.name for camera in wanted]
-        for line in check_start(lab, names, lenses, request, None):
+        for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
             say(line)
         if Path(record).exists() and not force:
             raise IpsysError(f"{record}: exists already; give another name, or force=True to overwrite it")
-        streamed = settings_of_rig(lab.stream, Path(rig).parent)
+        streamed = settings_of_rig(lab.rig.stream, lab.folder)
         for line in check_streams(streamed):
             say(line)
-        topic = TRACKS.topic_of(model_run(wanted_models(request)[0]))
-        with (
-            source_opener(lab, wanted, Path(rig).parent) as opener,
-            LiveCameras(wanted, opener, Clock(), say) as attached,
-            open_streams(
-                streamed,
-                {topic},
-                attached.clock.now_ns,
-                attached.add_event,
-                heights_m=lab.robot_heights_m(),
-            ) as streams,
-        ):
-            sizes_px = {name: state.size_px for name, state in attached.states.items()}
-            settings = first_messages(
-                lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns, attached.imported_run, assumed
-            )
-            tracker.begin(attached.stop)
+        with open_lab(lab, say) as opened, open_live_streams(streamed, opened, shown_run(request)) as streams:
+            tracker.begin(opened.cameras.stop)
             sinks: list[Sink] = [tracker, *streams]
-            return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=sinks)
+            return pipeline.live(
+                opened.cameras, opened.settings, Path(record), request, sinks=sinks, overwrite=force
+            )
 
     return Tracker(track)
 

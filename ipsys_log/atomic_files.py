@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,7 +16,7 @@ def replacement_of(path: Path) -> Iterator[BinaryIO]:
 
     After an error in the block, the old file stays and the new one is removed.
     """
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial = partial_of(path)
     try:
         with partial.open("wb") as file:
             yield file
@@ -24,3 +25,25 @@ def replacement_of(path: Path) -> Iterator[BinaryIO]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def partial_of(path: Path) -> Path:
+    """Return the name of this process for the unfinished file; remove the files of processes that have ended.
+
+    Such a file remains if its process was killed, or interrupted right after the creation of the file.
+    """
+    for file in path.parent.glob(f"{escape(path.name)}.*.partial*"):
+        number = file.name.removeprefix(f"{path.name}.").partition(".")[0]
+        if number.isdecimal() and not _is_running(int(number)):
+            file.unlink(missing_ok=True)
+    return path.with_name(f"{path.name}.{os.getpid()}.partial")
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -11,8 +11,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+from ipsys_log.analysis.accuracy import root_mean_square_m
 from ipsys_log.analysis.ground_truth import gather_paths
-from ipsys_log.analysis.trajectory_errors import ErrorSummary, trajectory_errors
+from ipsys_log.analysis.trajectory_errors import trajectory_errors
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation, LogUrl, is_one_of
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 
     from ipsys_log.soundness.finding import LogCheck
 
-_TRAJECTORY = ("robot", "metric", "delta")
+_STATISTICS = ("count", "rmse_m", "mean_m", "median_m", "std_m", "max_m", "p95_m")
+_TRAJECTORY = ("robot", "metric", "delta", *_STATISTICS)
 
 StrPath = str | PathLike[str]
 Time = int | datetime
@@ -229,12 +231,18 @@ class Log:
         rows = []
         for one in trajectory_errors(paths, true):
             relative = [("RPE", f"{rpe.delta:g} {rpe.unit}", rpe.summary) for rpe in one.relative]
-            errors = [("ATE 3D", None, one.absolute_3d), ("ATE 2D", None, one.absolute_2d), *relative]
+            metrics = [("ATE 3D", None, one.absolute_3d), ("ATE 2D", None, one.absolute_2d), *relative]
             rows += [
-                {"robot": one.robot, "metric": metric, "delta": delta, **asdict(summary)}
-                for metric, delta, summary in errors
+                {
+                    **asdict(errors),
+                    "robot": one.robot,
+                    "metric": metric,
+                    "delta": delta,
+                    "rmse_m": root_mean_square_m(errors),
+                }
+                for metric, delta, errors in metrics
             ]
-        table: pd.DataFrame = pandas.DataFrame(rows, columns=[*_TRAJECTORY, *ErrorSummary.__slots__])
+        table: pd.DataFrame = pandas.DataFrame(rows, columns=[*_TRAJECTORY])
         return table
 
     def export(

@@ -1,17 +1,19 @@
 """A process of this package with a pipe in both directions.
 
 The process has a session of its own: the keys of the terminal and a closed terminal concern its parent only.
-It has to end with its pipe, so that none remains after its parent.
+It ends with its pipe, whatever it does, so that none remains after its parent.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import select
 import subprocess
 import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from threading import Thread
 
 # The environment of a process with one BLAS thread. Such a process has no need to load the BLAS of scipy to
 # limit its threads, which takes 0.1 s.
@@ -21,7 +23,8 @@ ONE_THREAD = dict.fromkeys(
 # The path of modules is that of the parent: the folder of the user has no part in it.
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from {module} import {function}; {function}(*map(int, sys.argv[2:]))"
+    "from ipsys_log.piped_process import end_with_parent; end_with_parent(); "
+    "from {module} import {function}; {function}()"
 )
 
 
@@ -30,8 +33,7 @@ class PipedProcess:
 
     Parameters
     ----------
-    function : a function of a module, called with the ``descriptors``. It begins with :func:`parent_pipe`.
-    descriptors : file descriptors that the process also gets.
+    function : a function of a module. It begins with :func:`parent_pipe`.
 
     Attributes
     ----------
@@ -43,14 +45,13 @@ class PipedProcess:
         The system has no more processes or file descriptors for this program.
     """
 
-    def __init__(self, function: Callable[..., None], *descriptors: int) -> None:
+    def __init__(self, function: Callable[[], None]) -> None:
         start = _START.format(module=function.__module__, function=function.__name__)
         modules = json.dumps([path for path in sys.path if path])
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", start, modules, *map(str, descriptors)],
+            [sys.executable, "-P", "-c", start, modules],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            pass_fds=descriptors,
             start_new_session=True,
             env={**os.environ, **ONE_THREAD},
         )
@@ -77,7 +78,7 @@ class PipedProcess:
         return f"by signal {-code}" if code < 0 else f"with exit code {code}"
 
     def close(self) -> None:
-        """Close the pipe; the process then ends by itself."""
+        """Close the pipe; the process then ends."""
         self.sender.close()
         self.receiver.close()
 
@@ -86,6 +87,18 @@ class PipedProcess:
         self.process.kill()
         self.process.wait()
         self.close()
+
+
+def end_with_parent() -> None:
+    """End this process when its parent closes the pipe or ends; imports may take longer than that."""
+    Thread(target=_wait_for_parent, name="ends with the parent", daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    pipe = select.poll()
+    pipe.register(0, 0)  # no event but the end of the pipe, which is always reported
+    pipe.poll()
+    os._exit(0)
 
 
 def parent_pipe() -> tuple[Connection, Connection]:

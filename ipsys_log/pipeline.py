@@ -37,7 +37,7 @@ from itertools import chain
 from pathlib import Path
 
 from ipsys_log.analysis.latency import Ledger
-from ipsys_log.capture.backlog import TICK, Backlog
+from ipsys_log.capture.backlog import Backlog
 from ipsys_log.capture.frames import SourceError
 from ipsys_log.capture.live_check import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
@@ -57,7 +57,6 @@ from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.continuation import continue_newest
 from ipsys_log.runs.execute import sign
 from ipsys_log.runs.graph import stages_until
-from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import open_target
 from ipsys_log.runs.pieces import PieceWorkers
@@ -66,7 +65,7 @@ from ipsys_log.runs.replay import Replay
 from ipsys_log.runs.select import evaluated_models, wanted_models
 from ipsys_log.runs.stream import Route, WiredStage, in_threads, run
 from ipsys_log.runs.workers import LocalWorkers, check_jobs
-from ipsys_log.sinks.sink import Consumer, Consumers, Sink
+from ipsys_log.sinks.sink import FanOut, Sink
 
 
 @one_reading()
@@ -108,12 +107,10 @@ def replay(
     usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
     models = wanted_models(request, paths, usual)
     check_inputs(paths, request, models, stages)
-    with (
-        open_target(paths, output) as (logs, target),
-        LocalWorkers(jobs) as local,
-        OnePass(request, stages[-1]) as one_pass,
-    ):
-        work = Replay(request, stages, models, logs, target, workers or local, one_pass, progress, say)
+    if workers is not None and workers.first_only and len(stages) > 1:
+        request, stages = replace(request, run=None), stages[:1]  # the given name is for the last stage
+    with open_target(paths, output) as (logs, target), LocalWorkers(jobs) as local:
+        work = Replay(request, stages, models, logs, target, workers or local, progress, say)
         work.compute()
     return work.outcomes
 
@@ -122,9 +119,8 @@ def record(
     source: CameraSource,
     settings: Iterable[Message],
     target: Path,
-    consumers: Sequence[Consumer] = (),
-    overwrite: bool = False,
     sinks: Sequence[Sink] = (),
+    overwrite: bool = False,
 ) -> Mapping[str, int]:
     """Write the messages of cameras to a new log; return the number of messages of each topic.
 
@@ -132,21 +128,17 @@ def record(
     ----------
     source : messages, and None if no message came.
     settings : written first: rig and camera intrinsics.
-    consumers : each gets everything after it was written, and None if no message came.
+    sinks : each gets everything after it was written.
     overwrite : replace an existing log.
-    sinks : each gets the same in its own thread; a slow sink loses messages, images first.
 
     Raises
     ------
     IpsysError
         The log cannot be written; the messages before the error are complete in it.
     Exception
-        The error of the first failed consumer or sink. It cannot end the recording, and is raised after it.
+        The error of the first failed sink. It cannot end the recording, and is raised after it.
     """
-    with (
-        Consumers(consumers, source.add_event, sinks) as show,
-        open_recording(target, settings, overwrite) as log,
-    ):
+    with FanOut(sinks, source.add_event) as show, open_recording(target, settings, overwrite) as log:
         for arrived in write_each(source, log):
             show(arrived)
     _report_rename(log, source.say)
@@ -160,9 +152,8 @@ def measure(
     settings: Sequence[Message],
     target: Path,
     request: Request,
-    consumers: Sequence[Consumer],
+    sinks: Sequence[Sink],
     overwrite: bool = False,
-    sinks: Sequence[Sink] = (),
 ) -> Mapping[str, int]:
     """Detect markers in the frames of cameras, and write measurements with their frames to a new log.
 
@@ -174,8 +165,7 @@ def measure(
     ----------
     settings : written first: rig and camera intrinsics.
     request : corners.
-    consumers : each gets every frame that the stages have processed, its markers and camera points.
-    sinks : the same, each in its own thread; a slow sink loses messages, images first.
+    sinks : each gets every frame that the stages have processed, its markers and camera points.
 
     Returns
     -------
@@ -186,19 +176,19 @@ def measure(
     IpsysError
         A camera sends video instead of single images, or the log cannot be written; its content is kept.
     Exception
-        The first error of ``consumers``, after the log is complete.
+        The first error of ``sinks``, after the log is complete.
     """
     check_independent_frames(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     with (
-        Consumers([_contradictions(cameras.say), *consumers], cameras.add_event, sinks) as show,
+        FanOut([_contradictions(cameras.say), *sinks], cameras.add_event) as show,
         one_blas_thread(),
         open_recording(target, settings, overwrite) as log,
         RecentFrames(log) as recent,
         Backlog(cameras, recent, cameras.now_ns) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
-            _show_all(show, frames.take_events(), *(() if message is TICK else (message,)))
+            _show_all(show, *frames.take_events(), message)
     _report_rename(log, cameras.say)
     log.check_disk()
     show.check()
@@ -211,9 +201,8 @@ def live(
     target: Path,
     request: Request,
     until: str | None = None,
-    consumers: Sequence[Consumer] = (),
-    overwrite: bool = False,
     sinks: Sequence[Sink] = (),
+    overwrite: bool = False,
 ) -> list[Outcome]:
     """Write the messages of cameras to a new log with the results of the stages: the run of a replay.
 
@@ -226,9 +215,7 @@ def live(
     settings : written first: rig and camera intrinsics.
     request : corners, method and, for stages that read a model, ``model_from``.
     until : the last stage, such as detect or camera-frame; None: all causal stages.
-    consumers : each gets every frame that the stages have processed, and their results, after the write; and
-        None if no frame waits.
-    sinks : the same, each in its own thread; a slow sink loses messages, images first.
+    sinks : each gets every frame that the stages have processed, and their results, after the write.
 
     Returns
     -------
@@ -239,14 +226,12 @@ def live(
     IpsysError
         The other log has no such model, or the log cannot be written; its content is kept.
     Exception
-        The first error of ``consumers``, after the log is complete: it cannot end the recording.
+        The first error of ``sinks``, after the log is complete: it cannot end the recording.
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
     with (
-        Consumers(
-            [KnockEvents(cameras), _contradictions(cameras.say), *consumers], cameras.add_event, sinks
-        ) as show,
+        FanOut([KnockEvents(cameras), _contradictions(cameras.say), *sinks], cameras.add_event) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         ExitStack() as resources,
@@ -258,8 +243,8 @@ def live(
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in arriving:
-                _show_all(show, events(), None if message is TICK else message)
-        _show_all(show, events())
+                _show_all(show, *events(), message)
+        _show_all(show, *events())
     _report_rename(log, cameras.say)
     log.check_file()
     path = log.path
@@ -310,7 +295,7 @@ def _put_through(
     stages: Sequence[WiredStage],
     ledger: Ledger,
     log: Recording,
-    show: Consumers,
+    show: FanOut,
     events: Callable[[], Iterable[Message]],
 ) -> IpsysError | None:
     """Write the results of the stages for incoming frames, then show them; return the error of a stage.
@@ -320,17 +305,14 @@ def _put_through(
     computed = {Route(channel, wired.run) for wired in stages for channel in wired.stage.writes}
     try:
         for message in _through(stages, frames, ledger):
-            if message is TICK:
-                _show_all(show, events(), None)
-                continue
             entry = None
             if _route_of(message) in computed:  # all other messages are written already
                 entry = ledger.entry(message)
                 log.put(message)
-            _show_all(show, events(), message)
+            _show_all(show, *events(), message)
             if entry is not None:
                 log.put(entry)
-                _show_all(show, (), entry)
+                show(entry)
     except (LogError, SourceError):
         raise
     except IpsysError as fault:
@@ -338,11 +320,11 @@ def _put_through(
     return None
 
 
-def _contradictions(say: Callable[[str], None]) -> Consumer:
-    """Return a consumer that prints the contradictions between cameras and their calibrations."""
+def _contradictions(say: Callable[[str], None]) -> Sink:
+    """Return a sink that prints the contradictions between cameras and their calibrations."""
 
-    def print_text(message: Message | None) -> None:
-        if message is not None and getattr(message.payload, "kind", None) in CONTRADICTIONS:
+    def print_text(message: Message) -> None:
+        if getattr(message.payload, "kind", None) in CONTRADICTIONS:
             say(message.payload.text)
 
     return print_text
@@ -362,7 +344,6 @@ def _route_of(message: Message) -> Route | None:
     return None if channel is None else Route(channel, run_name)
 
 
-def _show_all(show: Consumers, events: Iterable[Message], *messages: Message | None) -> None:
-    """Show events and then messages."""
-    for message in chain(events, messages):
+def _show_all(show: FanOut, *messages: Message) -> None:
+    for message in messages:
         show(message)

@@ -29,12 +29,12 @@ from ipsys_log.sinks.played_topics import (
     viewed_topics,
 )
 from ipsys_log.sinks.selection import rig_in_force
-from ipsys_log.sinks.sink import LiveSinks, Sink
+from ipsys_log.sinks.sink import FanOut, Sink
 from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
 from ipsys_log.tracker import LiveTracks, Tracker
 
 if TYPE_CHECKING:
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
 _TURN_S = 0.1
 
@@ -198,7 +198,7 @@ class Player:
     def _play(self, tracker: Tracker) -> list[Outcome]:
         try:
             tracker.begin(self._playback.stop)
-            with LiveSinks([*self._streams, *self._viewers, tracker], self._warn) as show:
+            with FanOut([*self._streams, *self._viewers, tracker], self._warn) as show:
                 for message in chain(self._first, self._playback):
                     show(message)
             show.check()
@@ -221,7 +221,7 @@ def _rig_of(session: Session, chosen: PlayedTopics, settings: StreamSettings) ->
 def _open_page() -> ViewerPage:
     """Open the viewer in a browser; its library is optional, and loaded only here."""
     check_installed("--rerun needs", "rerun")
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
     return ViewerPage()
 

@@ -83,14 +83,12 @@ class Tracker:
             stop_cameras()
         self._begun.set()
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Take the tracks of the pipeline, as one of its sinks."""
-        for message in messages:
-            if message is not None and isinstance(message.payload, Tracks):
-                run = run_of_topic(message.topic) or ""
-                self._newest.put(LiveTracks(run, message.payload.timestamp, message.payload.tracks))
-                if self._newest.qsize() > _MOST_WAITING and self._take() is not None:
-                    self.dropped += 1
+    def send(self, message: Message) -> None:
+        """Take the tracks of the pipeline, as one of its inline sinks."""
+        run = run_of_topic(message.topic) or ""
+        self._newest.put(LiveTracks(run, message.payload.timestamp, message.payload.tracks))
+        if self._newest.qsize() > _MOST_WAITING and self._take() is not None:
+            self.dropped += 1
 
     def _take(self) -> LiveTracks | None:
         """Return tracks that already wait, if any. The end mark stays in the queue."""

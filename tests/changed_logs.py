@@ -9,8 +9,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message
 from ipsys_log.runs.output import write_log
 
-__all__ = ["rewrite"]
-
 
 def rewrite(
     log: Path,

@@ -11,8 +11,8 @@ from typing import Any
 
 from ipsys_log import pipeline
 from ipsys_log.analysis.differences import Comparison
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -75,7 +75,7 @@ def record_every_frame(lab: Path, calibration: Path, target: Path) -> None:
     """Record on a fast machine: no frame is skipped."""
     attached, settings, clock = attached_in_steps(lab)
     with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
+        pipeline.live(attached, settings, target, Request(model_from=calibration), sinks=[clock.watch])
 
 
 def again(log: Path, run: str | None = None) -> list[Comparison]:

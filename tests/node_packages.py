@@ -10,8 +10,6 @@ import pytest
 
 from tests.conftest import ROOT
 
-__all__ = ["install"]
-
 _LIMIT_S = 240
 
 

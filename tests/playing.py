@@ -12,8 +12,6 @@ from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.messages import CompressedImage, Message, RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["WAIT_LIMIT_S", "SteppedClock", "cameras", "playing"]
-
 WAIT_LIMIT_S = 240.0
 _READING_NS = 1000
 _START_NS = 1_700_000_000 * NS_PER_S
@@ -84,9 +82,9 @@ class SteppedClock(Clock):
             assert looked_at, f"frames {number - 1} were not looked at: {self._seen}"
             self._now_ns = max(self._now_ns, self._start_ns + number * self._step_ns)
 
-    def watch(self, message: Message | None) -> None:
+    def watch(self, message: Message) -> None:
         """Note that a frame was observed."""
-        if message is not None and isinstance(message.payload, CompressedImage):
+        if isinstance(message.payload, CompressedImage):
             with self._changed:
                 self._seen[str(message.camera)] += 1
                 self._changed.notify_all()

@@ -13,8 +13,6 @@ import socket
 import tempfile
 from pathlib import Path
 
-__all__ = ["free_port"]
-
 _KERNEL_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _FIRST, _COUNT = 10_000, 10_000
 

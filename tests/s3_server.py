@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-__all__ = ["open_bucket", "put", "serve_s3"]
-
 
 @contextmanager
 def serve_s3() -> Iterator[str]:

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["make_once"]
-
 
 def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Return the folder ``name`` with the files that ``make`` writes into it; tests only read them."""

@@ -19,8 +19,6 @@ import pytest
 from tests.conftest import ROOT
 from tests.shared_files import make_once
 
-__all__ = ["SiteParser", "build_site", "loaded_addresses", "read_site", "script_addresses", "staging"]
-
 _PACKAGES = ("mkdocs", "material", "mkdocstrings", "latex2mathml")
 # Attributes with an address that a browser loads at once; a link in the text loads nothing.
 _LOADED = {

@@ -54,7 +54,8 @@ def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
 
     tracker = Tracker(lambda _: [])
     tracks = [Message("/runs/poly/tracks", n, n, Tracks(n, ())) for n in range(1000)]
-    tracker.consume(iter(tracks))
+    for message in tracks:
+        tracker.send(message)
     assert tracker.dropped == 900
     assert next(iter(tracker)).time_ns == 999
     assert tracker.dropped == 999

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parent.parent
 # The dashboard of Dask, and the certificates of its local workers.
 _IMPORTED_BY_DASK = {"bokeh", "cryptography"}
@@ -75,17 +73,3 @@ def test_every_declared_dependency_is_imported() -> None:
 def test_every_dependency_has_a_lower_bound() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert [text for text in project["dependencies"] if ">=" not in text] == []
-
-
-@pytest.mark.parametrize(
-    ("source", "module"),
-    [
-        ("import lz4.frame", "lz4"),
-        ("from google.protobuf import message", "google"),
-        ("def late():\n    import cv2 as cv", "cv2"),
-        ("import_module(f'foxglove_schemas_protobuf.{name}_pb2')", "foxglove_schemas_protobuf"),
-        ("importlib.import_module('gi.repository')", "gi"),
-    ],
-)
-def test_imports_of_every_form_are_seen(source: str, module: str) -> None:
-    assert list(imported_modules(source)) == [module]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.first_messages import first_messages
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -49,7 +49,7 @@ def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathF
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     with attached:
         request = Request(model_from=calibration)
-        pipeline.live(attached, settings, target, request, consumers=[clock.watch])
+        pipeline.live(attached, settings, target, request, sinks=[clock.watch])
     return target
 
 

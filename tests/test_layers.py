@@ -6,12 +6,10 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors", "interrupts", "piped_process"),
+    ("errors", "piped_process"),
     ("arrays", "units", "plain_text", "extras", "atomic_files"),
     ("messages",),
     ("geometry", "rig"),
@@ -79,26 +77,13 @@ def modules() -> list[tuple[str, Path]]:
     return found
 
 
-@pytest.mark.parametrize(("module", "path"), modules(), ids=[name for name, _ in modules()])
-def test_imports_go_down(module: str, path: Path) -> None:
-    wrong = [fault(module, name.removeprefix("ipsys_log.")) for name in imports(path.read_text())]
-    assert [text for text in wrong if text] == []
-
-
-@pytest.mark.parametrize(
-    ("module", "imported"),
-    [
-        ("geometry.markers", "log.reader"),
-        ("stages.detect", "pipeline"),
-        ("stages.detect", "stages.locate"),
-        ("log.reader", "models.poly"),
-        ("runs.graph", "capture.backlog"),
-        ("geometry.markers", "rig.file"),
-        ("messages", "geometry"),
-    ],
-)
-def test_the_guard_sees_an_import_that_goes_up(module: str, imported: str) -> None:
-    assert fault(module, imported) is not None
+def test_imports_go_down() -> None:
+    found = {
+        fault(module, name.removeprefix("ipsys_log."))
+        for module, path in modules()
+        for name in imports(path.read_text())
+    }
+    assert found - {None} == set()
 
 
 def test_every_module_has_a_layer() -> None:
@@ -123,9 +108,3 @@ def test_nothing_but_a_source_reads_a_clock() -> None:
     """A stage that reads a clock could not be replayed. Sources share one clock."""
     reading = {name for name, path in modules() if clocks(path.read_text())}
     assert reading == {"capture.frames"}
-
-
-def test_the_guard_sees_a_clock() -> None:
-    assert clocks("import time\nstamp = time.time_ns()") == {"time.time_ns"}
-    assert clocks("from datetime import datetime\nstamp = datetime.now()") == {"datetime.now"}
-    assert clocks("import time\ntime.sleep(1)") == set()

@@ -39,7 +39,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.verify import diff, verify
 from ipsys_log.runs.view import LogView
-from ipsys_log.sinks.sink import Consumer, send_all
+from ipsys_log.sinks.sink import Sink
 from ipsys_log.stages.detect import FrameDetector
 from ipsys_log.survey.checks import check_entry, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry
@@ -256,12 +256,12 @@ def test_failed_stage_does_not_stop_the_recording(
 
 
 class Failing:
-    """A consumer that fails at its n-th message, and gets no more messages."""
+    """A sink that fails at its n-th message, and gets no more messages."""
 
     def __init__(self, number: int) -> None:
         self.left = number
 
-    def __call__(self, _: Message | None) -> None:
+    def __call__(self, _: Message) -> None:
         assert self.left > 0, "it is shown more after it failed"
         self.left -= 1
         if not self.left:
@@ -270,18 +270,18 @@ class Failing:
 
 @pytest.mark.parametrize("number", [1, 20])
 @pytest.mark.parametrize("stages", [False, True])
-def test_consumer_that_fails_ends_no_recording(
+def test_function_that_fails_ends_no_recording(
     lab_log: Path, calibration: Path, tmp_path: Path, stages: bool, number: int
 ) -> None:
     target = tmp_path / "x.mcap"
     attached, settings, clock = attached_in_steps(lab_log)
-    seen: list[Message | None] = []
-    consumers: list[Consumer] = [clock.watch, Failing(number), seen.append]
+    seen: list[Message] = []
+    sinks: list[Sink] = [clock.watch, Failing(number), seen.append]
     request = Request(model_from=calibration)
     live = partial(pipeline.live, attached, settings, target, request)
     act = live if stages else partial(pipeline.record, attached, settings, target)
     with attached, pytest.raises(ZeroDivisionError, match="in the display"):
-        act(consumers=consumers)
+        act(sinks=sinks)
     with Session([target]) as session:
         frames = {name: session.count(topic) for name, topic in session.images.items()}
         assert frames == {name: len(found) for name, found in sent(lab_log).items()}
@@ -291,7 +291,7 @@ def test_consumer_that_fails_ends_no_recording(
         signed = {run.stage for run in session.runs()}
         assert signed == ({"detect", "camera-frame", "fit", "locate", "fuse"} if stages else set())
         assert all(e.kind != FRAME_SKIPPED for e in session.payloads(["/events"]))
-    images = [one for one in seen if one is not None and isinstance(one.payload, CompressedImage)]
+    images = [one for one in seen if isinstance(one.payload, CompressedImage)]
     assert len(images) == sum(frames.values())
     if stages:
         assert all(one.equal for one in again(target))
@@ -306,14 +306,8 @@ class Noting:
     def __init__(self, steps: list[tuple[str, type, int]]) -> None:
         self._steps = steps
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        send_all(self, messages)
-
     def send(self, message: Message) -> None:
         self._steps.append(("sent", type(message.payload), message.log_time_ns))
-
-    def finish(self) -> None:
-        self._steps.append(("ended", Tracks, 0))
 
 
 @pytest.mark.slow
@@ -330,10 +324,10 @@ def test_position_is_sent_after_its_write_and_before_its_latency(
 
     monkeypatch.setattr(Recording, "put", noted)
     attached, settings, clock = attached_in_steps(lab_log)
-    request, sinks = Request(model_from=calibration), [Noting(steps)]
+    request = Request(model_from=calibration)
+    sinks: list[Sink] = [clock.watch, Noting(steps)]
     with attached:
-        pipeline.live(attached, settings, tmp_path / "x.mcap", request, None, [clock.watch], sinks=sinks)
-    assert steps.pop() == ("ended", Tracks, 0)
+        pipeline.live(attached, settings, tmp_path / "x.mcap", request, None, sinks)
     assert [step for step, *_ in steps] == ["written", "sent"] * (len(steps) // 2)
     assert [row[1:] for row in steps[::2]] == [row[1:] for row in steps[1::2]]
     times_ns = [time_ns for step, kind, time_ns in steps if (step, kind) == ("sent", Tracks)]
@@ -444,7 +438,7 @@ def test_point_measured_during_a_recording_is_used_by_fit(
     with attached:
         scene = LiveScene(rig, model, attached.states, attached.save)
 
-        def measure(message: Message | None) -> None:
+        def measure(message: Message) -> None:
             scene(message)
             for marker_id, one in wanted.items():
                 sight = observe_marker(scene.views(None), marker_id)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.first_messages import first_messages
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CAMERA_MOVED, Event, Markers, ReferenceMarker

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.first_messages import first_messages
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Latency
@@ -44,7 +44,7 @@ def recorded(lab_log: Path, fitted: Path, tmp_path_factory: pytest.TempPathFacto
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     request = Request(models=MODELS, model_from=fitted)
     with attached:
-        outcomes = pipeline.live(attached, settings, target, request, consumers=[clock.watch])
+        outcomes = pipeline.live(attached, settings, target, request, sinks=[clock.watch])
     assert [(one.stage, one.run) for one in outcomes] == [
         ("detect", "edges"),
         ("camera-frame", "edges"),

@@ -55,7 +55,7 @@ def record_out_of_order(
     attached = LiveCameras(cameras(*frames), opened, clock)
     settings = settings_of(lab, attached)
     with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
+        pipeline.live(attached, settings, target, Request(model_from=calibration), sinks=[clock.watch])
     with Session([target]) as session:
         return list(session.messages(session.topics(POSITIONS, "poly")))
 

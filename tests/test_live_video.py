@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.network import open_network
 from ipsys_log.images.video import Video, is_keyframe

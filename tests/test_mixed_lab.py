@@ -14,8 +14,8 @@ import pytest
 
 from ipsys_log import pipeline
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock, Frame, Open, Say
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
@@ -75,7 +75,7 @@ def mixed(
             (rig,) = session.payloads(["/rig"])
         settings = first_messages(rig, lenses(replayed_log), attached.now_ns, attached.imported_run)
         if request.param == "live":
-            pipeline.live(attached, settings, target, wanted, consumers=[clock.watch])
+            pipeline.live(attached, settings, target, wanted, sinks=[clock.watch])
         else:
             pipeline.record(attached, settings, target, [clock.watch])
     if request.param == "record":

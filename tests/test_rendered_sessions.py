@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,23 +67,3 @@ def test_rendered_markers_are_those_of_the_lab_and_are_kept(
     again = rendered.rendered_session(lab, tmp_path / "labs")
     assert [one.log_time_ns for one in again] == [one.log_time_ns for one in first]
     np.testing.assert_array_equal(list(corners(again).values()), list(seen.values()))
-
-
-def test_interrupted_session_leaves_nothing_that_counts_as_rendered(
-    rendered: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(rendered, "prepare_view", lambda *_: None)
-    monkeypatch.setattr(rendered, "render", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        rendered.rendered_session(make_lab(), tmp_path)
-    assert list(tmp_path.glob("*.mcap")) == []
-
-
-def test_rendered_session_refuses_an_uneven_floor(rendered: Any, tmp_path: Path) -> None:
-    lab = make_lab()
-    uneven = replace(lab, settings=replace(lab.settings, floor_rms_m=0.001))
-    with pytest.raises(SystemExit, match="flat floor"):
-        rendered.rendered_session(uneven, tmp_path)

@@ -1,4 +1,4 @@
-"""Resets of detection at absolute log times: live, in a replay, in pieces, and after a merge."""
+"""Resets of detection at absolute log times: live, in a replay, and in pieces."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from ipsys_log import pipeline
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers, Message
-from ipsys_log.messages.channels import MARKERS
 from ipsys_log.messages.stage import Resets
-from ipsys_log.runs.merge import merge
-from ipsys_log.runs.merge_plan import LogOffset
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
 from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from ipsys_log.units import NS_PER_S
@@ -32,7 +28,7 @@ def test_live_equals_replay_across_resets(lab_log: Path, tmp_path: Path) -> None
     frames = {camera: images[:12] for camera, images in sent(lab_log).items()}
     attached, settings, clock = attached_in_steps(lab_log, frames)
     with attached:
-        pipeline.live(attached, settings, target, REQUEST, "detect", consumers=[clock.watch])
+        pipeline.live(attached, settings, target, REQUEST, "detect", sinks=[clock.watch])
     (outcome,) = pipeline.replay([target], REQUEST, "detect")
     assert not outcome.fresh
     with Session([target]) as session:
@@ -72,23 +68,3 @@ def test_parameter_of_a_record_that_is_no_period_is_refused(lab: Path) -> None:
     for text in ("0", "-1", "x", "1e3", "999999999"):
         with pytest.raises(IpsysError, match="reset_s"):
             pipeline.replay([lab], Request(parameters={"reset_s": text}), "detect")
-
-
-@pytest.mark.slow
-def test_verify_repeats_a_merged_run_with_its_resets(lab_log: Path, tmp_path: Path) -> None:
-    """The clock of the second recorder is late, and the merge shifts its times: its resets move with them."""
-    first, second, merged = (tmp_path / f"{name}.mcap" for name in ("a", "b", "merged"))
-    with Session([lab_log]) as session:
-        settings = list(session.messages(["/rig", *session.calibrations.values()]))
-        images = list(session.messages(session.images.values()))
-    for path, cameras in ((first, ("red",)), (second, ("white", "black"))):
-        write_log(path, [m for m in (*settings, *images) if m.camera in (None, *cameras)])
-        pipeline.replay([path], replace(REQUEST, corners="edges"), "detect")
-    merge([first, second], merged, [LogOffset(), LogOffset(437_000_000)])
-    found = verify([merged], None, lambda *_: None)
-    repeated = {one.topic for one in found if one.repeated and one.topic.endswith("/markers")}
-    with Session([merged]) as session:
-        topics = {t for name in session.run_names() for t in session.topics(MARKERS, name)}
-    assert repeated == topics
-    assert len(repeated) == 3
-    assert all(one.equal for one in found)

@@ -17,7 +17,7 @@ from ipsys_log import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import ChunkRef
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import FRAME_SKIPPED, Message, Tracks
 from ipsys_log.messages.channels import EVENTS, MARKERS

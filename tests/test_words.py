@@ -34,48 +34,52 @@ _PHRASES = (
     "how a camera hangs",
 )
 _TEXT_PHRASES = (*_PHRASES, "there is no such", "no such camera", "is no number", "anew", "is made first")
+# Phrases of earlier pages. An id or a CSS class may still have them.
+_PAGE_PHRASES = (
+    *_PHRASES,
+    "off by",
+    "by how much",
+    "has to lie",
+    "it says",
+    "knows little",
+    "the place",
+    "places",
+    "somebody",
+)
 # A shorter text is a part of a sentence, such as "of focus".
 _FEWEST_WORDS = 4
-# Stages write these texts into derived channels: docs/decisions/stage-texts.md. A new text is a new version.
-_STAGE_TEXTS: tuple[str, ...] = ()
-_FILES = sorted(
-    path for folder in ("ipsys_log", "benchmarks", "tests") for path in ROOT.glob(f"{folder}/**/*.py")
-)
-_SOURCES = [path for path in _FILES if path.is_relative_to(ROOT / "ipsys_log")]
+_PACKAGE = ROOT / "ipsys_log"
+# Each of them is one test: the folders of the package, its modules, the tests, and the benchmarks.
+_FOLDERS = [
+    *(path for path in sorted(_PACKAGE.iterdir()) if path.is_dir() and path.name != "__pycache__"),
+    _PACKAGE,
+    ROOT / "tests",
+    ROOT / "benchmarks",
+]
 
 
-def sentences(source: str) -> Iterator[tuple[int, str]]:
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.py") if folder == _PACKAGE else folder.rglob("*.py"))
+
+
+def sentences(source: str, tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield the docstrings and comments of a source, each with its line."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             text = ast.get_docstring(node)
             if text:
                 yield getattr(node, "lineno", 1), text
-    lines: list[tuple[int, str]] = []
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            lines.append((token.start[0], token.string.lstrip("# ")))
-    for number, (line, text) in enumerate(lines):
-        follows = number and lines[number - 1][0] == line - 1
-        if not follows:
-            yield line, text
+    comments = [
+        (token.start[0], token.string.lstrip("# "))
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    ]
+    lines = {line for line, _ in comments}
+    yield from ((line, text) for line, text in comments if line - 1 not in lines)
 
 
-def faults(source: str) -> list[str]:
-    found = []
-    for line, text in sentences(source):
-        plain = re.sub(r"``.*?``|>>> .*", "x", text)
-        for paragraph in re.split(r"\n\s*\n", plain):
-            opening = _OPENING.search(" ".join(paragraph.split()))
-            if opening:
-                found.append(f"line {line}: begins with {opening[1]!r}: {' '.join(paragraph.split())[:70]}")
-        found += [f"line {line}: {phrase!r}" for phrase in _PHRASES if phrase in plain.lower()]
-    return found
-
-
-def texts(source: str) -> Iterator[tuple[int, str]]:
+def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield the strings of a source that are not docstrings, each with its line; x stands for a value."""
-    tree = ast.parse(source)
     skipped: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr):
@@ -92,16 +96,75 @@ def texts(source: str) -> Iterator[tuple[int, str]]:
             yield node.lineno, "".join(parts)
 
 
+def faults(text: str, opening: re.Pattern[str], phrases: tuple[str, ...]) -> list[str]:
+    """Return the paragraphs of a text that begin with a relative clause, and the phrases in it."""
+    paragraphs = [" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text)]
+    found = [f"{match[1]!r}: {part[:90]}" for part in paragraphs if (match := opening.search(part))]
+    return found + [f"{phrase!r}: {text[:90]}" for phrase in phrases if phrase in text.lower()]
+
+
 def text_faults(text: str) -> list[str]:
     """Return the faults of a text for a person: an error, a remark, a help text, a title."""
-    if len(text.split()) < _FEWEST_WORDS or text in _STAGE_TEXTS:
-        return []
-    found = []
-    for paragraph in re.split(r"\n\s*\n", text):
-        opening = _TEXT_OPENING.search(" ".join(paragraph.split()))
-        if opening:
-            found.append(f"{opening[1]!r} begins a sentence: {' '.join(paragraph.split())[:90]}")
-    return found + [f"{phrase!r}: {text[:90]}" for phrase in _TEXT_PHRASES if phrase in text.lower()]
+    return faults(text, _TEXT_OPENING, _TEXT_PHRASES) if len(text.split()) >= _FEWEST_WORDS else []
+
+
+def source_faults(path: Path) -> Iterator[str]:
+    source = path.read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    for line, text in sentences(source, tree):
+        plain = re.sub(r"``.*?``|>>> .*", "x", text)
+        yield from (f"{path}:{line}: {fault}" for fault in faults(plain, _OPENING, _PHRASES))
+    if path.is_relative_to(_PACKAGE):
+        for line, text in texts(tree):
+            yield from (f"{path}:{line}: {fault}" for fault in text_faults(text))
+
+
+@pytest.mark.parametrize("folder", _FOLDERS, ids=[path.name for path in _FOLDERS])
+def test_sentences_of_sources_are_plain(folder: Path) -> None:
+    assert [fault for path in files(folder) for fault in source_faults(path)] == []
+
+
+def test_faults_of_a_source_are_seen(tmp_path: Path) -> None:
+    path = tmp_path / "a.py"
+    path.write_text(
+        '"""What is recorded."""\n# Who asks for more has read it.\n# Is it right? What then?\n'
+        'def f():\n    """Return it. Of these, one is right."""\n'
+    )
+    assert len([*source_faults(path)]) == 3
+    assert text_faults("the camera has gone; plug it in anew")
+    assert text_faults("x: where it is seen, nobody knows")
+    assert not text_faults("Where is the marker now?")
+    assert page_faults("<h1>Positions are off by {{ head.mean }} cm</h1>", ".html")
+    assert page_faults('save.textContent = "Wait: the marker has to lie still";', ".js")
+
+
+def page_faults(source: str, suffix: str) -> list[str]:
+    """Return the visible texts of a page with a fault: texts and labels, or literals of a script."""
+    if suffix == ".js":
+        code = re.sub(r"^\s*//.*$", "", source, flags=re.MULTILINE)
+        literals = re.findall(r'"((?:[^"\\\n]|\\.)*)"|`((?:[^`\\]|\\.)*)`', code)
+        visible = [text for pair in literals for text in pair if " " in text.strip()]
+    else:
+        plain = re.sub(r"\{%.*?%\}|\{#.*?#\}|<style>.*?</style>", "", source, flags=re.DOTALL)
+        plain = re.sub(r"\{\{.*?\}\}", "x", plain, flags=re.DOTALL)
+        labels = re.findall(r'(?:aria-label|alt|title|placeholder)="([^"]*)"', plain)
+        inline = re.sub(r"</?(?:b|i|em|code|span)\b[^>]*>", "", plain)
+        visible = [*re.split(r"<[^>]*>", inline), *labels]
+    return [fault for text in visible for fault in faults(text, _OPENING, _PAGE_PHRASES)]
+
+
+def test_pages_are_plain() -> None:
+    pages = [path for suffix in ("html", "js") for path in _PACKAGE.rglob(f"*.{suffix}")]
+    assert len(pages) >= 8
+    wrong = {path.name: page_faults(path.read_text(encoding="utf-8"), path.suffix) for path in pages}
+    assert {name: found for name, found in wrong.items() if found} == {}
+
+
+def test_comments_of_the_example_rig_are_plain() -> None:
+    """The example is the first file that a new user reads."""
+    comments = re.findall(r"# .*", (_PACKAGE / "rig/lab.toml").read_text(encoding="utf-8"))
+    assert len(comments) > 40
+    assert faults(" ".join(comment.lstrip("# ") for comment in comments), _OPENING, _PAGE_PHRASES) == []
 
 
 def help_texts(command: Any, path: str) -> Iterator[tuple[str, str]]:
@@ -113,129 +176,7 @@ def help_texts(command: Any, path: str) -> Iterator[tuple[str, str]]:
         yield from help_texts(subcommand, f"{path} {name}")
 
 
-_HELP = list(help_texts(typer.main.get_command(app), "ipsys"))
-
-
-@pytest.mark.parametrize("path", _FILES, ids=[str(path.relative_to(ROOT)) for path in _FILES])
-def test_docstrings_and_comments_are_plain(path: Path) -> None:
-    assert faults(path.read_text(encoding="utf-8")) == []
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        '"""What is recorded."""',
-        "x = 1  # Who asks for more has read it.",
-        'def f():\n    """Return it. Of these, one is right."""',
-        '"""Return where a marker lies still."""',
-    ],
-)
-def test_the_guard_sees_a_fault(source: str) -> None:
-    assert faults(source)
-
-
-def test_questions_and_code_are_no_fault() -> None:
-    assert faults('"""Return x. ``What`` is a name. Is it right? What then?"""') == []
-
-
-_PAGES = sorted(path for suffix in ("html", "js") for path in ROOT.glob(f"ipsys_log/**/*.{suffix}"))
-# Phrases of earlier pages. An id or a CSS class may still have them.
-_PAGE_PHRASES = (
-    *_PHRASES,
-    "off by",
-    "by how much",
-    "has to lie",
-    "it says",
-    "knows little",
-    "the place",
-    "places",
-    "somebody",
-)
-
-
-def page_texts(source: str, suffix: str) -> list[str]:
-    """Return the visible texts of a page: text and labels of HTML, or literals with a space of a script."""
-    if suffix == ".js":
-        code = re.sub(r"^\s*//.*$", "", source, flags=re.MULTILINE)
-        literals = re.findall(r'"((?:[^"\\\n]|\\.)*)"|`((?:[^`\\]|\\.)*)`', code)
-        return [text for pair in literals for text in pair if " " in text.strip()]
-    plain = re.sub(r"\{%.*?%\}|\{#.*?#\}|<style>.*?</style>", "", source, flags=re.DOTALL)
-    plain = re.sub(r"\{\{.*?\}\}", "x", plain, flags=re.DOTALL)
-    labels = re.findall(r'(?:aria-label|alt|title|placeholder)="([^"]*)"', plain)
-    inline = re.sub(r"</?(?:b|i|em|code|span)\b[^>]*>", "", plain)
-    return [text for text in (*re.split(r"<[^>]*>", inline), *labels) if text.strip()]
-
-
-def page_faults(source: str, suffix: str) -> list[str]:
-    """Return the visible texts with a fault."""
-    texts = [" ".join(text.split()) for text in page_texts(source, suffix)]
-    return [
-        text
-        for text in texts
-        if _OPENING.search(text) or any(phrase in text.lower() for phrase in _PAGE_PHRASES)
-    ]
-
-
-@pytest.mark.parametrize("path", _PAGES, ids=[str(path.relative_to(ROOT)) for path in _PAGES])
-def test_pages_are_plain(path: Path) -> None:
-    assert page_faults(path.read_text(encoding="utf-8"), path.suffix) == []
-
-
-def test_comments_of_the_example_rig_are_plain() -> None:
-    """The example is the first file that a new user reads."""
-    comments = re.findall(r"# .*", (ROOT / "ipsys_log/rig/lab.toml").read_text(encoding="utf-8"))
-    text = " ".join(comment.lstrip("# ") for comment in comments)
-    assert len(comments) > 40
-    assert [phrase for phrase in _PAGE_PHRASES if phrase in text.lower()] == []
-    assert _OPENING.search(text) is None
-
-
-@pytest.mark.parametrize(
-    ("source", "suffix"),
-    [
-        ("<h2>Where not to trust it</h2>", ".html"),
-        ("<h1>Positions are off by {{ head.mean }} cm</h1>", ".html"),
-        ('<nav aria-label="Places in the log"></nav>', ".html"),
-        ('save.textContent = "Wait: the marker has to lie still";', ".js"),
-    ],
-)
-def test_page_guard_finds_a_fault(source: str, suffix: str) -> None:
-    assert page_faults(source, suffix)
-
-
-def test_page_guard_finds_texts_of_every_page() -> None:
-    assert len(_PAGES) >= 8
-    found = {path.name: page_texts(path.read_text(encoding="utf-8"), path.suffix) for path in _PAGES}
-    assert "Measured so far" in found["measure.html"]
-    assert "Nothing yet." in found["measure.js"]
-    assert "Error map" in found["session.html"]
-
-
-@pytest.mark.parametrize("path", _SOURCES, ids=[str(path.relative_to(ROOT)) for path in _SOURCES])
-def test_texts_for_people_are_plain(path: Path) -> None:
-    said = [(line, text_faults(text)) for line, text in texts(path.read_text(encoding="utf-8"))]
-    assert [f"line {line}: {fault}" for line, found in said for fault in found] == []
-
-
-@pytest.mark.parametrize(("name", "text"), _HELP, ids=[name for name, _ in _HELP])
-def test_help_is_plain(name: str, text: str) -> None:
-    assert text or name.endswith("--help")
-    assert text_faults(text) == []
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        'raise IpsysError("what is recorded is not shown")',
-        'raise IpsysError(f"{path}: where it is seen, nobody knows")',
-        'say(f"{count} frames. Of these, one is right")',
-        'say("the camera has gone; plug it in " "anew")',
-        'help = "Whether the log is read again."',
-    ],
-)
-def test_the_guard_sees_a_fault_in_a_text(source: str) -> None:
-    assert [fault for _, text in texts(source) for fault in text_faults(text)]
-
-
-def test_a_question_is_no_fault_in_a_text() -> None:
-    assert text_faults("Where is the marker now?") == []
+def test_help_is_plain() -> None:
+    helps = list(help_texts(typer.main.get_command(app), "ipsys"))
+    assert [name for name, text in helps if not text and not name.endswith("--help")] == []
+    assert {name: text_faults(text) for name, text in helps if text_faults(text)} == {}

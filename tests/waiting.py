@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-__all__ = ["PATIENCE_S", "wait_until"]
-
 # A limit far above any duration on a busy machine.
 PATIENCE_S = 600.0
 _TURN_S = 0.02

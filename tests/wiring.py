@@ -8,8 +8,6 @@ from ipsys_log.messages.channels import Channel
 from ipsys_log.messages.stage import Plan, Stage, StageView, Step
 from ipsys_log.runs.stream import WiredStage, wire
 
-__all__ = ["wired"]
-
 
 def wired(
     run: str,

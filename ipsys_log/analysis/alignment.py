@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.coverage import MountedCamera
 from ipsys_log.analysis.stationary import StationaryMarker
 from ipsys_log.arrays import Array, Mask
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import invert_pose, make_pose, transform
 from ipsys_log.messages import CameraCalibration
 
@@ -237,7 +237,7 @@ _ALIKE_M = 0.05
 
 def join_cameras(
     alignments: Sequence[Alignment], lenses: Mapping[str, CameraCalibration]
-) -> list[MountedCamera]:
+) -> list[PosedCamera]:
     """Return the cameras that common markers connect to the first camera, in common coordinates.
 
     Two cameras must see a common marker at the same time. The markers on the floor give the height and the
@@ -263,7 +263,7 @@ def join_cameras(
     if len(joined) < 2:
         return []
     return [
-        MountedCamera(name, lenses[name], invert_pose(joined[name] @ _floor_from_camera(known[name])))
+        PosedCamera.at_pose(name, lenses[name], invert_pose(joined[name] @ _floor_from_camera(known[name])))
         for name in known
         if name in joined
     ]

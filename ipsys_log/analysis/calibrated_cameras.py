@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipsys_log.analysis.floor_cameras import FloorCamera, outline_view
+from ipsys_log.analysis.floor_cameras import outline_view
 from ipsys_log.arrays import Array
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.joint.fit import JointFit
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import restore_joint
@@ -104,7 +105,7 @@ def _describe(
     outline_m = np.zeros((0, 2))
     if size_px is not None:
         lens = replace(model.calibration, width=size_px[0], height=size_px[1])
-        outline_m = outline_view(FloorCamera(name, lens, model.camera_from_world, model.origin_m))
+        outline_m = outline_view(PosedCamera(name, lens, model.camera_from_world, model.origin_m))
     return CalibratedCamera(
         name,
         size_px,

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Baseline, Motion, build_baseline, estimate_motion
-from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid
+from ipsys_log.analysis.floor_cameras import floor_grid
 from ipsys_log.analysis.reference_markers import Window, average_windows
 from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import undistort
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.messages import Floor
 
 # Windows whose mean is a baseline, or the state after a move.
@@ -82,7 +83,7 @@ class LabDrift:
 
 def find_drift(
     logs: Sequence[DriftLog],
-    cameras: Mapping[str, FloorCamera],
+    cameras: Mapping[str, PosedCamera],
     lengths_m: Mapping[int, float],
     floor: Floor | None,
 ) -> LabDrift:
@@ -120,7 +121,7 @@ class _Search:
     """The search for moves, log by log."""
 
     def __init__(
-        self, cameras: Mapping[str, FloorCamera], lengths_m: Mapping[int, float], floor: Floor | None
+        self, cameras: Mapping[str, PosedCamera], lengths_m: Mapping[int, float], floor: Floor | None
     ) -> None:
         self.drift = LabDrift()
         self._cameras, self._lengths_m = cameras, lengths_m

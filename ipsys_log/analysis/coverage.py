@@ -9,12 +9,13 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, find_objects, label
+from scipy.ndimage import distance_transform_edt
 
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.lenses import in_image
-from ipsys_log.geometry.poses import invert_pose, transform
-from ipsys_log.messages import CameraCalibration, Floor
+from ipsys_log.geometry.posed_camera import PosedCamera
+from ipsys_log.messages import Floor
 
 # Distance between tested points of the floor, and their largest number along a side.
 _STEP_M, _MOST = 0.01, 800
@@ -24,20 +25,6 @@ _GRAZED = 5.0
 _AROUND_M = 2.0
 # Smaller areas (less than a hand) are not reported: camera positions by tape are not accurate enough.
 _LEAST_M2 = 0.01
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MountedCamera:
-    """A camera with intrinsics ``lens`` and extrinsics ``camera_from_world`` (4, 4)."""
-
-    camera: str
-    lens: CameraCalibration
-    camera_from_world: Array
-
-    @property
-    def foot_m(self) -> Array:
-        """Return the point of the floor below the camera, (2,) in m."""
-        return np.asarray(invert_pose(self.camera_from_world)[:2, 3])
 
 
 class Overlap(NamedTuple):
@@ -52,7 +39,7 @@ class Overlap(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """A connected part of the floor, from ``low_m`` to ``high_m``, (2,) each."""
+    """A connected part of the floor, from ``low_m`` to ``high_m``, (2,) each; its cells are included."""
 
     area_m2: float
     low_m: Array
@@ -88,7 +75,7 @@ class FloorCoverage:
 
 
 def cover_floor(
-    floor: Floor, cameras: Sequence[MountedCamera], marker_length_m: float, height_m: float
+    floor: Floor, cameras: Sequence[PosedCamera], marker_length_m: float, height_m: float
 ) -> FloorCoverage:
     """Compute the coverage of the floor at points about every centimetre.
 
@@ -109,20 +96,20 @@ def cover_floor(
     rim = math.ceil(diagonal_m / 2 / step_m) + 1
     xs_m, ys_m = (_middles(size_m, step_m, rim) for size_m in _size(floor))
     inside = (slice(rim, -rim), slice(rim, -rim))
-    seen = {camera.camera: _seen(camera, xs_m, ys_m, height_m) for camera in cameras}
+    seen = {camera.name: _seen(camera, xs_m, ys_m, height_m) for camera in cameras}
     whole = {name: _erode(mask, diagonal_m / 2 / step_m)[inside] for name, mask in seen.items()}
     ground = [_seen(camera, xs_m[rim:-rim], ys_m[rim:-rim], 0.0) for camera in cameras]
-    grid = _Grid(xs_m[rim:-rim], ys_m[rim:-rim], step_m)
-    fits = grid.from_edge(floor) >= marker_length_m / 2
+    grid = FloorGrid(xs_m[rim:-rim], ys_m[rim:-rim], step_m)
+    fits = _from_edge(grid, floor) >= marker_length_m / 2
     return FloorCoverage(
         floor, height_m, diagonal_m, grid.xs_m, grid.ys_m, whole, fits,
-        grid.patches(~np.any(ground, axis=0)),
-        grid.patches(fits & ~np.any([*whole.values()], axis=0)),
+        _patches(grid, ~np.any(ground, axis=0)),
+        _patches(grid, fits & ~np.any([*whole.values()], axis=0)),
         tuple(_overlaps(grid, {name: mask[inside] for name, mask in seen.items()}, cameras)),
     )  # fmt: skip
 
 
-def find_overlaps(cameras: Sequence[MountedCamera], height_m: float) -> tuple[Overlap, ...]:
+def find_overlaps(cameras: Sequence[PosedCamera], height_m: float) -> tuple[Overlap, ...]:
     """Return the overlaps of neighbouring cameras on an unlimited floor.
 
     Parameters
@@ -134,8 +121,8 @@ def find_overlaps(cameras: Sequence[MountedCamera], height_m: float) -> tuple[Ov
     low_m, high_m = feet_m.min(axis=0) - _AROUND_M, feet_m.max(axis=0) + _AROUND_M
     step_m = max(_STEP_M, float((high_m - low_m).max()) / _MOST)
     xs_m, ys_m = (np.arange(a, b, step_m) for a, b in zip(low_m, high_m, strict=True))
-    seen = {camera.camera: _seen(camera, xs_m, ys_m, height_m) for camera in cameras}
-    return tuple(_overlaps(_Grid(xs_m, ys_m, step_m), seen, cameras))
+    seen = {camera.name: _seen(camera, xs_m, ys_m, height_m) for camera in cameras}
+    return tuple(_overlaps(FloorGrid(xs_m, ys_m, step_m), seen, cameras))
 
 
 def _size(floor: Floor) -> tuple[float, float]:
@@ -147,10 +134,10 @@ def _middles(size_m: float, step_m: float, rim: int) -> Array:
     return np.asarray(step_m * (np.arange(-rim, round(size_m / step_m) + rim) + 0.5), dtype=np.float64)
 
 
-def _seen(camera: MountedCamera, xs_m: Array, ys_m: Array, height_m: float) -> Mask:
+def _seen(camera: PosedCamera, xs_m: Array, ys_m: Array, height_m: float) -> Mask:
     """Return a mask (b, a) of the points of a grid at a height that are in the image."""
     points_m = np.stack(np.meshgrid(xs_m, ys_m, [height_m]), axis=-1).reshape(-1, 3)
-    inside_m = transform(camera.camera_from_world, points_m)
+    inside_m = camera.transform(points_m)
     ahead = np.hypot(inside_m[:, 0], inside_m[:, 1]) < _GRAZED * inside_m[:, 2]
     ahead[ahead] = in_image(inside_m[ahead], camera.lens)
     return np.asarray(ahead.reshape(len(ys_m), len(xs_m)))
@@ -164,38 +151,28 @@ def _erode(seen: Mask, radius: float) -> Mask:
     return np.asarray(distance_transform_edt(seen) - 0.5 >= radius)
 
 
-class _Grid(NamedTuple):
-    xs_m: Array
-    ys_m: Array
-    step_m: float
-
-    def from_edge(self, floor: Floor) -> Array:
-        """Return the distance of each point from the edge of the floor, (b, a) in m."""
-        x_m, y_m = (
-            np.minimum(v, size - v) for v, size in zip((self.xs_m, self.ys_m), _size(floor), strict=True)
-        )
-        return np.asarray(np.minimum(x_m, y_m[:, None]))
-
-    def patches(self, mask: Mask) -> tuple[Patch, ...]:
-        labels, _ = label(mask, np.ones((3, 3)))
-        areas, half_m = [], self.step_m / 2
-        for number, (rows, columns) in enumerate(find_objects(labels), 1):
-            area_m2 = float((labels[rows, columns] == number).sum()) * self.step_m**2
-            x_m, y_m = self.xs_m[columns], self.ys_m[rows]
-            low_m, high_m = np.array([x_m[0], y_m[0]]) - half_m, np.array([x_m[-1], y_m[-1]]) + half_m
-            areas.append(Patch(area_m2, low_m, high_m))
-        return tuple(sorted((p for p in areas if p.area_m2 >= _LEAST_M2), key=lambda p: -p.area_m2))
-
-    def at(self, mask: Mask, points_m: Array) -> Mask:
-        """Return the values of a mask at points (..., 2); False for points outside the grid."""
-        low_m = np.array([self.xs_m[0], self.ys_m[0]]) - self.step_m / 2
-        columns, rows = np.moveaxis(np.floor((points_m - low_m) / self.step_m).astype(int), -1, 0)
-        inside = (columns >= 0) & (columns < len(self.xs_m)) & (rows >= 0) & (rows < len(self.ys_m))
-        return np.asarray(inside & mask[np.where(inside, rows, 0), np.where(inside, columns, 0)])
+def _from_edge(grid: FloorGrid, floor: Floor) -> Array:
+    """Return the distance of each point from the edge of the floor, (b, a) in m."""
+    x_m, y_m = (np.minimum(v, size - v) for v, size in zip((grid.xs_m, grid.ys_m), _size(floor), strict=True))
+    return np.asarray(np.minimum(x_m, y_m[:, None]))
 
 
-def _overlaps(grid: _Grid, seen: Mapping[str, Mask], cameras: Sequence[MountedCamera]) -> Iterator[Overlap]:
-    feet_m = {camera.camera: camera.foot_m for camera in cameras}
+def _patches(grid: FloorGrid, mask: Mask) -> tuple[Patch, ...]:
+    half_m = grid.step_m / 2
+    parts = grid.patches(mask, _LEAST_M2)
+    return tuple(Patch(part.area_m2, part.low_m - half_m, part.high_m + half_m) for part in parts)
+
+
+def _values_at(grid: FloorGrid, mask: Mask, points_m: Array) -> Mask:
+    """Return the values of a mask at points (..., 2); False for points outside the grid."""
+    low_m = np.array([grid.xs_m[0], grid.ys_m[0]]) - grid.step_m / 2
+    columns, rows = np.moveaxis(np.floor((points_m - low_m) / grid.step_m).astype(int), -1, 0)
+    inside = (columns >= 0) & (columns < len(grid.xs_m)) & (rows >= 0) & (rows < len(grid.ys_m))
+    return np.asarray(inside & mask[np.where(inside, rows, 0), np.where(inside, columns, 0)])
+
+
+def _overlaps(grid: FloorGrid, seen: Mapping[str, Mask], cameras: Sequence[PosedCamera]) -> Iterator[Overlap]:
+    feet_m = {camera.name: camera.foot_m for camera in cameras}
     for first, second in combinations(feet_m, 2):
         middle_m = (feet_m[first] + feet_m[second]) / 2
         half_m = float(np.linalg.norm(feet_m[second] - middle_m))
@@ -208,7 +185,7 @@ def _overlaps(grid: _Grid, seen: Mapping[str, Mask], cameras: Sequence[MountedCa
 
 
 def _narrowest(
-    grid: _Grid, seen: tuple[Mask, Mask], feet_m: tuple[Array, Array]
+    grid: FloorGrid, seen: tuple[Mask, Mask], feet_m: tuple[Array, Array]
 ) -> tuple[float, Array] | None:
     """Return the least width of the area that two cameras both see, and the point with this width.
 
@@ -221,8 +198,8 @@ def _narrowest(
     aside_m = np.arange(-reach_m, reach_m, grid.step_m)
     ahead_m = np.arange(0, apart_m + reach_m, grid.step_m)
     offsets_m = aside_m[:, None, None] * np.array([-along[1], along[0]])
-    ours = grid.at(seen[0], feet_m[0] + offsets_m + ahead_m[None, :, None] * along)
-    theirs = grid.at(seen[1], feet_m[1] + offsets_m - ahead_m[None, :, None] * along)
+    ours = _values_at(grid, seen[0], feet_m[0] + offsets_m + ahead_m[None, :, None] * along)
+    theirs = _values_at(grid, seen[1], feet_m[1] + offsets_m - ahead_m[None, :, None] * along)
     lines = np.flatnonzero(ours[:, 0] & theirs[:, 0])
     if not len(lines):
         return None

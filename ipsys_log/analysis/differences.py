@@ -24,7 +24,7 @@ class Comparison:
     the same frame, and ``same`` the number of pairs that are equal byte for byte. ``first`` is the first
     difference. ``rms`` and ``greatest`` are distances between common markers of both sides, in ``unit``:
     corners in px, points in m. They are None without common markers.
-    ``repeated`` is False for a channel of a part of a log that is compared with the record of the cut.
+    ``repeated`` is False for a copied channel that is compared with the hash of the copy.
     """
 
     topic: str

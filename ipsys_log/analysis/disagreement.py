@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.arrays import Array, Times
 from ipsys_log.errors import LogError
+from ipsys_log.geometry.time_brackets import bracket_times
 from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import read_columns
 from ipsys_log.log.contents import camera_of_topic
@@ -173,20 +174,14 @@ def _compare(first: CameraPositions, second: CameraPositions) -> PairDisagreemen
     parts = []
     for marker_id in np.intersect1d(first.ids, second.ids).tolist():
         own, other = _in_order(first, marker_id), _in_order(second, marker_id)
-        after = np.searchsorted(other.times_ns, own.times_ns)
-        inner = (after > 0) & (after < len(other.times_ns))
-        after = np.where(inner, after, 1)
-        if len(other.times_ns) < 2:
-            continue
-        gaps_ns = other.times_ns[after] - other.times_ns[after - 1]
-        rows = np.flatnonzero(inner & (gaps_ns <= LONGEST_GAP_NS) & (gaps_ns > 0))
-        upper, lower = after[rows], after[rows] - 1
-        share = ((own.times_ns[rows] - other.times_ns[lower]) / gaps_ns[rows])[:, None]
-        line_m = (1 - share) * other.points_m[lower] + share * other.points_m[upper]
-        share = share[:, :, None]
-        spread = (1 - share) * other.covariances_m2[lower] + share * other.covariances_m2[upper]
+        brackets = bracket_times(other.times_ns, own.times_ns, LONGEST_GAP_NS)
+        # No line leads to the first sighting after a gap.
+        has_line = np.append(False, np.diff(other.times_ns) <= LONGEST_GAP_NS)
+        rows = np.flatnonzero(brackets.is_known & has_line[brackets.after])
+        line_m = brackets.mix(other.points_m)[rows]
+        spread_m2 = brackets.mix(other.covariances_m2)[rows]
         differences_m = own.points_m[rows] - line_m
-        squares = _squares(differences_m, own.covariances_m2[rows] + spread)
+        squares = _squares(differences_m, own.covariances_m2[rows] + spread_m2)
         ids = np.full(len(rows), marker_id, dtype=np.int64)
         parts.append((own.times_ns[rows], ids, (own.points_m[rows] + line_m) / 2, differences_m, squares))
     names = first.camera, second.camera

@@ -18,11 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipsys_log.analysis.floor_cameras import FloorCamera, shift_floor_map
+from ipsys_log.analysis.floor_cameras import shift_floor_map
 from ipsys_log.arrays import Array
 from ipsys_log.calibration.lens_models import project_points, project_with_slopes
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import marker_corners, pixel_slopes
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import rotation
 from ipsys_log.geometry.square_pose import fit_squares, is_convex
 from ipsys_log.joint.observations import lens_model_of
@@ -76,7 +77,7 @@ class Baseline:
     points_c : by marker id, the corners (4, 3) in camera coordinates, in m.
     """
 
-    camera: FloorCamera
+    camera: PosedCamera
     floor_m: Array
     corners: Mapping[int, MeanCorners]
     points_c: Mapping[int, Array]
@@ -114,7 +115,7 @@ class Motion:
 
 
 def build_baseline(
-    camera: FloorCamera, floor_m: Array, corners: Mapping[int, MeanCorners], lengths_m: Mapping[int, float]
+    camera: PosedCamera, floor_m: Array, corners: Mapping[int, MeanCorners], lengths_m: Mapping[int, float]
 ) -> Baseline:
     """Return the baseline of a camera; a marker outside of the field of view of its lens model is left out.
 
@@ -227,16 +228,16 @@ def _covariance(
     return covariance
 
 
-def _project(camera: FloorCamera, points_c: Array) -> Array:
+def _project(camera: PosedCamera, points_c: Array) -> Array:
     return project_points(lens_model_of(camera.lens), _lens_parameters(camera), points_c)
 
 
-def _lens_parameters(camera: FloorCamera) -> Array:
+def _lens_parameters(camera: PosedCamera) -> Array:
     K = camera.lens.K
     return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera.lens.D])
 
 
-def _displace(camera: FloorCamera, points_c: Array, motion: Array) -> tuple[Array, Array]:
+def _displace(camera: PosedCamera, points_c: Array, motion: Array) -> tuple[Array, Array]:
     """Return the pixels (n, 2) of points (n, 3) after a motion, and their slopes (2 n, 6) by it."""
     turn = rotation(motion[:3])
     arrived_c = (points_c - camera.camera_from_world @ motion[3:]) @ turn.T

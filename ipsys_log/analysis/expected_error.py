@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import find_objects, label
 from scipy.spatial import cKDTree
 
-from ipsys_log.analysis.floor_error import GRID_M, WALL_M, WHOLE_PRINT
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.analysis.plan import mean_length
 from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.lenses import in_image, project
@@ -22,6 +21,8 @@ from ipsys_log.geometry.rotations import level_turns
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel
 
+# A marker counts as visible if a square of this multiple of its side is wholly in the image.
+WHOLE_PRINT = 1.4
 # A node is covered if the camera saw a marker nearer than this: the floor changes little over this distance.
 _COVERED_M = 0.35
 # Smaller gaps are not reported.
@@ -29,30 +30,6 @@ _LEAST_GAP_M2 = 0.1
 # So many nodes at once have modes of a few dozen megabytes, in a hall of 24 cameras.
 _AT_ONCE = 1000
 _ALL = slice(None)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FloorGrid:
-    """A grid over the floor: coordinates ``xs_m`` (a,) and ``ys_m`` (b,) of its nodes, ``step_m`` apart."""
-
-    xs_m: Array
-    ys_m: Array
-    step_m: float
-
-    @classmethod
-    def over(cls, low_m: Array, high_m: Array, step_m: float = GRID_M) -> FloorGrid:
-        """Return the grid over a rectangle, at least 0.3 m from its edges."""
-        # The small number keeps a node that is exactly at the limit.
-        axes = [
-            np.arange(low + WALL_M, high - WALL_M + 1e-6, step_m)
-            for low, high in zip(low_m, high_m, strict=True)
-        ]
-        return cls(axes[0], axes[1], step_m)
-
-    @property
-    def nodes_m(self) -> Array:
-        """The nodes (b * a, 2), row by row."""
-        return np.stack(np.meshgrid(self.xs_m, self.ys_m), axis=-1).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,15 +189,14 @@ def find_gaps(expected: ExpectedErrors, grid: FloorGrid, places_m: Array) -> tup
     mask[expected.seen] = open_nodes
     errors_m = np.full(len(mask), np.nan)
     errors_m[expected.seen] = expected.errors_m
-    labels, _ = label(mask.reshape(shape), np.ones((3, 3)))
-    gaps = []
-    for number, (rows, columns) in enumerate(find_objects(labels), 1):
-        inside = labels == number
-        area_m2 = float(inside.sum()) * grid.step_m**2
-        if area_m2 < _LEAST_GAP_M2:
-            continue
-        x_m, y_m = grid.xs_m[columns], grid.ys_m[rows]
-        low_m, high_m = np.array([x_m[0], y_m[0]]), np.array([x_m[-1], y_m[-1]])
-        error_m = float(errors_m.reshape(shape)[inside].mean())
-        gaps.append(FloorGap(expected.camera, area_m2, low_m, high_m, error_m))
-    return float(1 - open_nodes.mean()), sorted(gaps, key=lambda gap: -gap.area_m2)
+    gaps = [
+        FloorGap(
+            expected.camera,
+            patch.area_m2,
+            patch.low_m,
+            patch.high_m,
+            float(errors_m.reshape(shape)[patch.inside].mean()),
+        )
+        for patch in grid.patches(mask.reshape(shape), _LEAST_GAP_M2)
+    ]
+    return float(1 - open_nodes.mean()), gaps

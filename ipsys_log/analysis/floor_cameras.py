@@ -1,17 +1,18 @@
-"""Calibrated cameras above the floor, from any fitted model, and the motion of such a camera."""
+"""Calibrated cameras above the floor, from any fitted model, and the effect of a motion."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import check_calibration, in_image, undistort
-from ipsys_log.geometry.poses import rotation
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.messages import CameraCalibration, CameraModel, Floor, Model
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import reads_corners
@@ -28,21 +29,7 @@ _OUTLINE = 16
 _GRAZED = 3.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FloorCamera:
-    """A camera with its intrinsics ``lens``, its rotation ``camera_from_world`` (3, 3) and its position."""
-
-    name: str
-    lens: CameraCalibration
-    camera_from_world: Array
-    origin_m: Array
-
-    def transform(self, points_m: Array) -> Array:
-        """Return world points (n, 3) in camera coordinates."""
-        return np.asarray((points_m - self.origin_m) @ self.camera_from_world.T)
-
-
-def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) -> dict[str, FloorCamera]:
+def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) -> dict[str, PosedCamera]:
     """Return the cameras of a fitted model that have intrinsics and a pose, by name.
 
     The joint model has the pose and its own intrinsics. For all other models, the pose is the rigid transform
@@ -80,13 +67,13 @@ def _joint_models(model: Model) -> Mapping[str, JointModel]:
     return restore_joint(model)
 
 
-def _joint_camera(name: str, joint: JointModel, lens: CameraCalibration) -> FloorCamera:
+def _joint_camera(name: str, joint: JointModel, lens: CameraCalibration) -> PosedCamera:
     own = joint.calibration
     lens = replace(lens, distortion_model=own.distortion_model, K=own.K, D=own.D)
-    return FloorCamera(name, lens, joint.camera_from_world, joint.origin_m)
+    return PosedCamera(name, lens, joint.camera_from_world, joint.origin_m)
 
 
-def _rigid_camera(camera: CameraModel, lens: CameraCalibration) -> FloorCamera | None:
+def _rigid_camera(camera: CameraModel, lens: CameraCalibration) -> PosedCamera | None:
     """Return a camera with the pose that its calibration points give; None if they are too few."""
     world_m = np.array([pair.world_m for pair in camera.pairs]).reshape(-1, 3)
     camera_m = np.array([pair.camera_m for pair in camera.pairs]).reshape(-1, 3)
@@ -96,10 +83,10 @@ def _rigid_camera(camera: CameraModel, lens: CameraCalibration) -> FloorCamera |
         turn, shift_m = rigid_transform(world_m, camera_m)
     except FitError:
         return None
-    return FloorCamera(camera.camera, lens, turn, -turn.T @ shift_m)
+    return PosedCamera(camera.camera, lens, turn, -turn.T @ shift_m)
 
 
-def floor_grid(camera: FloorCamera, floor: Floor | None) -> Array:
+def floor_grid(camera: PosedCamera, floor: Floor | None) -> Array:
     """Return the points (n, 3) of a grid of 0.25 m on the floor that a camera sees.
 
     Parameters
@@ -112,13 +99,13 @@ def floor_grid(camera: FloorCamera, floor: Floor | None) -> Array:
     else:
         reach_m = _REACH * abs(float(camera.origin_m[2]))
         low, high = camera.origin_m[:2] - reach_m, camera.origin_m[:2] + reach_m
-    axes = [np.arange(start + _STEP_M / 2, end, _STEP_M) for start, end in zip(low, high, strict=True)]
-    flat_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    grid = FloorGrid.of_cells(low, high, _STEP_M)
+    flat_m = np.stack(np.meshgrid(grid.xs_m, grid.ys_m, indexing="ij"), axis=-1).reshape(-1, 2)
     points_m = np.column_stack([flat_m, np.zeros(len(flat_m))])
     return np.asarray(points_m[in_image(camera.transform(points_m), camera.lens)])
 
 
-def outline_view(camera: FloorCamera) -> Array:
+def outline_view(camera: PosedCamera) -> Array:
     """Return the outline (k, 2) of the field of view of a camera on the floor, z = 0, in m."""
     along, ends = np.linspace(0.0, 1.0, _OUTLINE, endpoint=False), np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     sides = [
@@ -134,13 +121,7 @@ def outline_view(camera: FloorCamera) -> Array:
     return np.asarray(camera.origin_m[:2] + rays[:, :2] * (camera.origin_m[2] / depths)[:, None])
 
 
-def move_camera(camera: FloorCamera, motion: Array) -> FloorCamera:
-    """Return a camera after a motion (6,): a turn about its axes in rad, and a shift in the world in m."""
-    turned = rotation(motion[:3]) @ camera.camera_from_world
-    return replace(camera, camera_from_world=turned, origin_m=camera.origin_m + motion[3:])
-
-
-def shift_floor_map(camera: FloorCamera, points_m: Array, motion: Array) -> Array:
+def shift_floor_map(camera: PosedCamera, points_m: Array, motion: Array) -> Array:
     """Return the errors (n, 2) of positions on the floor, in m, if a camera moves and its model does not.
 
     The moved camera sees a point on another ray. The model of the camera before the motion meets this ray
@@ -150,15 +131,15 @@ def shift_floor_map(camera: FloorCamera, points_m: Array, motion: Array) -> Arra
     ----------
     camera : the camera before the motion.
     points_m : (n, 3), true points at any height; the positions have the same height.
-    motion : (6,), as for :func:`move_camera`.
+    motion : (6,), as for :meth:`PosedCamera.move`.
 
     Examples
     --------
     >>> lens = CameraCalibration(0, "red", 0, 0, "kannala_brandt", np.zeros(4), np.eye(3))
-    >>> camera = FloorCamera("red", lens, np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 2.0]))
+    >>> camera = PosedCamera("red", lens, np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 2.0]))
     >>> shift_floor_map(camera, np.zeros((1, 3)), np.array([0, 0, 0, 0.01, 0, 0])).round(6).tolist()
     [[-0.01, 0.0]]
     """
-    rays = move_camera(camera, motion).transform(points_m) @ camera.camera_from_world
+    rays = camera.move(motion).transform(points_m) @ camera.camera_from_world
     along = (points_m[:, 2] - camera.origin_m[2]) / rays[:, 2]
     return np.asarray(camera.origin_m[:2] + along[:, None] * rays[:, :2] - points_m[:, :2])

@@ -14,13 +14,14 @@ from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.pairs import Sightings, still_interval
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.arrays import Array
+from ipsys_log.geometry.time_brackets import bracket_times
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
 
 _SAME_HEIGHT_M = 0.005
 # Longest gap for linear interpolation. For a robot with 2 m/s and 2.5 rad/s, its error is 0.7 mm over 1/30 s,
 # and 6 mm over 0.1 s.
-_GAP_NS = NS_PER_S // 10
+LONGEST_GAP_NS = NS_PER_S // 10
 
 
 class TrackErrors(NamedTuple):
@@ -124,8 +125,9 @@ def track_errors(
             continue
         # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-        true_m, is_known = interpolate(known, times_ns)
-        offsets.append((track.points_m[::-1][last] - true_m)[is_known])
+        truth = bracket_times(known.times_ns, times_ns, LONGEST_GAP_NS)
+        offsets_m = track.points_m[::-1][last] - truth.mix(known.points_m)
+        offsets.append(offsets_m[truth.is_known])
     rows_m = np.vstack([np.zeros((0, 3)), *offsets])
     if not len(rows_m):
         return None
@@ -141,21 +143,3 @@ def _statistics(offsets_m: Array) -> tuple[ErrorStatistics, ErrorStatistics]:
         error_statistics(np.linalg.norm(offsets_m, axis=1), independent=False),
         error_statistics(np.linalg.norm(offsets_m[:, :2], axis=1), independent=False),
     )
-
-
-def interpolate(
-    known: Sightings, times_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return points (n, 3) at times (n,), and a mask of the known points.
-
-    Points beyond the ends or in a gap are unknown. At an instant of the ground truth, the result is the exact
-    true point. If this instant occurs twice, the first point counts.
-    """
-    after = np.searchsorted(known.times_ns, times_ns).clip(max=len(known.times_ns) - 1)
-    end_ns = known.times_ns[after]
-    before = np.where(end_ns > times_ns, after - 1, after).clip(min=0)
-    start_ns = known.times_ns[before]
-    is_known = (start_ns <= times_ns) & (times_ns <= end_ns) & (end_ns - start_ns <= _GAP_NS)
-    share = (times_ns - start_ns) / np.maximum(end_ns - start_ns, 1)
-    start_m = known.points_m[before]
-    return start_m + share[:, None] * (known.points_m[after] - start_m), is_known

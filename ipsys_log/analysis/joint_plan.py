@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
-    FloorGrid,
     expect_errors,
     mean_lengths,
     see_markers,
 )
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.analysis.plan import MeasurementPlan, PlannedPlace
 from ipsys_log.analysis.tape import TapeCovariances
 from ipsys_log.analysis.taped_points import choose_points, mean_error, some_modes
@@ -145,12 +145,12 @@ def choose_drive(
     The drive; None if no camera sees a robot.
     """
     modes_m = some_modes(expected)
-    xs_m, ys_m = (np.arange(a + _STEP_M / 2, b, _STEP_M) for a, b in zip(low_m, high_m, strict=True))
-    if not len(modes_m) or not len(xs_m) or not len(ys_m):
+    grid = FloorGrid.of_cells(low_m, high_m, _STEP_M)
+    if not len(modes_m) or not len(grid.nodes_m):
         return None
-    places_m = np.stack(np.meshgrid(xs_m, ys_m), axis=-1)
-    seen, rows = _information(models, sizes_px, places_m.reshape(-1, 2), height_m, length_m)
-    shape = places_m.shape[:2]
+    seen, rows = _information(models, sizes_px, grid.nodes_m, height_m, length_m)
+    shape = len(grid.ys_m), len(grid.xs_m)
+    places_m = grid.nodes_m.reshape(*shape, 2)
     seen, rows = seen.reshape(len(models), *shape), rows.reshape(*shape, *rows.shape[1:])
     best: tuple[float, slice, slice] | None = None
     for y in range(0, max(1, shape[0] - _SQUARE + 1), _SQUARE // 2):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.arrays import Array, Mask
+from ipsys_log.geometry.time_brackets import bracket_times
 
 # Longest gap for an interpolation, in multiples of the usual interval, and in s.
 _USUAL_INTERVALS, _SHORTEST_GAP_S, _LONGEST_GAP_S = 2.5, 0.1, 1.0
@@ -100,16 +101,16 @@ def _interpolate(times_s: Array, points_m: Array, at_s: Array) -> tuple[Array, A
     if len(times_s) < 2:
         return np.zeros((len(at_s), 3)), np.zeros((len(at_s), 3)), np.zeros(len(at_s), dtype=np.bool_)
     limit_s = gap_limit_s(times_s)
-    after = np.searchsorted(times_s, at_s, side="right").clip(1, len(times_s) - 1)
+    brackets = bracket_times(times_s, at_s, limit_s)
+    after = brackets.before.clip(max=len(times_s) - 2) + 1
     start_s, step_s = times_s[after - 1], times_s[after] - times_s[after - 1]
-    is_known = (start_s <= at_s) & (at_s <= times_s[after]) & (step_s <= limit_s)
     velocities = _velocities(times_s, points_m, limit_s)
     u, h = ((at_s - start_s) / step_s)[:, None], step_s[:, None]
     p, q, v, w = points_m[after - 1], points_m[after], velocities[after - 1] * h, velocities[after] * h
     # The cubic with these ends p, q and slopes v, w, by powers of u.
     second, third = 3 * (q - p) - 2 * v - w, 2 * (p - q) + v + w
     value_m = p + u * (v + u * (second + u * third))
-    return value_m, (v + u * (2 * second + 3 * u * third)) / h, is_known
+    return value_m, (v + u * (2 * second + 3 * u * third)) / h, brackets.is_known & (step_s <= limit_s)
 
 
 def _velocities(times_s: Array, points_m: Array, limit_s: float) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ipsys_log.analysis.path_pairs import PathPair, gap_limit_s
 from ipsys_log.arrays import Array
+from ipsys_log.geometry.time_brackets import bracket_times
 
 # Half the time over which a speed is measured. Noise of 5 mm then is a speed of 0.035 m/s.
 _HALF_WINDOW_S = 0.1
@@ -57,24 +58,13 @@ def _speeds(times_s: Array, points_m: Array, step_s: float) -> tuple[Array, Arra
     """Return speeds on the floor at the steps of a grid, with 0 where they are unknown, and a mask 0 or 1."""
     half_s = max(_HALF_WINDOW_S, step_s)
     grid_s: Array = np.arange(int(times_s[-1] / step_s) + 1, dtype=np.float64) * step_s
-    ends = [_floor_at(times_s, points_m, grid_s + sign * half_s) for sign in (-1, 1)]
-    speeds = np.linalg.norm(ends[1] - ends[0], axis=1) / (2 * half_s)
-    known = np.isfinite(speeds)
+    ends = [bracket_times(times_s, grid_s + sign * half_s, gap_limit_s(times_s)) for sign in (-1, 1)]
+    before_m, after_m = (end.mix(points_m[:, :2]) for end in ends)
+    speeds = np.linalg.norm(after_m - before_m, axis=1) / (2 * half_s)
+    known = ends[0].is_known & ends[1].is_known
     if known.any():
         speeds = np.minimum(speeds, _CLIPPED_ABOVE * np.quantile(speeds[known], 0.9))
     return np.where(known, speeds, 0.0), known.astype(np.float64)
-
-
-def _floor_at(times_s: Array, points_m: Array, at_s: Array) -> Array:
-    """Return points on the floor (k, 2) at some times, NaN in a gap and beyond the ends."""
-    after = np.searchsorted(times_s, at_s).clip(1, max(len(times_s) - 1, 1))
-    if len(times_s) < 2:
-        return np.full((len(at_s), 2), np.nan)
-    start_s, end_s = times_s[after - 1], times_s[after]
-    is_known = (start_s <= at_s) & (at_s <= end_s) & (end_s - start_s <= gap_limit_s(times_s))
-    share = ((at_s - start_s) / (end_s - start_s))[:, None]
-    between_m = (1 - share) * points_m[after - 1, :2] + share * points_m[after, :2]
-    return np.where(is_known[:, None], between_m, np.nan)
 
 
 def _correlation_sums(true: tuple[Array, Array], track: tuple[Array, Array], size: int) -> Array:

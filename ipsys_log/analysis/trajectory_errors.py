@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.ground_truth import RobotPath, interpolate
+from ipsys_log.analysis.accuracy import error_statistics
+from ipsys_log.analysis.ground_truth import LONGEST_GAP_NS, RobotPath
 from ipsys_log.arrays import Array
+from ipsys_log.geometry.time_brackets import TimeBrackets, bracket_times
+from ipsys_log.messages import ErrorStatistics
 from ipsys_log.units import NS_PER_S
 
 Places = NDArray[np.int64]
@@ -21,19 +23,6 @@ DELTAS = ((1.0, "m"), (1.0, "s"))
 # differs by at most this share of the usual interval.
 _DISTANCE_SHARE, _INTERVAL_SHARE = 0.1, 0.5
 TRANSLATION, DISTANCE = "translation_part", "point_distance"
-
-
-@dataclass(frozen=True, slots=True)
-class ErrorSummary:
-    """Statistics of errors in m, with the names and definitions of evo; ``std_m`` divides by n."""
-
-    count: int
-    rmse_m: float
-    mean_m: float
-    median_m: float
-    std_m: float
-    max_m: float
-    p95_m: float
 
 
 class RelativeErrors(NamedTuple):
@@ -48,8 +37,8 @@ class RelativeErrors(NamedTuple):
     errors_m: Array
 
     @property
-    def summary(self) -> ErrorSummary:
-        return _summary(self.errors_m)
+    def summary(self) -> ErrorStatistics:
+        return error_statistics(self.errors_m, independent=False)
 
 
 class TrajectoryErrors(NamedTuple):
@@ -64,14 +53,14 @@ class TrajectoryErrors(NamedTuple):
     relative: tuple[RelativeErrors, ...]
 
     @property
-    def absolute_3d(self) -> ErrorSummary:
+    def absolute_3d(self) -> ErrorStatistics:
         """The absolute trajectory error (ATE) in space, without a further alignment."""
-        return _summary(np.linalg.norm(self.offsets_m, axis=1))
+        return error_statistics(np.linalg.norm(self.offsets_m, axis=1), independent=False)
 
     @property
-    def absolute_2d(self) -> ErrorSummary:
+    def absolute_2d(self) -> ErrorStatistics:
         """The absolute trajectory error (ATE) on the floor."""
-        return _summary(np.linalg.norm(self.offsets_m[:, :2], axis=1))
+        return error_statistics(np.linalg.norm(self.offsets_m[:, :2], axis=1), independent=False)
 
 
 def trajectory_errors(
@@ -122,14 +111,15 @@ def _errors_of(
 ) -> TrajectoryErrors | None:
     # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
     times_ns, last = np.unique(track.positions.times_ns[::-1], return_index=True)
-    true_m, is_known = interpolate(truth.positions, times_ns)
+    brackets = bracket_times(truth.positions.times_ns, times_ns, LONGEST_GAP_NS)
+    is_known = brackets.is_known
     if not is_known.any():
         return None
     points_m, headings_rad = (
         values[::-1][last][is_known] for values in (track.positions.points_m, track.headings_rad)
     )
-    times_ns, true_m = times_ns[is_known], true_m[is_known]
-    true_rad = _headings_at(truth, times_ns)
+    times_ns, true_m = times_ns[is_known], brackets.mix(truth.positions.points_m)[is_known]
+    true_rad = _mix_headings(brackets, truth.headings_rad)[is_known]
     has_headings = np.isfinite(headings_rad) & np.isfinite(true_rad)
     used = has_headings if has_headings.any() else np.ones(len(times_ns), dtype=np.bool_)
     relative = _relative_errors(
@@ -141,15 +131,11 @@ def _errors_of(
     return TrajectoryErrors(track.robot, points_m - true_m, tuple(relative))
 
 
-def _headings_at(truth: RobotPath, times_ns: NDArray[np.int64]) -> Array:
-    """Return headings (n,) at times between instants of the truth, along the shorter arc; NaN if unknown."""
-    known_ns = truth.positions.times_ns
-    after = np.searchsorted(known_ns, times_ns).clip(max=len(known_ns) - 1)
-    before = np.where(known_ns[after] > times_ns, after - 1, after).clip(min=0)
-    span_ns = np.maximum(known_ns[after] - known_ns[before], 1)
-    start_rad, end_rad = truth.headings_rad[before], truth.headings_rad[after]
+def _mix_headings(brackets: TimeBrackets, known_rad: Array) -> Array:
+    """Return headings (k,) between those of the truth (n,), along the shorter arc; NaN if unknown."""
+    start_rad, end_rad = known_rad[brackets.before], known_rad[brackets.after]
     arc_rad = (end_rad - start_rad + np.pi) % (2 * np.pi) - np.pi
-    return np.asarray(start_rad + (times_ns - known_ns[before]) / span_ns * arc_rad)
+    return np.asarray(start_rad + brackets.share * arc_rad)
 
 
 def _relative_errors(
@@ -205,15 +191,3 @@ def _turned_back(moves_m: Array, headings_rad: Array) -> Array:
     cos, sin = np.cos(headings_rad), np.sin(headings_rad)
     x_m, y_m, z_m = moves_m.T
     return np.column_stack([cos * x_m + sin * y_m, cos * y_m - sin * x_m, z_m])
-
-
-def _summary(errors_m: Array) -> ErrorSummary:
-    return ErrorSummary(
-        len(errors_m),
-        float(np.sqrt((errors_m**2).mean())),
-        float(errors_m.mean()),
-        float(np.median(errors_m)),
-        float(errors_m.std()),
-        float(errors_m.max()),
-        float(np.percentile(errors_m, 95)),
-    )

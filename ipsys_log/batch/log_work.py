@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.batch.tasks import LogResult
-from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.log_files import name_places, read_log_state
 from ipsys_log.log_export import EXPORT_FORMATS, ExportOptions, channel_of_table, find_format
 from ipsys_log.runs.output import check_source, choose_target, derived_log_of, logs_with_results
-from ipsys_log.runs.piece_folder import PieceFolder, StoredPieces
+from ipsys_log.runs.pieces import PieceWorkers
 from ipsys_log.runs.superseded import outdated_runs
 from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck
 
@@ -32,7 +32,7 @@ def replay_log(
     path: LogLocation,
     outdated: bool = False,
     folder: Path | None = None,
-    divide: bool = False,
+    workers: PieceWorkers | None = None,
     **options: Any,
 ) -> LogResult:
     """Compute the results that a log lacks in this process, as :func:`ipsys_log.api.replay` does.
@@ -41,13 +41,8 @@ def replay_log(
     ----------
     outdated : leave a log without outdated runs unchanged.
     folder : for the results of a log that cannot be appended to; None: the working folder.
-    divide : do not detect markers in a long log here, but merge the stored results of its pieces.
+    workers : they compute the pieces of a long log.
     options : those of the replay.
-
-    Raises
-    ------
-    PiecesMissingError
-        Some pieces are not stored yet; nothing is written.
     """
     from ipsys_log import api
 
@@ -57,20 +52,10 @@ def replay_log(
     target = output or logs[-1]
     assert isinstance(target, Path)  # the results are in a file, also those of a log at a URL
     target.parent.mkdir(parents=True, exist_ok=True)
-    stored = StoredPieces(PieceFolder.beside(target))
     remarks: list[str] = []
-    workers = stored if divide else None
-    try:
-        outcomes = api.replay(
-            *logs, output=output, say=remarks.append, jobs=1, workers=workers, **options
-        ).outcomes
-    except WriteError:
-        raise
-    except IpsysError:
-        if output is None and stored.is_complete:  # the log has their run already
-            stored.folder.clear(stored.keys)
-        raise
-    lost = stored.folder.clear(stored.keys)
+    outcomes = api.replay(
+        *logs, output=output, say=remarks.append, jobs=1, workers=workers, **options
+    ).outcomes
     new = [outcome for outcome in outcomes if outcome.fresh]
     remarks += [f"{outcome.run}: {remark}" for outcome in new for remark in outcome.remarks]
     return LogResult(
@@ -79,8 +64,6 @@ def replay_log(
         text=_remarks_text(remarks),
         runs=tuple(dict.fromkeys(outcome.run for outcome in new)),
         messages=sum(outcome.messages for outcome in new),
-        pieces=stored.merged or None,
-        lost_attempts=lost if stored.merged else None,
         derived=None if target == path else str(target),
     )
 

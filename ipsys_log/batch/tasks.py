@@ -1,29 +1,26 @@
 """Tasks of a batch: the work on one log in a worker process, its pieces, and its result.
 
 A task runs in a worker process, perhaps on another machine. Each task can run twice: a log has its results as
-runs, and a run that exists is not computed again. The first task of a long log gives the pieces of its
-detection as further tasks. When these are done, the same task merges their results.
+runs, and a run that exists is not computed again. The first task of a long log only reports that it is long.
 """
 
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ipsys_log import __version__
 from ipsys_log.errors import IpsysError, os_error_text, reason_without
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
+from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.graph import VERSIONS
-from ipsys_log.runs.piece_folder import (
-    OtherSoftwareError,
-    PiecesMissingError,
-    PieceTask,
-    store_piece,
-)
+from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun, check_versions, compute_piece
+from ipsys_log.runs.provenance import fingerprint
 
 # The state of a log whose task had an error; the works on logs have others.
 FAILED = "failed"
@@ -31,6 +28,14 @@ FAILED = "failed"
 
 class VersionError(IpsysError):
     """A worker of another version of ipsys."""
+
+
+class OtherSoftwareError(IpsysError):
+    """A worker with other versions of libraries than the process that merges the pieces."""
+
+
+class LongLogError(Exception):
+    """The interruption of a work: the log is long, so its detection can be divided."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +52,7 @@ class LogResult:
     runs : the runs that were computed, compared or exported.
     messages : the number of messages that were written, compared or exported.
     trace : the traceback of a fault of the program; "" otherwise.
-    pieces : the number of merged pieces of a long log; None for a log that was one task.
-    lost_attempts : the number of their further results, which were deleted; None for a log that was one task.
+    pieces : the number of pieces of a long log; None for a log that was one task.
     derived : the derived log with results of the log, which was read or extended; None without one.
     """
 
@@ -60,29 +64,24 @@ class LogResult:
     messages: int = 0
     trace: str = ""
     pieces: int | None = None
-    lost_attempts: int | None = None
     derived: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class LogPieces:
-    """The pieces that must be computed before the task of a long log is repeated."""
-
-    tasks: tuple[PieceTask, ...]
+class LongLog:
+    """The answer of a task on a log that is long; nothing was done."""
 
 
-@dataclass(frozen=True, slots=True)
-class PieceState:
-    """The state of a piece after its task.
+class LongLogs:
+    """Workers that compute no pieces: a work on a long log ends with :class:`LongLogError`."""
 
-    Attributes
-    ----------
-    failure : the result of its log, if the piece failed; None if the piece is stored.
-    other_software : True if the worker has other libraries: the log must not be divided.
-    """
+    divides, first_only = True, False
 
-    failure: LogResult | None = None
-    other_software: bool = False
+    def prepare(self, _plan: PiecePlan) -> None:
+        raise LongLogError
+
+    def compute(self, _plan: PiecePlan) -> Iterator[PieceResult]:
+        raise LongLogError
 
 
 Work = Callable[..., LogResult]
@@ -121,21 +120,21 @@ def perform(task: BatchTask, path: LogLocation) -> LogResult:
     ------
     VersionError
         The worker has another version than the batch: it would compute other results.
-    PiecesMissingError
-        The work may divide the log, and pieces are missing.
+    LongLogError, OtherSoftwareError
+        The work may divide the log, and it is long; or a worker of its pieces has other libraries.
     """
     _check_versions(task)
     try:
         with one_reading():
             return task.work(path, **task.options)
-    except PiecesMissingError:
+    except (LongLogError, OtherSoftwareError):
         raise
     except Exception as error:
         return _failure_of(path, error)
 
 
-def perform_or_divide(task: BatchTask, path: LogLocation) -> LogResult | LogPieces:
-    """Do the work on a log as :func:`perform`; of a long log, return the pieces that are not stored yet.
+def perform_or_divide(task: BatchTask, path: LogLocation) -> LogResult | LongLog:
+    """Do the work on a log as :func:`perform`, but not on a long log.
 
     Raises
     ------
@@ -143,27 +142,31 @@ def perform_or_divide(task: BatchTask, path: LogLocation) -> LogResult | LogPiec
         The worker has another version than the batch.
     """
     try:
-        return perform(replace(task, options={**task.options, "divide": True}), path)
-    except PiecesMissingError as missing:
-        return LogPieces(tuple(missing.tasks))
+        return perform(replace(task, options={**task.options, "workers": LongLogs()}), path)
+    except LongLogError:
+        return LongLog()
 
 
-def perform_piece(task: BatchTask, path: LogLocation, piece: PieceTask) -> PieceState:
-    """Compute a piece of a log, and store its result.
+def compute_alone(run: PieceRun, piece: Piece, software: Mapping[str, str]) -> PieceResult:
+    """Compute a piece of a log.
 
     Raises
     ------
-    VersionError
-        The worker has another version than the batch.
+    OtherSoftwareError
+        This process has other versions of libraries than the process that planned the pieces.
+    IpsysError
+        A log has changed since the pieces were planned, or cannot be opened.
     """
-    _check_versions(task)
-    try:
-        store_piece(piece)
-    except OtherSoftwareError:
-        return PieceState(other_software=True)
-    except Exception as error:
-        return PieceState(_failure_of(path, error))
-    return PieceState()
+    run.load()
+    own = fingerprint()
+    if own != software:
+        names = [name for name in software if own.get(name) != software[name]]
+        raise OtherSoftwareError(f"the workers have different versions: {', '.join(names)}")
+    with Session(run.paths) as session, one_blas_thread():
+        check_versions(session, run)
+        result = compute_piece(session, run, piece)
+        check_versions(session, run)
+    return result
 
 
 def _failure_of(path: LogLocation, error: Exception) -> LogResult:

@@ -53,12 +53,14 @@ class Workers:
     address : of the scheduler.
     dashboard : address of the page that shows the work.
     local : the number of worker processes on this machine; 0 with an existing scheduler.
+    is_stopped : True if the batch ends, perhaps before its logs are done.
     """
 
     client: Client
     address: str
     dashboard: str
     local: int = 0
+    is_stopped: bool = False
 
     def window(self) -> int:
         """Return the number of tasks to submit at once: it does not depend on the number of logs.
@@ -66,6 +68,20 @@ class Workers:
         On this machine, each worker has one task, so that the end of a worker affects one log.
         """
         return self.local or max(_LEAST_WAITING, 2 * sum(self.client.nthreads().values()))
+
+    def check_connection(self) -> None:
+        """Check that the batch goes on.
+
+        Raises
+        ------
+        IpsysError
+            The scheduler was lost, or the batch ends.
+        """
+        if self.is_stopped or self.client.status in ("closing", "closed"):
+            raise IpsysError(
+                f"the scheduler {self.address} was lost; results so far are in the logs; to continue, repeat "
+                "the command"
+            )
 
 
 def most_tasks(logs: Iterable[LogLocation]) -> int:

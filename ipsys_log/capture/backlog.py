@@ -168,8 +168,6 @@ class Backlog:
     def _record(self) -> None:
         try:
             for message in write_each(self._source, self._log):
-                if message is None:
-                    continue
                 if message.camera is not None or _is_read(message):
                     self._hand_on(message)
                 elif isinstance(message.payload, Event):

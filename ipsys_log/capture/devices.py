@@ -189,33 +189,15 @@ def source_opener(
         yield receiver.choose_opener(open_source)
 
 
-def check_devices(cameras: Iterable[RigCamera]) -> None:
-    """Check that no two cameras are the same device, also under different names of the device.
-
-    Raises
-    ------
-    IpsysError
-        Two cameras are the same device. The text names both.
-    """
-    names: dict[Path, str] = {}
-    for camera in cameras:
-        if camera.source and camera.source.startswith("usb:"):
-            device = Path(device_path(camera.source)).resolve()
-            other = names.setdefault(device, camera.name)
-            if other != camera.name:
-                raise IpsysError(
-                    f"cameras {other} and {camera.name} have the same device, {device}; give each its own"
-                )
-
-
-def check_sources(cameras: Iterable[RigCamera]) -> None:
+def check_sources(cameras: Sequence[RigCamera]) -> None:
     """Check the source of each camera without opening it: its text, its file or its device.
 
     Raises
     ------
     IpsysError
-        A source is invalid, or its file or device does not exist.
+        Two cameras are the same device, a source is invalid, or its file or device does not exist.
     """
+    _check_devices(cameras)
     for camera in cameras:
         source = str(camera.source)
         if _opener(camera) is open_network:
@@ -231,6 +213,19 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
                 f"camera {camera.name}: device {device_path(source)!r} does not exist; 'ipsys cameras' "
                 "lists the attached cameras"
             )
+
+
+def _check_devices(cameras: Iterable[RigCamera]) -> None:
+    """Check that no two cameras are the same device, also under different names of the device."""
+    names: dict[Path, str] = {}
+    for camera in cameras:
+        if camera.source and camera.source.startswith("usb:"):
+            device = Path(device_path(camera.source)).resolve()
+            other = names.setdefault(device, camera.name)
+            if other != camera.name:
+                raise IpsysError(
+                    f"cameras {other} and {camera.name} have the same device, {device}; give each its own"
+                )
 
 
 def usb_advice(rig: Rig) -> list[str]:

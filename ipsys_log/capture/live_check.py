@@ -76,9 +76,9 @@ class CameraMonitor:
         self._ended.set()
         self._thread.join()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Handle one recorded message."""
-        if message is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
+        if not isinstance(message.payload, (CompressedImage, CompressedVideo)):
             return
         if isinstance(message.payload, CompressedImage) or is_keyframe(message.payload):
             self._newest[str(message.camera)] = message.payload
@@ -118,7 +118,7 @@ class CameraMonitor:
 
 
 class KnockEvents:
-    """A consumer of live results that adds an event, and prints its text, when a camera has moved.
+    """A sink of live results that adds an event, and prints its text, when a camera has moved.
 
     The event is recorded and never derived: a replay does not repeat it, and no stage reads it.
 
@@ -131,10 +131,8 @@ class KnockEvents:
         self._cameras = cameras
         self._monitor: KnockMonitor | None = None
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Handle one message; the rig comes first."""
-        if message is None:
-            return
         if isinstance(message.payload, Rig):
             self._monitor = KnockMonitor(message.payload)
         elif self._monitor is not None:

@@ -27,6 +27,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
+from ipsys_log.stages.fit import model_run
 
 
 class LivePlan(NamedTuple):
@@ -146,6 +147,11 @@ def check_start(
         for model in models
         for name in sorted(set(cameras) - {camera.camera for camera in model.cameras})
     ]
+
+
+def shown_run(request: Request) -> str:
+    """Return the run of the first model: streams, viewers and the dashboard show one run."""
+    return model_run(wanted_models(request)[0])
 
 
 def check_model(model: Model, cameras: Collection[str]) -> None:

@@ -221,7 +221,7 @@ class Recording:
             self._torn = False
 
 
-def write_each(source: Source, log: Target) -> Iterator[Message | None]:
+def write_each(source: Source, log: Target) -> Iterator[Message]:
     """Yield the messages of a source, each after it was written.
 
     A measurement is confirmed as soon as it is on the disk. When the disk is full, or another program has
@@ -247,9 +247,9 @@ def write_each(source: Source, log: Target) -> Iterator[Message | None]:
                 if isinstance(message.payload, Measurement):
                     log.flush()
                     log.sync(partial(source.confirm, message))
+                yield message
             else:
                 continue
-            yield message
             if log.full is not None:
                 source.stop(
                     "the disk is full" if is_full(log.full.cause) else describe_disk_fault(log.full.cause)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
-from ipsys_log.cli.open_cameras import SENT_NOW, Lab, prepare_lab, record_now
+from ipsys_log.cli.open_cameras import SENT_NOW, prepare_lab, record_now
 from ipsys_log.cli.options import AsJson, file_log_argument
 from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import CalibrationResult, Failure
+    from ipsys_log.capture.lab import Lab
 
 Sources = Annotated[
     list[Path] | None,
@@ -217,7 +219,7 @@ def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
             "its cameras now"
         )
     lab = prepare_lab(rig, only, None, with_lenses=False)
-    return lab._replace(cameras=[show_board(camera, board) for camera in lab.cameras])
+    return replace(lab, cameras=[show_board(camera, board) for camera in lab.cameras])
 
 
 @contextmanager

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Rig
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Consumer
+    from ipsys_log.sinks.sink import Sink
     from ipsys_log.survey.lab_calibration import LabCalibration
 
 # Largest goal that still means something, in mm.
@@ -263,13 +263,13 @@ def _record_drive(
     check_target(output, force, lab.files)
     request = Request(corners=corners)
     ready_to_measure(lab, request, None, page)
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
-        scene = live_scene(settings, cameras, None)
+    with open_cameras(lab, output, seconds) as (opened, status):
+        scene = live_scene(opened, None)
         calibrating = LiveCalibration(lab.rig, lab.lenses, goal_m, say)
-        consumers: list[Consumer] = [status, scene, calibrating]
+        sinks: list[Sink] = [status, scene, calibrating]
         try:
             with nullcontext() if page is None else serve_live_measuring(scene, *page):
-                pipeline.live(cameras, settings, output, request, "camera-frame", consumers, force)
+                pipeline.live(opened.cameras, opened.settings, output, request, "camera-frame", sinks, force)
         finally:
             calibrating.close()
     if page is None or (len(scene.history()) < _LEAST_POINTS and sys.stdin.isatty()):

@@ -10,7 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
-from ipsys_log.cli.open_cameras import Lab, check_target, prepare_lab, record_now
+from ipsys_log.cli.open_cameras import check_target, prepare_lab, record_now
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -28,6 +28,7 @@ from ipsys_log.cli.stages import derive
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab
     from ipsys_log.log.location import LogLocation
     from ipsys_log.report.alignment import AlignedLab
     from ipsys_log.survey.drift_reading import DriftReading

@@ -79,9 +79,9 @@ def verify(
 ) -> None:
     """Compute every run of a log again from its inputs, and compare each channel byte for byte.
 
-    Frames that live processing skipped are excluded. In a part of a log (ipsys cut), results that depend on
-    messages outside of the part are compared with the record of the cut. In a merged log (ipsys merge), the
-    runs of each log are repeated with its own images. The exit code is 1 if there is a difference.
+    Frames that live processing skipped are excluded. Runs that ipsys cut or ipsys merge has copied without
+    their whole inputs are compared with the hashes of the copy; the command names them. The exit code is 1 if
+    there is a difference.
 
     Examples
 
@@ -149,11 +149,12 @@ def _agreement(comparisons: Sequence[Comparison]) -> str:
 def repair(
     log: Annotated[Path, appended_log_argument(help="A damaged or incomplete log.")],
 ) -> None:
-    """Repair a log in place: keep all complete records, report the losses, and complete its runs.
+    """Repair a log: keep everything that can be read, report the losses, and complete its runs.
 
-    The removed bytes are kept in <log>.damaged. A log that cannot be repaired is not changed. If ipsys live
-    or record --detect was killed, the command also processes the recorded frames that have no results. For
-    this it computes the runs again. After Ctrl-C, ipsys replay can do this instead.
+    A log without an end is completed in place. For any other damage, a new log replaces it. The old data are
+    kept in <log>.damaged. A log that cannot be repaired is not changed. If ipsys live or record --detect was
+    killed, the command also processes the recorded frames that have no results. For this it computes the
+    runs again. After Ctrl-C, ipsys replay can do this instead.
 
     Examples
 
@@ -161,7 +162,7 @@ def repair(
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.repair import repair as repair_log
+    from ipsys_log.log.recovery import repair as repair_log
     from ipsys_log.report.repair import repair_lines
 
     for part in repair_lines(repair_log(log)):

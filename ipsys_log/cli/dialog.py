@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import typer
 
 from ipsys_log.cli.console import console
-from ipsys_log.cli.signals import wake_input
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Rig
@@ -42,8 +41,7 @@ def answer(question: str, usual: str = "") -> str:
         The answer is a letter with a meaning at any question.
     """
     try:
-        with wake_input():
-            text = str(typer.prompt(question, default=usual, show_default=bool(usual))).strip()
+        text = str(typer.prompt(question, default=usual, show_default=bool(usual))).strip()
     except (typer.Abort, EOFError):
         raise LetterError("q") from None
     if text.lower() in _LETTERS:

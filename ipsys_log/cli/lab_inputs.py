@@ -12,9 +12,10 @@ import typer
 from ipsys_log.cli.console import say, warn
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.location import LogLocation
-    from ipsys_log.messages import CameraCalibration, Rig, RigCamera
+    from ipsys_log.messages import CameraCalibration, Rig
 
 Focal = Annotated[
     list[str] | None,
@@ -183,21 +184,21 @@ def lab_of_run(
 
 def load_lab(
     rig: Path, calibration: list[str] | None, only: Collection[str], with_lenses: bool = True
-) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration], dict[str, str]]:
-    """Return the rig of a file, its cameras that have a source (or ``only`` some), and their intrinsics.
+) -> Lab:
+    """Return the cameras of a rig file that have a source (or ``only`` some), with their intrinsics.
 
     The intrinsics come from ``calibration``, else from the file that the rig names, relative to the rig file.
-    The files of the rig are read only ``with_lenses``. The last value has a text for each camera whose file
-    does not state the lens model.
+    The files of the rig are read only ``with_lenses``.
 
     Raises
     ------
     IpsysError
         The rig has no such camera, or no camera with a source.
     """
+    from ipsys_log.capture.lab import Lab
     from ipsys_log.exchange.lab_files import load_cameras, load_lenses
 
-    lab, cameras = load_cameras(rig, only)
+    described, cameras = load_cameras(rig, only)
     names = [camera.name for camera in cameras]
     assumed: dict[str, str] = {}
     given = load_calibrations(calibration, lambda: names, assumed.__setitem__)
@@ -206,7 +207,7 @@ def load_lab(
     for camera, text in from_files.items():
         say_remark(camera, text)
     say_unusual({camera: lens for camera, lens in lenses.items() if camera not in given})
-    return lab, cameras, lenses, assumed | from_files
+    return Lab(described, cameras, lenses, rig.parent, assumed | from_files)
 
 
 def cameras_of(logs: Sequence[LogLocation]) -> set[str]:

@@ -181,8 +181,9 @@ def merge(
 
     Each recorder has its own clock. Without --offset, the command estimates the offset of a log from moving
     markers that its cameras and those of an earlier log saw. Run ipsys replay --until detect on both logs
-    first. Rigs and intrinsics must not contradict each other. The new log has the record of the merge with
-    all offsets.
+    first. Rigs and intrinsics must not contradict each other, and each run has its results in one log only:
+    markers of other cameras join the run of the same name. The new log has the record of the merge with all
+    offsets.
 
     Examples
 
@@ -200,7 +201,7 @@ def merge(
     if as_json:
         print_json(_merge_json(output, result))
         return
-    _show_merge(logs, offsets, result)
+    _show_offsets(logs, offsets)
     from ipsys_log.units import format_bytes
 
     console.print(f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}")
@@ -252,12 +253,10 @@ def _compact_json(
     }
 
 
-def _show_merge(logs: Sequence[LogLocation], offsets: Sequence[LogOffset], result: MergeResult) -> None:
-    for path, offset, one in zip(logs[1:], offsets[1:], result.logs[1:], strict=True):
+def _show_offsets(logs: Sequence[LogLocation], offsets: Sequence[LogOffset]) -> None:
+    for path, offset in zip(logs[1:], offsets[1:], strict=True):
         sigma = "" if offset.sigma_s is None else f" (estimated, sigma {offset.sigma_s * 1e3:.2f} ms)"
         console.print(f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}")
-        for old, new in one.renamed_runs.items():
-            say(f"run {old} of {path} is run {new}")
 
 
 def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
@@ -269,7 +268,6 @@ def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
                 "name": one.name,
                 "offset_ns": one.offset_ns,
                 "offset_sigma_s": one.offset_sigma_s,
-                "renamed_runs": one.renamed_runs,
             }
             for one in result.logs
         ],

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ipsys_log.cli.console import say, warn
-from ipsys_log.cli.open_cameras import Lab, check_target, open_cameras, prepare_lab
+from ipsys_log.cli.open_cameras import check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import Calibrations, Corners, Force, log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab
     from ipsys_log.capture.nodes.network import NodeNetwork
     from ipsys_log.runs.options import Request
 
@@ -118,9 +119,10 @@ def _send(
 
     camera = lab.names[0]
     with (
-        open_cameras(lab, target, seconds) as (cameras, settings, status),
-        Node(camera, network, __version__, target, cameras.clock, say, request is not None) as sender,
+        open_cameras(lab, target, seconds) as (opened, status),
+        Node(camera, network, __version__, target, opened.cameras.clock, say, request is not None) as sender,
     ):
+        cameras, settings = opened.cameras, opened.settings
         if request is not None:
             pipeline.live(cameras, settings, target, request, "detect", [status, sender], force)
         else:

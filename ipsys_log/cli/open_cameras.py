@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import TIMEOUT_MAX, Timer
 from time import monotonic
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ipsys_log.cli.console import console, remarks, say, warn
 from ipsys_log.cli.lab_inputs import load_lab, split_calibration
@@ -20,9 +20,8 @@ from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.capture.disk import DiskRoom
-    from ipsys_log.capture.multiplexer import LiveCameras
+    from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.log.location import LogLocation
-    from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
     from ipsys_log.report.cameras import LiveStatus
 
 
@@ -32,24 +31,6 @@ SENT_NOW = "the camera images"
 MODEL = "the log with the model"
 # Duration of the frames that are kept for a measured point.
 _PLACE_S = 1.5
-
-
-class Lab(NamedTuple):
-    """The cameras to open: the rig, its cameras, their intrinsics by name, the input files and the folder.
-
-    ``assumed`` has a text for each camera whose calibration file does not state the lens model.
-    """
-
-    rig: Rig
-    cameras: list[RigCamera]
-    lenses: dict[str, CameraCalibration]
-    files: list[tuple[str, LogLocation]]
-    folder: Path
-    assumed: dict[str, str]
-
-    @property
-    def names(self) -> list[str]:
-        return [camera.name for camera in self.cameras]
 
 
 def prepare_lab(
@@ -67,11 +48,10 @@ def prepare_lab(
     IpsysError
         The rig, the source of a camera, or a file of intrinsics has a fault.
     """
-    from ipsys_log.capture.devices import check_devices, check_sources, usb_advice
+    from ipsys_log.capture.devices import check_sources, usb_advice
 
-    described, cameras, lenses, assumed = load_lab(rig, calibration, only or (), with_lenses)
-    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration), rig.parent, assumed)
-    check_devices(lab.cameras)
+    lab = load_lab(rig, calibration, only or (), with_lenses)
+    lab = replace(lab, files=_files_of(lab, calibration))
     check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
         warn(line)
@@ -82,15 +62,14 @@ def prepare_lab(
     return lab
 
 
-def _files(
-    rig: Path, cameras: list[RigCamera], calibration: list[str] | None
-) -> list[tuple[str, LogLocation]]:
+def _files_of(lab: Lab, calibration: list[str] | None) -> list[tuple[str, LogLocation]]:
+    """Return the input files of a lab with their names in messages."""
     from ipsys_log.capture.video_files import split_source
 
     files = [("a calibration", split_calibration(option)[1]) for option in calibration or ()]
-    for camera in cameras:
+    for camera in lab.cameras:
         if camera.calibration is not None:
-            files.append((f"the calibration of camera {camera.name}", rig.parent / camera.calibration))
+            files.append((f"the calibration of camera {camera.name}", lab.folder / camera.calibration))
         if str(camera.source).startswith("file:"):
             files.append((f"the source of camera {camera.name}", split_source(str(camera.source))[0]))
     return files
@@ -141,8 +120,8 @@ def open_cameras(
     doing: str | None = None,
     panel: bool = True,
     until_stopped: bool = True,
-) -> Iterator[tuple[LiveCameras, list[Message], LiveStatus]]:
-    """Open the cameras; yield them, the first messages of the log, and the status on the screen.
+) -> Iterator[tuple[OpenLab, LiveStatus]]:
+    """Open the cameras; yield them, and the status on the screen.
 
     Parameters
     ----------
@@ -155,40 +134,32 @@ def open_cameras(
     IpsysError
         A camera cannot be opened, or its frames do not fit its intrinsics.
     """
-    from ipsys_log.capture.devices import source_opener
-    from ipsys_log.capture.disk import expected_bytes_per_s, free_room
-    from ipsys_log.capture.first_messages import first_messages, fitting_lenses
-    from ipsys_log.capture.frames import Clock
+    from ipsys_log.capture.lab import open_lab
     from ipsys_log.capture.live_check import CameraMonitor
-    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.report.cameras import LiveStatus
 
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(lab.names)):
-            opener = stack.enter_context(source_opener(lab.rig, lab.cameras, lab.folder))
-            attached = stack.enter_context(LiveCameras(lab.cameras, opener, Clock(), say))
-        sizes_px = {name: state.size_px for name, state in attached.states.items()}
-        lenses = fitting_lenses(lab.lenses, sizes_px, say)
-        stack.enter_context(_stop_after(attached.stop, seconds, until_stopped))
-        expected = expected_bytes_per_s(lab.cameras, attached.states)
+            opened = stack.enter_context(open_lab(lab, say))
+        stack.enter_context(_stop_after(opened.cameras.stop, seconds, until_stopped))
+        room = opened.room(output)
         # A log without a recording grows only with measured points.
-        growing = None if doing and seconds is None else expected
+        growing = None if doing and seconds is None else room.bytes_per_s
         monitor = stack.enter_context(CameraMonitor(lab.rig))
-        status = LiveStatus(attached.states, monitor, output, monotonic, growing, None if doing else say)
+        status = LiveStatus(
+            opened.cameras.states, monitor, output, monotonic, growing, None if doing else say
+        )
         stack.callback(status.close)
-        _say_room(lab, attached, free_room(output, expected), seconds, doing)
+        _say_room(opened, room, seconds, doing)
         say(doing or "the cameras are open; Ctrl-C to end")
         if panel:
             stack.enter_context(_on_screen(status))
-        settings = first_messages(lab.rig, lenses, attached.now_ns, attached.imported_run, lab.assumed)
-        yield attached, settings, status
+        yield opened, status
     for line in () if doing else status.summary():
         console.print(line)
 
 
-def _say_room(
-    lab: Lab, attached: LiveCameras, room: DiskRoom, seconds: float | None, doing: str | None
-) -> None:
+def _say_room(opened: OpenLab, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
     """Print the expected size of the recording and how long the disk lasts, before it begins.
 
     If frames are taken only for some seconds, the text is printed only if the disk is too small for them.
@@ -200,7 +171,7 @@ def _say_room(
         return
     short = room.is_short(seconds)
     remarks.print(room.describe(seconds), style="bold red" if short else None)
-    if advice := room.advise(lab.cameras, attached.states):
+    if advice := room.advise(opened.lab.cameras, opened.cameras.states):
         say(advice)
 
 
@@ -242,8 +213,8 @@ def record_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[P
         log = keep or Path(folder) / "now.mcap"
         doing = None if keep else f"recording for {seconds:g} s"
         try:
-            with open_cameras(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
-                pipeline.record(cameras, settings, log, [status])
+            with open_cameras(lab, log, seconds, doing, until_stopped=False) as (opened, status):
+                pipeline.record(opened.cameras, opened.settings, log, [status])
         except Interrupted as interrupt:
             kept = (
                 f"{keep} has the frames before the interruption"

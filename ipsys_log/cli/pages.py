@@ -12,12 +12,12 @@ import typer
 from ipsys_log.cli.console import console, remarks, say
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.messages import Message, Model
+    from ipsys_log.capture.lab import OpenLab
+    from ipsys_log.messages import Model
     from ipsys_log.player import Player
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Sink
+    from ipsys_log.sinks.streams.settings import Stream
     from ipsys_log.survey.scene import MeasuringScene
     from ipsys_log.web.dashboard.state import Dashboard
     from ipsys_log.web.server import PageServer
@@ -100,29 +100,21 @@ def plan_dashboard(
     return DashboardPlan(host, port, copy_model(request, first)[1])
 
 
-def first_run(request: Request) -> str:
-    """Return the run of the first model: streams, the viewer and the dashboard show one run."""
-    from ipsys_log.runs.select import wanted_models
-    from ipsys_log.stages.fit import model_run
-
-    first, *_ = wanted_models(request)
-    return model_run(first)
-
-
 @contextmanager
 def serve_dashboard(
     plan: DashboardPlan | None,
-    opened: tuple[LiveCameras, list[Message], LiveStatus],
+    opened: OpenLab,
+    status: LiveStatus,
     log: Path,
     run: str,
-    streams: Sequence[Sink],
+    streams: Sequence[Stream],
 ) -> Iterator[list[Dashboard]]:
     """Serve the dashboard of a live recording until the end of the block, and print its address.
 
     Parameters
     ----------
     plan : None: there is no dashboard.
-    opened : the cameras, the first messages of the log, and the status on the screen.
+    opened, status : the open cameras, and the status on the screen.
     log, run, streams : the log that is written, the run of the shown tracks, and the streams of positions.
     """
     if plan is None:
@@ -130,8 +122,7 @@ def serve_dashboard(
         return
     from ipsys_log.web.dashboard.sources import dashboard_of_recording
 
-    cameras, settings, status = opened
-    dashboard = dashboard_of_recording(cameras, settings, status.checks, log, plan.model, run, streams)
+    dashboard = dashboard_of_recording(opened, status.checks, log, plan.model, run, streams)
     with _serve(dashboard, plan.host, plan.port, has_viewers=True):
         yield [dashboard]
 

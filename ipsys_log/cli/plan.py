@@ -140,7 +140,7 @@ def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: S
 
 
 def _headline(found: PlannedFloor) -> str:
-    from ipsys_log.report.tables import means_cm
+    from ipsys_log.report.rows import means_cm
 
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
     subject = "this point" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} points"
@@ -150,7 +150,7 @@ def _headline(found: PlannedFloor) -> str:
 def _drive_line(drive: PlannedDrive) -> str:
     """Return the line of the drive that reduces the error most, with its effect without new points."""
     from ipsys_log.analysis.joint_plan import DRIVE_S
-    from ipsys_log.report.tables import means_cm
+    from ipsys_log.report.rows import means_cm
     from ipsys_log.units import CM_PER_M
 
     if not drive.is_useful:
@@ -166,7 +166,7 @@ def _drive_line(drive: PlannedDrive) -> str:
 def _table(found: PlannedFloor) -> Table:
     from rich.table import Table
 
-    from ipsys_log.report.tables import means_cm
+    from ipsys_log.report.rows import means_cm
     from ipsys_log.units import CM_PER_M
 
     title = f"Next points to measure, for the model {found.model} of run {found.run}"

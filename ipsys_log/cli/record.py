@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -14,7 +14,7 @@ import typer
 
 from ipsys_log.cli.console import say, warn
 from ipsys_log.cli.measure import show_measured
-from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, open_cameras, prepare_lab
+from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
     Calibrations,
     Corners,
@@ -32,14 +32,15 @@ from ipsys_log.cli.options import (
     Terminal,
     other_log_option,
 )
-from ipsys_log.cli.pages import Web, WebPort, first_run, plan_dashboard, serve_dashboard, serve_measuring
-from ipsys_log.cli.signals import SAVED, allow_interrupt, runs_until_stopped, suppress_interrupt
+from ipsys_log.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
+from ipsys_log.cli.signals import SAVED, allow_interrupt, runs_until_stopped
 from ipsys_log.cli.stream import StreamOptions, choose_streams, takes_streams
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.log.location import LogLocation
-    from ipsys_log.messages import Measurement, Message, Model
+    from ipsys_log.messages import Measurement, Model
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.sink import Sink
@@ -130,7 +131,8 @@ def record(
         return
     if detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
-    with open_cameras(lab, output, seconds) as (cameras, settings, status):
+    with open_cameras(lab, output, seconds) as (opened, status):
+        cameras, settings = opened.cameras, opened.settings
         for name in sorted(set(lab.names) - set(lab.lenses)):
             warn(
                 f"camera {name} has no calibration, but a replay needs one; write calibration = "
@@ -160,22 +162,20 @@ def _measure(
     points_only : keep only about 1 s of frames of each point.
     """
     from ipsys_log import pipeline
-    from ipsys_log.sinks.sink import Consumer
 
     model = ready_to_measure(lab, request, model_from, page)
     ends = "q" if page is None else "Ctrl-C"
     doing = f"measuring into {output}; {ends} to end" if points_only else None
-    with open_cameras(lab, output, seconds, doing, panel=page is not None) as (cameras, settings, status):
-        scene = live_scene(settings, cameras, model)
-        consumers: list[Consumer] = [status, scene]
+    with open_cameras(lab, output, seconds, doing, panel=page is not None) as (opened, status):
+        cameras, settings = opened.cameras, opened.settings
+        scene = live_scene(opened, model)
+        sinks: list[Sink] = [status, scene]
         if points_only:
             work: Callable[[], Any] = partial(
-                pipeline.measure, cameras, settings, output, request, consumers, force
+                pipeline.measure, cameras, settings, output, request, sinks, force
             )
         else:
-            work = partial(
-                pipeline.live, cameras, settings, output, request, "camera-frame", consumers, force
-            )
+            work = partial(pipeline.live, cameras, settings, output, request, "camera-frame", sinks, force)
         if page is None:
             _ask_beside(work, scene, cameras)
         else:
@@ -211,11 +211,11 @@ def ready_to_measure(
     return model
 
 
-def live_scene(settings: list[Message], cameras: LiveCameras, model: Model | None) -> LiveScene:
+def live_scene(opened: OpenLab, model: Model | None) -> LiveScene:
     """Make the scene of the live cameras, for measuring."""
     from ipsys_log.survey.live import LiveScene
 
-    return LiveScene(settings[0].payload, model, cameras.states, cameras.save)
+    return LiveScene(opened.rig, model, opened.cameras.states, opened.cameras.save)
 
 
 @contextmanager
@@ -234,7 +234,7 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras)
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:
-            with suppress_interrupt():
+            with suppress(KeyboardInterrupt):
                 while not (working.done() or any(view.points for view in scene.views(None))):
                     sleep(_TURN_S)
                 sleep(_LOOK_S)
@@ -278,11 +278,10 @@ def live(
     """
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
-    from ipsys_log.capture.live_plan import check_start
+    from ipsys_log.capture.live_plan import check_start, shown_run
     from ipsys_log.extras import check_installed
-    from ipsys_log.messages.channels import TRACKS
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.streams.settings import check_streams, open_streams
+    from ipsys_log.sinks.streams.settings import check_streams, open_live_streams
 
     for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
         if is_wanted:
@@ -299,42 +298,37 @@ def live(
     streamed = choose_streams(lab.rig, rig.parent, has_page=web, **streams)
     for line in check_streams(streamed):
         say(line)
-    robots = lab.rig.robot_heights_m()
-    if streamed and not robots:
+    if streamed and not lab.rig.robot_heights_m():
         text = f"{rig}: names no robots; the streams name them marker_<id>. Add robot = NAME to [[markers]]"
         warn(text)
-    shown_run = first_run(request)
+    run = shown_run(request)
     with (
-        open_cameras(lab, output, seconds) as (cameras, settings, status),
-        open_streams(
-            streamed, {TRACKS.topic_of(shown_run)}, cameras.clock.now_ns, cameras.add_event, heights_m=robots
-        ) as senders,
-        _page_viewer(settings, cameras, shown_run, streamed) as pages,
-        serve_dashboard(planned, (cameras, settings, status), output, shown_run, senders) as dashboards,
+        open_cameras(lab, output, seconds) as (opened, status),
+        open_live_streams(streamed, opened, run) as senders,
+        _page_viewer(opened, run, streamed) as pages,
+        serve_dashboard(planned, opened, status, output, run, senders) as dashboards,
     ):
-        viewer = [_viewer(settings, cameras, shown_run)] if view else []
-        sinks: list[Sink] = [*viewer, *pages, *dashboards, *senders]
-        pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
+        viewer = [_viewer(opened, run)] if view else []
+        sinks: list[Sink] = [status, *viewer, *pages, *dashboards, *senders]
+        pipeline.live(opened.cameras, opened.settings, output, request, None, sinks, force)
 
 
-def _viewer(settings: list[Message], cameras: LiveCameras, run: str) -> LiveView:
+def _viewer(opened: OpenLab, run: str) -> LiveView:
     from ipsys_log.sinks.rerun.live import LiveView
 
-    return LiveView(settings[0].payload, cameras.states, run, say)
+    return LiveView(opened.rig, opened.cameras.states, run, say)
 
 
 @contextmanager
-def _page_viewer(
-    settings: list[Message], cameras: LiveCameras, run: str, streamed: StreamSettings
-) -> Iterator[list[LiveView]]:
+def _page_viewer(opened: OpenLab, run: str, streamed: StreamSettings) -> Iterator[list[LiveView]]:
     """Show the recording on a page for a browser of this machine, if the user asked for it."""
     if not streamed.rerun:
         yield []
         return
     from ipsys_log.sinks.rerun.live import LiveView
-    from ipsys_log.sinks.rerun.page import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
 
-    shown = cameras.states if streamed.images else ()
+    shown = opened.cameras.states if streamed.images else ()
     with closing(ViewerPage()) as page:
         say(page.describe())
-        yield [LiveView(settings[0].payload, shown, run, say, page.show, page.name)]
+        yield [LiveView(opened.rig, shown, run, say, page.show, page.name)]

@@ -304,8 +304,8 @@ def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> 
 
 def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
     """Print the answer first, then one table, and on request all numbers."""
-    from ipsys_log.report.summary import answer_text, models_table
-    from ipsys_log.report.tables import accuracy_tables, trajectory_table
+    from ipsys_log.report.summary import answer_text
+    from ipsys_log.report.tables import accuracy_tables, models_table, trajectory_table
 
     parts = [answer_text(accuracies), models_table(accuracies)]
     further = [*accuracy_tables(accuracies), trajectory_table(accuracies)] if details else []

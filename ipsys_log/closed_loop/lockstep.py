@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, deque
 from collections.abc import Collection, Generator, Iterator
+from types import NoneType
 
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.frames import Clock, Say
@@ -22,6 +23,7 @@ from ipsys_log.messages import (
     CompressedImage,
     Event,
     Message,
+    Tracks,
     WheelCommand,
     image_topic,
 )
@@ -45,7 +47,7 @@ class SimulatedClock(Clock):
 
 
 class SyncPoint:
-    """A consumer that knows when the stages have processed a frame, and how many positions were sent.
+    """An inline sink that knows when the stages have processed a frame, and how many positions were sent.
 
     Parameters
     ----------
@@ -58,6 +60,9 @@ class SyncPoint:
     sent : number of positions of each robot that the stream has sent.
     """
 
+    name = "the simulated time"
+    payloads: tuple[type, ...] = (NoneType, CompressedImage, Tracks)
+
     def __init__(self, topic: str, robots: Collection[str], clock: Clock, good_only: bool) -> None:
         self.sent: Counter[str] = Counter()
         self._poses = PoseSource([topic], clock.now_ns, 1, robots)
@@ -66,9 +71,9 @@ class SyncPoint:
         self._stopped = False
         self._changed = threading.Condition()
 
-    def __call__(self, message: Message | None) -> None:
-        """Count the frames and positions of a message; after None, all work on the frames is done."""
-        if message is None:
+    def send(self, message: Message) -> None:
+        """Count the frames and positions of a message; with a tick, all work on the frames is done."""
+        if message.payload is None:
             with self._changed:
                 self._done = self._shown
                 self._changed.notify()
@@ -97,7 +102,7 @@ class LockstepCameras:
 
     Parameters
     ----------
-    sync : consumer of the run, which knows the processed frames.
+    sync : sink of the run, which knows the processed frames.
     say : called with the text of each event.
 
     Attributes

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ipsys_log import pipeline
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock
-from ipsys_log.capture.live_plan import check_start
-from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.lab import Lab, first_messages, open_lab
+from ipsys_log.capture.live_plan import check_start, shown_run
 from ipsys_log.capture.recorder import CameraSource
 from ipsys_log.closed_loop.lockstep import LockstepCameras, SimulatedClock, SyncPoint
 from ipsys_log.closed_loop.programs import Programs, start_programs
@@ -19,15 +18,13 @@ from ipsys_log.closed_loop.real_time import Driver, RobotCameras, add_truth
 from ipsys_log.closed_loop.settings import RobotRun, start_poses
 from ipsys_log.closed_loop.steering import Steering
 from ipsys_log.closed_loop.wheels import Wheels
-from ipsys_log.messages import EVENTS_TOPIC, PATHS_TOPIC, Event, Message, Rig, RobotPath
+from ipsys_log.messages import EVENTS_TOPIC, PATHS_TOPIC, CameraCalibration, Event, Message, Rig, RobotPath
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import Outcome
-from ipsys_log.runs.select import wanted_models
 from ipsys_log.simulation.robot_lab import RobotLab, robot_rig
-from ipsys_log.sinks.sink import Consumer
+from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.settings import Stream, open_streams
-from ipsys_log.stages.fit import model_run
 
 # The kind of the event with the settings of the run.
 ROBOT_RUN = "robot_run"
@@ -90,7 +87,7 @@ class _Parts:
     @property
     def topic(self) -> str:
         """The topic of the tracks that the robots get: those of the first model."""
-        return TRACKS.topic_of(model_run(next(iter(wanted_models(self.request)))))
+        return TRACKS.topic_of(shown_run(self.request))
 
     def check_start(self) -> None:
         names = self.run.lab.cameras
@@ -101,9 +98,9 @@ class _Parts:
         labels = [place for path in self.run.paths.values() for place in path]
         return RobotLab(self.run.lab, start_poses(self.run), labels, start_ns, self.run.seed)
 
-    def settings(self, lab: RobotLab, now_ns: Callable[[], int]) -> list[Message]:
-        """Return the first messages of the log: rig, intrinsics, paths, and the settings of the run."""
-        messages = first_messages(self.rig, {camera.name: camera.lens for camera in lab.cameras}, now_ns)
+    def settings(self, now_ns: Callable[[], int]) -> list[Message]:
+        """Return the messages after the rig and the intrinsics: the paths, and the settings of the run."""
+        messages = []
         for robot, path in self.run.paths.items():
             time_ns = now_ns()
             messages.append(Message(PATHS_TOPIC, time_ns, time_ns, RobotPath(time_ns, robot, path)))
@@ -135,18 +132,14 @@ class _Parts:
             wheels.wait_for_robots()
             yield streams, wheels, programs[0]
 
-    def live(
-        self,
-        cameras: CameraSource,
-        lab: RobotLab,
-        streams: Sequence[Stream],
-        consumers: Sequence[Consumer] = (),
-    ) -> list[Outcome]:
-        settings = self.settings(lab, cameras.now_ns)
+    def live(self, cameras: CameraSource, first: Sequence[Message], sinks: Sequence[Sink]) -> list[Outcome]:
+        settings = [*first, *self.settings(cameras.now_ns)]
         self.begin(cameras.stop)
-        return pipeline.live(
-            cameras, settings, self.target, self.request, None, consumers, self.overwrite, streams
-        )
+        return pipeline.live(cameras, settings, self.target, self.request, None, sinks, self.overwrite)
+
+
+def _lenses(lab: RobotLab) -> dict[str, CameraCalibration]:
+    return {camera.name: camera.lens for camera in lab.cameras}
 
 
 def _drive_lockstep(parts: _Parts) -> list[Outcome]:
@@ -157,7 +150,8 @@ def _drive_lockstep(parts: _Parts) -> list[Outcome]:
     cameras = LockstepCameras(parts.run, lab, clock, sync, parts.say)
     with parts.connect(cameras) as (streams, wheels, programs):
         cameras.steering = Steering(parts.run, lab, wheels, programs, clock.now_ns(), parts.say)
-        outcomes = parts.live(cameras, lab, streams, [sync])
+        first = first_messages(parts.rig, _lenses(lab), cameras.now_ns)
+        outcomes = parts.live(cameras, first, [*streams, sync])
         if cameras.fault is not None:
             raise cameras.fault
         return outcomes
@@ -169,14 +163,15 @@ def _drive_live(parts: _Parts) -> list[Outcome]:
     lab = parts.lab(clock.now_ns())
     opener = RobotCameras(parts.run, lab)
     with (
-        LiveCameras(parts.rig.cameras, opener.open, clock, parts.say) as cameras,
-        parts.connect(cameras) as (streams, wheels, programs),
+        open_lab(Lab(parts.rig, parts.rig.cameras, _lenses(lab)), parts.say, clock, opener.open) as opened,
+        parts.connect(opened.cameras) as (streams, wheels, programs),
     ):
+        cameras = opened.cameras
         opener.add_truth = add_truth(cameras, lab)
         opener.start_ns = clock.now_ns()
         steering = Steering(parts.run, lab, wheels, programs, opener.start_ns, parts.say)
         with Driver(parts.run, cameras, steering) as driver:
-            outcomes = parts.live(cameras, lab, streams)
+            outcomes = parts.live(cameras, opened.settings, streams)
         if driver.fault is not None:
             raise driver.fault
         return outcomes

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
+from ipsys_log.capture.devices import check_sources
+from ipsys_log.capture.lab import Lab
 from ipsys_log.capture.simulated import intrinsics_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
@@ -19,6 +22,28 @@ _SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes th
 # The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers do not move.
 
 """
+
+
+def read_lab(
+    path: Path, only: Collection[str] = (), given: Mapping[str, CameraCalibration] = MappingProxyType({})
+) -> Lab:
+    """Read the cameras of a rig file with their intrinsics, and check their sources.
+
+    Parameters
+    ----------
+    only : names of some cameras; none: all cameras with a source.
+    given : intrinsics that replace those of the rig, by camera.
+
+    Raises
+    ------
+    IpsysError
+        The rig, the source of a camera, or a file of intrinsics has a fault.
+    """
+    rig, cameras = load_cameras(path, only)
+    assumed: dict[str, str] = {}
+    lenses = load_lenses(path, cameras, given, report=assumed.__setitem__)
+    check_sources(cameras)
+    return Lab(rig, cameras, lenses, path.parent, assumed)
 
 
 def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigCamera]]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import cv2
 
-from ipsys_log.capture.devices import check_devices, check_sources
+from ipsys_log.capture.devices import check_sources
 from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.simulated import parse_source
@@ -122,7 +122,6 @@ def save_cameras(path: Path, names: Mapping[str, str], attached: Sequence[UsbCam
     if not chosen:
         raise IpsysError("no camera has a name; type a name for each camera that the lab uses")
     check_rig(replace(rig, cameras=tuple(chosen)), path.name)
-    check_devices(chosen)
     check_sources(chosen)
     _write_cameras(path, rig, chosen)
     return []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -11,39 +11,33 @@ from pathlib import Path
 
 from ipsys_log import api, pipeline
 from ipsys_log.calibration.calibrate import CalibrationResult
-from ipsys_log.capture.devices import check_devices, check_sources, source_opener
-from ipsys_log.capture.disk import expected_bytes_per_s, free_room
-from ipsys_log.capture.first_messages import first_messages, fitting_lenses
-from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.devices import check_sources
+from ipsys_log.capture.lab import Lab, OpenLab, open_lab
 from ipsys_log.capture.live_check import CameraMonitor
-from ipsys_log.capture.live_plan import check_start
+from ipsys_log.capture.live_plan import check_start, shown_run
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.simulated import show_board
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
-from ipsys_log.exchange.lab_files import load_cameras, load_lenses
+from ipsys_log.exchange.lab_files import load_cameras, read_lab
 from ipsys_log.first_day.board_entry import BoardEntry
 from ipsys_log.first_day.board_search import BoardSearch
 from ipsys_log.first_day.camera_choice import set_calibration
 from ipsys_log.first_day.jobs import Job
 from ipsys_log.first_day.lab_folder import ALIGNMENT_LOG, LabFolder
 from ipsys_log.messages import (
-    CameraCalibration,
     CompressedImage,
     CompressedVideo,
     Message,
     Model,
-    Rig,
 )
-from ipsys_log.messages.channels import TRACKS
 from ipsys_log.report.calibration import calibration_lines
 from ipsys_log.report.files import write_files
 from ipsys_log.runs.graph import copy_model
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.sinks.sink import Sink
-from ipsys_log.sinks.streams.settings import check_streams, open_streams, settings_of_rig
-from ipsys_log.stages.fit import model_run
+from ipsys_log.sinks.streams.settings import Stream, check_streams, open_live_streams, settings_of_rig
 from ipsys_log.survey.add_sheet import add_sheet, check_sheet
 from ipsys_log.survey.entry import check_references
 from ipsys_log.survey.from_log import open_finished_log
@@ -56,25 +50,15 @@ _SHEET_S, _ALIGN_S, _LEAST_FRAMES = 5.0, 3.0, 20
 
 
 @dataclass(frozen=True, slots=True)
-class OpenedLab:
-    """The opened cameras of a lab, with the first messages of a log."""
-
-    rig: Rig
-    lenses: Mapping[str, CameraCalibration]
-    cameras: LiveCameras
-    settings: list[Message]
-    monitor: CameraMonitor
-
-
-@dataclass(frozen=True, slots=True)
 class LiveRecording:
     """A live recording that a page can show: its cameras, its log, and the run of the shown model."""
 
-    lab: OpenedLab
+    opened: OpenLab
+    monitor: CameraMonitor
     log: Path
     model: Model
     run: str
-    streams: tuple[Sink, ...]
+    streams: tuple[Stream, ...]
 
 
 def align(folder: LabFolder, job: Job) -> None:
@@ -106,10 +90,8 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
     check_sources(cameras)
     shown = [show_board(camera, entry.board) for camera in cameras]
     job.say(f"opening {search.camera}")
-    with (
-        source_opener(rig, shown, folder.rig_file.parent) as opener,
-        LiveCameras(shown, opener, Clock(), job.say) as attached,
-    ):
+    with open_lab(Lab(rig, shown, {}, folder.path), job.say) as opened:
+        attached = opened.cameras
         job.on_stop(attached.stop)
         newest = _NewestImage(search.look)
         with newest:
@@ -164,13 +146,13 @@ def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManage
     IpsysError
         The rig or a camera has a fault, or the rig has fewer than two reference points.
     """
-    with _new_log(folder, "calibration") as log, _open_lab(folder, job) as lab:
-        check_references(lab.rig)
-        check_start(lab.rig, list(lab.cameras.states), lab.lenses, Request(), _LAST_STAGE)
-        scene = LiveScene(lab.rig, None, lab.cameras.states, lab.cameras.save)
+    with _new_log(folder, "calibration") as log, _open_cameras(folder, job) as (opened, monitor):
+        check_references(opened.rig)
+        check_start(opened.rig, opened.lab.names, opened.lenses, Request(), _LAST_STAGE)
+        scene = LiveScene(opened.rig, None, opened.cameras.states, opened.cameras.save)
         with show(scene):
             job.say("open the measuring page")
-            pipeline.measure(lab.cameras, lab.settings, log, Request(), [scene, lab.monitor])
+            pipeline.measure(opened.cameras, opened.settings, log, Request(), [scene, monitor])
 
 
 def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
@@ -199,23 +181,20 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
         The rig, a camera or the model has a fault.
     """
     request = Request(model_from=folder.calibration_logs()[-1])
-    with _new_log(folder, "live") as log, _open_lab(folder, job) as lab:
-        for line in check_start(lab.rig, list(lab.cameras.states), lab.lenses, request, None):
+    with _new_log(folder, "live") as log, _open_cameras(folder, job) as (opened, monitor):
+        for line in check_start(opened.rig, opened.lab.names, opened.lenses, request, None):
             job.say(line)
-        name = wanted_models(request)[0]
-        run, cameras = model_run(name), lab.cameras
-        streamed = settings_of_rig(lab.rig.stream, folder.path)
+        run = shown_run(request)
+        streamed = settings_of_rig(opened.rig.stream, folder.path)
         for line in check_streams(streamed):
             job.say(line)
-        heights_m = lab.rig.robot_heights_m()
-        with open_streams(
-            streamed, {TRACKS.topic_of(run)}, cameras.clock.now_ns, cameras.add_event, heights_m=heights_m
-        ) as streams:
-            view = LiveRecording(lab, log, copy_model(request, name)[1], run, tuple(streams))
+        with open_live_streams(streamed, opened, run) as streams:
+            model = copy_model(request, wanted_models(request)[0])[1]
+            view = LiveRecording(opened, monitor, log, model, run, tuple(streams))
             with show(view) as sink:
                 job.say("open the dashboard")
-                sinks: list[Sink] = [sink, *streams]
-                pipeline.live(cameras, lab.settings, log, request, None, [lab.monitor], sinks=sinks)
+                sinks: list[Sink] = [monitor, sink, *streams]
+                pipeline.live(opened.cameras, opened.settings, log, request, sinks=sinks)
 
 
 @contextmanager
@@ -228,40 +207,24 @@ def _new_log(folder: LabFolder, name: str) -> Iterator[Path]:
 
 
 @contextmanager
-def _open_lab(folder: LabFolder, job: Job) -> Iterator[OpenedLab]:
-    """Open the cameras of the rig; a stop of the job ends them in order."""
-    rig, cameras = load_cameras(folder.rig_file)
-    assumed: dict[str, str] = {}
-    lenses = load_lenses(folder.rig_file, cameras, {}, report=assumed.__setitem__)
-    check_devices(cameras)
-    check_sources(cameras)
-    job.say(f"opening {', '.join(camera.name for camera in cameras)}")
-    with (
-        source_opener(rig, cameras, folder.rig_file.parent) as opener,
-        LiveCameras(cameras, opener, Clock(), job.say) as attached,
-        CameraMonitor(rig) as monitor,
-    ):
-        job.on_stop(attached.stop)
-        sizes_px = {name: state.size_px for name, state in attached.states.items()}
-        fitting = fitting_lenses(lenses, sizes_px, job.say)
-        room = free_room(folder.rig_file, expected_bytes_per_s(cameras, attached.states))
+def _open_cameras(folder: LabFolder, job: Job) -> Iterator[tuple[OpenLab, CameraMonitor]]:
+    """Open the cameras of the rig with their live check; a stop of the job ends them in order."""
+    lab = read_lab(folder.rig_file)
+    job.say(f"opening {', '.join(lab.names)}")
+    with open_lab(lab, job.say) as opened, CameraMonitor(lab.rig) as monitor:
+        job.on_stop(opened.cameras.stop)
+        room = opened.room(folder.rig_file)
         # Devices that only view the page see this, too: the path of the folder is not for them.
         job.say(replace(room, folder=Path(room.folder.name)).describe(None))
-        yield OpenedLab(
-            rig,
-            fitting,
-            attached,
-            first_messages(rig, fitting, attached.now_ns, attached.imported_run, assumed),
-            monitor,
-        )
+        yield opened, monitor
 
 
 def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
     """Record all cameras into a new log for some seconds."""
-    with _open_lab(folder, job) as lab:
+    with _open_cameras(folder, job) as (opened, _):
         job.say(f"the cameras are open; {log.name} gets {seconds:g} s")
-        enough = _Enough(lab.cameras, seconds, job)
-        pipeline.record(lab.cameras, lab.settings, log, [enough])
+        enough = _Enough(opened.cameras, seconds, job)
+        pipeline.record(opened.cameras, opened.settings, log, [enough])
 
 
 class _NewestImage:
@@ -309,7 +272,7 @@ class _NewestImage:
 
 
 class _Enough:
-    """A consumer that stops the cameras when each has sent frames for some seconds.
+    """A sink that stops the cameras when each has sent frames for some seconds.
 
     It counts the time by the frames, so that a slow machine records the same scene.
     """
@@ -321,9 +284,9 @@ class _Enough:
         self._counts = dict.fromkeys(cameras.states, 0)
         self._done: set[str] = set()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Count a frame."""
-        if message is None or message.camera not in self._counts:
+        if message.camera not in self._counts:
             return
         camera = message.camera
         self._counts[camera] += 1

@@ -2,8 +2,7 @@
 
 import os
 import stat
-from bisect import bisect_left
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,8 +61,7 @@ class FileBytes:
     """The bytes of a log file at the time when it was opened.
 
     Bytes from `tail_offset` on come from `tail_fd` (a journal). In the journal they begin at `tail_base`.
-    `patches` are pairs (offset, bytes), sorted by offset. A repair is about to write these bytes before
-    `tail_offset`. The class uses ``pread`` and not ``mmap``: if a mapped file shrinks, the operating system
+    The class uses ``pread`` and not ``mmap``: if a mapped file shrinks, the operating system
     kills the process.
     """
 
@@ -74,7 +72,6 @@ class FileBytes:
     tail_fd: int = -1
     tail_base: int = 0
     bytes_read: int = 0
-    patches: Sequence[tuple[int, bytes]] = ()
     read_limits: ReadLimits = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,12 +85,10 @@ class FileBytes:
         if offset < 0 or length < 0 or end > self.size:
             raise self.fault(offset, f"a record reaches {end - self.size} bytes beyond the end of the file")
         self.bytes_read += length
-        if self.patches:
-            return self._patched(offset, self._unpatched(offset, length))
         if end <= self.tail_offset:
             data = self._read_once(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
             return data if len(data) == length else self._pread(self.fd, offset, length)
-        return self._unpatched(offset, length)
+        return self._joined(offset, length)
 
     @property
     def is_interrupted(self) -> bool:
@@ -113,19 +108,7 @@ class FileBytes:
             with suppress(OSError):
                 os.posix_fadvise(self.fd, offset, length, os.POSIX_FADV_WILLNEED)
 
-    def _patched(self, offset: int, data: bytes) -> bytes:
-        end = offset + len(data)
-        first = bisect_left(self.patches, offset, key=lambda patch: patch[0] + len(patch[1]))
-        for patch_offset, new in self.patches[first:]:
-            if patch_offset >= end:
-                break
-            low, high = max(patch_offset, offset), min(patch_offset + len(new), end)
-            data = (
-                data[: low - offset] + new[low - patch_offset : high - patch_offset] + data[high - offset :]
-            )
-        return data
-
-    def _unpatched(self, offset: int, length: int) -> bytes:
+    def _joined(self, offset: int, length: int) -> bytes:
         head = max(0, min(length, self.tail_offset - offset))
         parts = [self._pread(self.fd, offset, head)] if head else []
         if head < length:

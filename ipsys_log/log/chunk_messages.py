@@ -8,19 +8,11 @@ from functools import partial
 
 import numpy as np
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.checked_chunk import CheckedMessage, Entries, Rows, check_messages
-from ipsys_log.log.chunks import (
-    EqualBlocks,
-    RawBlocks,
-    check_compression,
-    find_blocks,
-    parse_chunk_contents,
-    unpack,
-)
+from ipsys_log.log.chunks import check_compression, parse_chunk_contents, unpack
 from ipsys_log.log.contents import RawMessage
-from ipsys_log.log.hashing import WORTH_COMBINING
 from ipsys_log.log.order import Cursor
 from ipsys_log.log.records import (
     CHUNK_HEAD_SIZE,
@@ -36,6 +28,8 @@ ALWAYS = (0, (1 << 64) - 1)  # ns
 _GAP = 4096  # bytes: to read a smaller gap costs less than another system call
 _RUN = 256 << 10  # bytes read at once
 _LONG = 16 << 10  # bytes: to copy a longer message costs more than another system call
+Rows = NDArray[np.uint64]  # shape (N, 2): log time in ns, offset in the chunk or the file
+Entries = Mapping[int, Rows]  # by channel id
 Run = tuple[int, int]  # start and end of a byte range
 
 
@@ -68,7 +62,7 @@ def chunk_entries(
 def planned_range(chunk: ChunkRef) -> Run:
     """Return the range of a chunk that its first reader needs: its message indexes, or all of it.
 
-    A chunk that is small, or that its compression has made smaller, is always read as a whole.
+    A chunk of images has indexes that are often read alone, and little else that is needed without them.
     """
     is_whole = chunk.length <= _SMALL or chunk.compressed_size < _PACKED * chunk.uncompressed_size
     return chunk.offset if is_whole or not chunk.index_length else chunk.offset + chunk.length, chunk.end
@@ -124,9 +118,8 @@ def runs(entries: Entries, wanted: Rows, end: int) -> list[Run]:
 
 
 _CACHE_BYTES = 64 << 20
-_SMALL = 64 << 10  # bytes: a smaller compressed chunk is unpacked as a whole, without a search for its blocks
-_PACKED = 0.75  # of its size: a chunk that is compressed to less has few raw blocks
-_SPARSE = 4096  # bytes per wanted message: a chunk with fewer is unpacked as a whole too
+_SMALL = 64 << 10  # bytes: the indexes of a smaller chunk are not worth a read of their own
+_PACKED = 0.75  # of its size: a chunk that is compressed to less has no images
 _OPCODE = int(Opcode.MESSAGE)
 _SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message record without payload
 _new = tuple.__new__  # RawMessage(...) calls a Python function and takes twice as long
@@ -208,36 +201,32 @@ class _Messages:
             self.spare -= length
             if self.spare < 0:
                 raise self.view.fault(self.chunk_offset, "its message indexes name bytes more than once")
-            yield _new(RawMessage, (topic, time, published, payload, None))
+            yield _new(RawMessage, (topic, time, published, payload))
 
 
 @dataclass(slots=True)
 class _Records:
-    """The records of one chunk, by their offsets in the chunk. They are read in place if possible."""
+    """The records of one chunk, by their offsets in the chunk. A compressed chunk is unpacked once.
+
+    Unpacked records stay in memory until the last message is read, because chunks may overlap in time.
+    """
 
     view: LogBytes
     chunk: ChunkRef
-    raw: EqualBlocks | RawBlocks | None = None
     whole: bytes | None = None
 
     def read(self, low: int, high: int) -> bytes:
-        chunk = self.chunk
-        if low < 0 or high > chunk.uncompressed_size:
-            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
-        if not chunk.compression:
-            return self.view.read(chunk.offset + CHUNK_HEAD_SIZE + low, high - low)
-        data = self.raw.read(low, high) if self.raw is not None else None
-        if data is None:
-            data = self.unpacked()[low:high]
+        if low < 0 or high > self.chunk.uncompressed_size:
+            raise self.view.fault(self.chunk.offset, "a message reaches beyond the end of its chunk")
+        if not self.chunk.compression:
+            return self.view.read(self.chunk.offset + CHUNK_HEAD_SIZE + low, high - low)
+        data = self.unpacked()[low:high]
         if len(data) != high - low:
-            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
+            raise self.view.fault(self.chunk.offset, "a message reaches beyond the end of its chunk")
         return data
 
     def unpacked(self, *_: int) -> bytes:
-        """Return all records, decompressed once.
-
-        They stay in memory until the last message is read, because chunks may overlap in time.
-        """
+        """Return all records; their CRC is checked."""
         if self.whole is None:
             offset = self.chunk.offset
             self.whole = unpack(self.view, offset, parse_chunk_head(self.view, offset)[1])
@@ -251,66 +240,24 @@ def open_chunk(
     topics: Mapping[int, str],
     span: tuple[int, int],
     is_checked: bool = False,
-    next_chunk: ChunkRef | None = None,
 ) -> Cursor:
     """Return a cursor over the messages of the channels in `topics` with start <= log time <= end.
 
-    With `is_checked`, the chunk is read as a whole, and its CRC is checked. `next_chunk` is the chunk to be
-    read from the disk meanwhile.
+    With `is_checked`, the chunk is read as a whole, and its CRC is checked.
     """
-    if next_chunk is not None:
-        view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
-    offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
-    packed = chunk.compressed_size
-    check_compression(view, name)
+    offset, size = chunk.offset, chunk.uncompressed_size
+    check_compression(view, chunk.compression)
     entries = chunk_entries(view, chunk, cache.searched)
-    if is_checked and size >= sum(map(len, entries.values())) * WORTH_COMBINING > 0:
-        return _open_checked(view, chunk, entries, topics, span)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
-    if not name:
-        view.plan("messages", _row_ranges(chunk, entries, rows))
-    if not is_checked and name and packed > _SMALL and packed > len(rows) * _SPARSE:
-        records.raw = find_blocks(view, name, offset + CHUNK_HEAD_SIZE + len(name), packed, size)
-    if is_checked or (name and records.raw is None):
+    if is_checked or chunk.compression:
         ranges, fetch = [(0, size)] * len(rows), records.unpacked
     else:
+        view.plan("messages", _row_ranges(chunk, entries, rows))
         ranges, fetch = runs(entries, rows, size), partial(cache.fetch, offset, records.read)
     times, offsets = rows.T.tolist()
     messages = _Messages(view, topics, offset, times, offsets, ranges, fetch, records.read, size)
     return Cursor(offset, times, offsets, messages.read_rows)
-
-
-@dataclass(slots=True)
-class _CheckedMessages:
-    """The wanted messages of one chunk, by row, with their CRC-32."""
-
-    topics: Mapping[int, str]
-    data: memoryview
-    rows: list[CheckedMessage]
-
-    def read_rows(self, first: int, stop: int) -> Iterator[RawMessage]:
-        """Yield the messages of rows `first` to `stop`."""
-        for key, log_ns, publish_ns, _, start, end, crc in self.rows[first:stop]:
-            yield RawMessage(self.topics[key], log_ns, publish_ns, bytes(self.data[start:end]), crc)
-
-
-def _open_checked(
-    view: LogBytes, chunk: ChunkRef, entries: Entries, topics: Mapping[int, str], span: tuple[int, int]
-) -> Cursor:
-    """Return a cursor over the long messages of a chunk; one pass computes all CRCs."""
-    head = parse_chunk_head(view, chunk.offset)[1]
-    data = unpack(view, chunk.offset, head, is_crc_checked=False)
-    messages, _ = check_messages(view, chunk.offset, data, entries, head.crc)
-    rows = [one for one in messages if one.channel in topics and span[0] <= one.log_time_ns <= span[1]]
-    rows.sort(key=lambda one: (one.log_time_ns, one.offset))
-    longest = max((one.end - one.start for one in rows), default=0)
-    if longest > view.read_limits.max_payload:
-        raise view.refusal(
-            f"one of its messages has {longest} bytes, more than {view.read_limits.max_payload}"
-        )
-    times, offsets = [one.log_time_ns for one in rows], [one.offset for one in rows]
-    return Cursor(chunk.offset, times, offsets, _CheckedMessages(topics, memoryview(data), rows).read_rows)
 
 
 def open_unchunked(

@@ -1,12 +1,7 @@
-"""Contents of a chunk: decompression within limits, its records, and reads in place.
-
-Images do not compress: the compressors store them as raw blocks inside their frames. A message in raw
-blocks can be read directly from the file. Frame formats: RFC 8878 (zstd), lz4_Frame_format.md.
-"""
+"""Contents of a chunk: decompression within limits, and its records."""
 
 import threading
 import zlib
-from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -20,126 +15,6 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, BoundError, chunk_excess
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse, parse_chunk_head
-
-_ZSTD_MAGIC = (0xFD2FB528).to_bytes(4, "little")
-_LZ4_MAGIC = (0x184D2204).to_bytes(4, "little")
-_ZSTD_BLOCK = 128 << 10  # bytes: limit of a block; compressors fill every block but the last
-_HEAD = 24  # more than the longest frame head of both formats
-
-
-@dataclass(frozen=True, slots=True)
-class _Block:
-    start: int  # in the uncompressed chunk
-    length: int
-    offset: int  # in the file
-
-
-@dataclass(frozen=True, slots=True)
-class EqualBlocks:
-    """A compressed frame of raw blocks; all but the last are full, the first begins at `offset` in the file.
-
-    A compressor never makes a block longer than its content. So all blocks are raw if the length of the
-    frame is the sum over raw blocks. A crafted frame may break this rule. Readers detect such a frame: they
-    check for every message that the record has the time in the index.
-    """
-
-    view: LogBytes
-    offset: int
-    size: int
-    head: int
-    extra: int  # head and checksum
-
-    def read(self, start: int, end: int) -> bytes | None:
-        """Return bytes `start` to `end` of the uncompressed chunk."""
-        first = start // self.size
-        shift = self.offset + self.head + first * self.extra
-        if end <= (first + 1) * self.size:
-            return self.view.read(shift + start, end - start)
-        parts = []
-        while start < end:
-            stop = min(end, (first + 1) * self.size)
-            parts.append(self.view.read(shift + start, stop - start))
-            first, shift, start = first + 1, shift + self.extra, stop
-        return b"".join(parts)
-
-
-@dataclass(slots=True)
-class RawBlocks:
-    """The raw blocks at the beginning of a compressed frame, located one by one when a read needs them."""
-
-    view: LogBytes
-    _blocks: Iterator[_Block]
-    _known: list[_Block] = field(default_factory=list)
-
-    def read(self, start: int, end: int) -> bytes | None:
-        """Return bytes `start` to `end` of the uncompressed chunk; None if some lie outside of raw blocks."""
-        known = self._known
-        while not known or known[-1].start + known[-1].length < end:
-            block = next(self._blocks, None)
-            if block is None:
-                return None
-            known.append(block)
-        parts = []
-        for block in known[bisect_right(known, start, key=_start) - 1 :]:
-            if block.start >= end:
-                break
-            low, high = max(start, block.start), min(end, block.start + block.length)
-            parts.append(self.view.read(block.offset + low - block.start, high - low))
-        return parts[0] if len(parts) == 1 else b"".join(parts)
-
-
-def find_blocks(
-    view: LogBytes, compression: str, offset: int, size: int, content: int
-) -> EqualBlocks | RawBlocks | None:
-    """Return a reader for parts of the frame of `size` bytes at `offset`, which holds `content` bytes.
-
-    Return None if the format of the frame is not known here.
-    """
-    head = view.read(offset, min(_HEAD, size))
-    end = offset + size
-    if compression == "zstd" and len(head) == _HEAD and head.startswith(_ZSTD_MAGIC):
-        flags, single = head[4], head[4] >> 5 & 1
-        first = offset + 5 + (1 - single) + (0, 1, 2, 4)[flags & 3] + (single, 2, 4, 8)[flags >> 6]
-        block, block_head, extra, frame_tail = _ZSTD_BLOCK, 3, 3, (flags >> 2 & 1) * 4
-        blocks = _zstd_blocks(view, first, end)
-    elif compression == "lz4" and len(head) == _HEAD and head.startswith(_LZ4_MAGIC):
-        flags = head[4]
-        first = offset + 7 + (flags >> 3 & 1) * 8 + (flags & 1) * 4
-        checksum = (flags >> 4 & 1) * 4
-        block, block_head = 1 << (8 + 2 * (head[5] >> 4 & 7)), 4
-        extra, frame_tail = 4 + checksum, 4 + (flags >> 2 & 1) * 4
-        blocks = _lz4_blocks(view, first, end, checksum)
-    else:
-        return None
-    if end - first - frame_tail == content + extra * -(-content // block):
-        return EqualBlocks(view, first, block, block_head, extra)
-    return RawBlocks(view, blocks)
-
-
-def _start(block: _Block) -> int:
-    return block.start
-
-
-def _zstd_blocks(view: LogBytes, offset: int, end: int) -> Iterator[_Block]:
-    start, last = 0, 0
-    while not last and offset + 3 <= end:
-        word = int.from_bytes(view.read(offset, 3), "little")
-        last, kind, size = word & 1, word >> 1 & 3, word >> 3
-        if kind != 0 or offset + 3 + size > end:
-            return
-        yield _Block(start, size, offset + 3)
-        start, offset = start + size, offset + 3 + size
-
-
-def _lz4_blocks(view: LogBytes, offset: int, end: int, checksum: int) -> Iterator[_Block]:
-    start = 0
-    while offset + 4 <= end:
-        word = int.from_bytes(view.read(offset, 4), "little")
-        size = word & 0x7FFFFFFF
-        if not word >> 31 or offset + 4 + size + checksum > end:
-            return
-        yield _Block(start, size, offset + 4)
-        start, offset = start + size, offset + 4 + size + checksum
 
 
 class _PerThread(threading.local):
@@ -283,6 +158,10 @@ class ChunkContents:
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+
+    def in_order(self) -> list[tuple[int, int]]:
+        """Return the offset and the channel id of each message, in the order of the file."""
+        return sorted((offset, key) for key, rows in self.entries.items() for _, offset in rows)
 
     def add(self, view: LogBytes, record: RecordAt, offset: int, body: bytes) -> None:
         """Add one record of type Schema, Channel or Message; ignore other types."""

@@ -87,14 +87,12 @@ class RawMessage(NamedTuple):
     """One message, payload not decoded. Times are in ns.
 
     The class is a tuple: to create a frozen dataclass takes four times as long, and a log has many messages.
-    `crc` is the CRC-32 of the data if the reader has computed it, else None.
     """
 
     topic: str
     log_time_ns: int
     publish_time_ns: int
     data: bytes
-    crc: int | None = None
 
 
 _LARGEST_ID = 0xFFFF

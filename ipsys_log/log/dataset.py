@@ -65,7 +65,7 @@ class Session:
     def __init__(self, paths: Sequence[LogLocation]) -> None:
         self.paths = list(paths)
         self._stack = ExitStack()
-        self._added: tuple[Message, ...] = ()
+        self._hidden: Collection[str] = ()
         self._channels: dict[tuple[str, str], Channel | None] = {}
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
@@ -118,11 +118,11 @@ class Session:
             for reader in self.readers
             for topic, stored in reader.channels.items()
             if stored.message_count > 0
+            and topic not in self._hidden
             and self._channel_of(topic, stored) is channel
             and run_of_topic(topic) == run
         }
-        added = {m.topic for m in self._added if channel_of(m.topic, type(m.payload)) is channel}
-        return sorted(stored_topics | {topic for topic in added if run_of_topic(topic) == run})
+        return sorted(stored_topics)
 
     def _channel_of(self, topic: str, stored: StoredChannel) -> Channel | None:
         schema = stored.schema.name if stored.schema is not None else ""
@@ -180,8 +180,7 @@ class Session:
         ]
 
     def count(self, topic: str) -> int:
-        stored = sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
-        return stored + sum(message.topic == topic for message in self._added)
+        return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
 
     def hash(self, topic: str) -> str:
         """Return the hash of a channel's messages, which does not depend on their file.
@@ -206,10 +205,6 @@ class Session:
         streams: list[Iterator[Message]] = [
             self._decoded(reader, items, topics, start_ns, end_ns) for reader, items in self._items()
         ]
-        if self._added:
-            low_ns, high_ns = start_ns or 0, _LATEST_NS if end_ns is None else end_ns
-            added = (m for m in self._added if m.topic in topics and low_ns <= m.log_time_ns < high_ns)
-            streams.append(added)
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
@@ -309,7 +304,7 @@ class Session:
         payload = _payload(reader, raw, items)
         if isinstance(payload, Measurement) and reader in self._ids:
             payload = rename_ids(payload, self._ids[reader])
-        camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
+        camera = self.camera_of(raw.topic)
         # The log time of a ROS 2 recorder is the arrival; the message contains the time of its frame.
         taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
         return Message(raw.topic, raw.log_time_ns, taken_ns or raw.publish_time_ns, payload, camera)
@@ -335,8 +330,8 @@ class Session:
         return sorted(runs, key=lambda run: run.number)
 
     @cached_property
-    def cuts(self) -> dict[LogReader, list[Cut | MergedLog]]:
-        """The records of cuts and of merges of each log that was made from others, the oldest first.
+    def copies(self) -> dict[LogReader, list[Cut | MergedLog]]:
+        """The records of cuts and of merges of each log that was copied from others, the oldest first.
 
         A merge has one record for each of its logs.
         """
@@ -345,26 +340,26 @@ class Session:
             reader: [
                 record
                 for message in self._decoded(reader, items, topics, None, None)
-                for record in _origin_records(message.payload)
+                for record in _copy_records(message.payload)
             ]
             for reader, items in (self._items() if topics else ())
         }
-        return {reader: cuts for reader, cuts in parts.items() if cuts}
+        return {reader: copies for reader, copies in parts.items() if copies}
 
-    def with_images(self, topics: Collection[str]) -> Session:
-        """Return a view of these logs with the images of these topics only; it ends with this session."""
+    def with_cameras(self, cameras: Collection[str]) -> Session:
+        """Return a view of these logs with the channels of these cameras only; it ends with this session."""
         view = copy(self)
-        view.images = {camera: topic for camera, topic in self.images.items() if topic in topics}
+        view.images = {camera: topic for camera, topic in self.images.items() if camera in cameras}
+        view.calibrations = {
+            camera: topic for camera, topic in self.calibrations.items() if camera in cameras
+        }
+        topics = {topic for reader in self.readers for topic in reader.channels}
+        view._hidden = {topic for topic in topics if self.camera_of(topic) not in (None, *cameras)}
         return view
 
-    def with_message(self, message: Message) -> Session:
-        """Return a view of these logs with one more message, of a topic that they do not have.
-
-        The view has its topic, its count and its payload. It ends with this session.
-        """
-        view = copy(self)
-        view._added = (*self._added, message)
-        return view
+    def camera_of(self, topic: str) -> str | None:
+        """Return the camera of a topic; None if it has none."""
+        return self._camera_of.get(topic) or camera_of_topic(topic)
 
     def _check_same_parameters(self) -> None:
         names = [{run_of_topic(topic) for topic in reader.channels} - {None} for reader in self.readers]
@@ -455,7 +450,7 @@ class Session:
         return ""
 
 
-def _origin_records(payload: Cut | Merge) -> tuple[Cut | MergedLog, ...]:
+def _copy_records(payload: Cut | Merge) -> tuple[Cut | MergedLog, ...]:
     return payload.logs if isinstance(payload, Merge) else (payload,)
 
 

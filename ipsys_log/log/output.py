@@ -100,7 +100,7 @@ class NewFile:
 
 @dataclass(slots=True)
 class PendingAppend:
-    """An append. The file does not change before `finish`."""
+    """An append. The file does not change before `finish`. With `is_forced`, it gets at least a new tail."""
 
     storage: Storage
     path: Path
@@ -110,6 +110,7 @@ class PendingAppend:
     offset: int
     crc: int | None
     make_temporary_tail: Callable[[int], bytes]
+    is_forced: bool = False
     _pieces: list[bytes] = field(default_factory=list)
 
     def emit(self, data: Buffer, crc: int | None = None) -> None:
@@ -118,7 +119,7 @@ class PendingAppend:
         self.crc = None if self.crc is None else _extend(self.crc, data, crc)
 
     def finish(self, tail: bytes) -> None:
-        if not self._pieces:
+        if not self._pieces and not self.is_forced:
             return
         self._check_unchanged()
         try:

@@ -1,23 +1,22 @@
 """Copies of parts of logs: whole chunks as they are, other messages one by one, in constant memory."""
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import zip_longest
+from typing import NamedTuple
 
 import numpy as np
 from mcap import records as mcap
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from ipsys_log.log.bounds import chunk_excess
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.checked_chunk import Entries, Rows, check_messages, message_head, rows_by_offset
-from ipsys_log.log.chunk_messages import chunk_entries, to_rows
+from ipsys_log.log.chunk_messages import Entries, Rows, chunk_entries, to_rows
 from ipsys_log.log.chunks import unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import METADATA_NAME, Buffer, extend
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
+from ipsys_log.log.records import HEAD_SIZE, HEADER, MESSAGE, MESSAGE_HEAD_SIZE, ChunkRef, parse_chunk_head
 from ipsys_log.log.writer import LogWriter
 
 # From a topic and log times in ns, (n,), to those that are kept, (n,).
@@ -49,7 +48,7 @@ def copy_messages(
     for chunk, next_chunk in zip_longest(chunks, chunks[1:]):
         if next_chunk is not None:
             view.prefetch(next_chunk.offset, next_chunk.end - next_chunk.offset)
-        copy_chunk(reader, writer, chunk, choose)
+        _copy_chosen(reader, writer, chunk, choose)
         advance(chunk.end)
     unchunked = _kept_rows(contents, to_rows(contents.unchunked), choose)
     if unchunked:
@@ -58,25 +57,20 @@ def copy_messages(
         _copy_rows(view, contents, unchunked, writer, lambda low, high: view.read(low, high - low))
 
 
-def copy_chunk(
-    reader: LogReader, writer: LogWriter, chunk: ChunkRef, choose: Choose, is_distinct: bool = False
-) -> None:
-    """Copy the chosen messages of a chunk; errors are those of `copy_messages`.
-
-    With ``is_distinct``, a channel with other metadata is another channel.
-    """
+def _copy_chosen(reader: LogReader, writer: LogWriter, chunk: ChunkRef, choose: Choose) -> None:
+    """Copy the chosen messages of a chunk; errors are those of `copy_messages`."""
     view, contents = reader.view, reader.contents
     entries = chunk_entries(view, chunk, {})
     kept = _kept_rows(contents, entries, choose)
     if not kept:
         return
-    ids = {key: _adopt(contents, writer, key, is_distinct) for key in kept}
+    ids = {key: _adopt(contents, writer, key) for key in kept}
     is_whole = all(len(kept.get(key, ())) == len(rows) for key, rows in entries.items())
     if chunk.index_length and is_whole and all(key == own for key, own in ids.items()):
         _copy_chunk(view, contents, chunk, entries, writer)
     else:
         data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
-        _copy_rows(view, contents, kept, writer, _Bytes(data).read, is_distinct)
+        _copy_rows(view, contents, kept, writer, lambda low, high: data[low:high])
 
 
 def copy_records(reader: LogReader, writer: LogWriter) -> None:
@@ -117,20 +111,9 @@ def _kept_rows(contents: Contents, entries: Entries, choose: Choose) -> dict[int
     return kept
 
 
-class _Bytes:
-    """The records of a chunk, decompressed."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-
-    def read(self, low: int, high: int) -> bytes:
-        """Return the bytes from ``low`` to before ``high``."""
-        return self._data[low:high]
-
-
-def _adopt(contents: Contents, writer: LogWriter, key: int, is_distinct: bool = False) -> int:
+def _adopt(contents: Contents, writer: LogWriter, key: int) -> int:
     channel = contents.channels[key]
-    return writer.adopt_channel(channel, contents.schemas.get(channel.schema_id), is_distinct)
+    return writer.adopt_channel(channel, contents.schemas.get(channel.schema_id))
 
 
 def _copy_rows(
@@ -138,44 +121,70 @@ def _copy_rows(
     contents: Contents,
     kept: Mapping[int, Rows],
     writer: LogWriter,
-    read: Callable[[int, int], bytes],
-    is_distinct: bool = False,
+    read: Callable[[int, int], Buffer],
 ) -> None:
     """Write messages one by one; ``read`` returns the bytes between two offsets."""
     topics = [contents.channels[key].topic for key in kept]
-    for time_ns, offset in rows_by_offset(kept):
-        head = read(offset, offset + MESSAGE_HEAD_SIZE)
-        opcode, length, key, _, log_ns, publish_ns = message_head(view, head, 0, offset)
-        if opcode != Opcode.MESSAGE or key not in kept or log_ns != time_ns:
-            raise view.fault(offset, "a message index points to no message of its time")
-        data = read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
-        if len(data) != length - MESSAGE_HEAD_SIZE + HEAD_SIZE:
-            raise view.fault(offset, "a message reaches beyond the end of its chunk")
-        topic = contents.channels[key].topic
+    for message in _messages(view, kept, read):
+        topic = contents.channels[message.channel].topic
         if topics.count(topic) > 1:  # its channels differ in the version of their schema
-            _adopt(contents, writer, key, is_distinct)
-        writer.write(topic, log_ns, publish_ns, data)
+            _adopt(contents, writer, message.channel)
+        data = bytes(read(message.start, message.end))
+        writer.write(topic, message.log_time_ns, message.publish_time_ns, data)
+
+
+class _Message(NamedTuple):
+    """A message record: its channel id, its times in ns, and the offsets of its data."""
+
+    channel: int
+    log_time_ns: int
+    publish_time_ns: int
+    start: int
+    end: int
+
+
+def _messages(view: LogBytes, entries: Entries, read: Callable[[int, int], Buffer]) -> Iterator[_Message]:
+    """Yield the messages of message indexes in the order of the file.
+
+    Raises
+    ------
+    LogError
+        An index points to no message of its time.
+    """
+    rows = np.concatenate([*entries.values()])
+    for time_ns, offset in rows[np.argsort(rows[:, 1], kind="stable")].tolist():
+        start = offset + MESSAGE_HEAD_SIZE
+        head = read(offset, start)
+        if len(head) < MESSAGE_HEAD_SIZE:
+            raise view.fault(offset, "a message reaches beyond the end of its chunk")
+        opcode, length, key, _, log_ns, publish_ns = MESSAGE.unpack(head)
+        if opcode != Opcode.MESSAGE or key not in entries or log_ns != time_ns:
+            raise view.fault(offset, "a message index points to no message of its time")
+        yield _Message(key, log_ns, publish_ns, start, offset + HEAD_SIZE + length)
 
 
 def _copy_chunk(
     view: LogBytes, contents: Contents, chunk: ChunkRef, entries: Entries, writer: LogWriter
 ) -> None:
-    record, head = parse_chunk_head(view, chunk.offset)
-    if record.length != chunk.length:
-        raise view.fault(chunk.offset, "its index claims another length of the chunk")
-    if not head.compression and (excess := chunk_excess(head.data_size, head.uncompressed_size)):
-        raise view.refusal(excess)
+    """Copy a chunk as it is. One pass computes the CRCs of its messages, its records and all its bytes."""
+    head = parse_chunk_head(view, chunk.offset)[1]
     whole = view.read(chunk.offset, chunk.length + chunk.index_length)
+    data = memoryview(unpack(view, chunk.offset, head, is_crc_checked=False))
+    rows, crc, position = [], 0, 0
+    for message in _messages(view, entries, lambda low, high: data[low:high]):
+        payload = data[message.start : message.end]
+        own_crc = zlib.crc32(payload)
+        crc = extend(zlib.crc32(data[position : message.start], crc), payload, own_crc)
+        position = message.end
+        topic = contents.channels[message.channel].topic
+        rows.append((topic, message.log_time_ns, message.publish_time_ns, len(payload), own_crc))
+    crc = zlib.crc32(data[position:], crc)
+    if head.crc and crc != head.crc:
+        raise view.fault(chunk.offset, "the CRC of the chunk is wrong")
     start = head.data_offset - chunk.offset
     stored = memoryview(whole)[start : start + head.data_size]
-    data: Buffer = unpack(view, chunk.offset, head, False) if head.compression else stored
-    messages, data_crc = check_messages(view, chunk.offset, data, entries, head.crc)
-    rows = [
-        (contents.channels[key].topic, log_ns, publish_ns, end - start, own_crc)
-        for key, log_ns, publish_ns, _, start, end, own_crc in messages
-    ]
-    stored_crc = zlib.crc32(stored) if head.compression else data_crc
-    crc = extend(zlib.crc32(whole[:start]), stored, stored_crc)
-    crc = zlib.crc32(memoryview(whole)[start + len(stored) :], crc)
+    stored_crc = zlib.crc32(stored) if head.compression else crc
+    indexes = memoryview(whole)[start + head.data_size :]
+    whole_crc = zlib.crc32(indexes, extend(zlib.crc32(whole[:start]), stored, stored_crc))
     counts = {key: len(rows_of_one) for key, rows_of_one in entries.items()}
-    writer.copy_chunk(chunk, whole, crc, counts, rows)
+    writer.copy_chunk(chunk, whole, whole_crc, counts, rows)

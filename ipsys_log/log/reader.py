@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -19,10 +18,10 @@ from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import ReadLimits
 from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
-from ipsys_log.log.checked_chunk import Rows
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
     RangeCache,
+    Rows,
     chunk_entries,
     open_chunk,
     open_unchunked,
@@ -31,7 +30,6 @@ from ipsys_log.log.chunk_messages import (
 )
 from ipsys_log.log.chunks import has_wrong_crc
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
-from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.file_check import FileCheck, check_file
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
@@ -41,6 +39,7 @@ from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
 from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
 from ipsys_log.log.summary import NoFooterError
+from ipsys_log.log.survey import Watch
 from ipsys_log.plain_text import shell_words
 
 _logger = logging.getLogger(__name__)
@@ -154,7 +153,6 @@ class LogReader:
         topics: Collection[str] | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
-        without: Collection[int] = (),
         is_checked: bool = False,
     ) -> Iterator[RawMessage]:
         """Return the messages in log order: by log time, then by offset in the file.
@@ -165,10 +163,8 @@ class LogReader:
             The topics to read; None means all topics. A topic that is not in the log has no messages.
         start_ns, end_ns
             Half-open range of log time in ns: start <= log time < end.
-        without
-            Offsets of chunks that are left out.
         is_checked
-            Read each chunk as a whole, and check its CRC. The next chunk is read from the disk meanwhile.
+            Read each chunk as a whole, and check its CRC.
 
         Raises
         ------
@@ -180,23 +176,16 @@ class LogReader:
         span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
         chunks = [
             chunk
-            for chunk in contents.chunks
-            if chunk.start_ns <= span[1]
-            and chunk.end_ns >= span[0]
-            and chunk.offset not in without
-            and (not chunk.index_offsets or not wanted.keys().isdisjoint(chunk.index_offsets))
+            for chunk in self._chunks_with(wanted)
+            if chunk.start_ns <= span[1] and chunk.end_ns >= span[0]
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
-        next_chunks = self._next_chunks(chunks) if is_checked else {}
         pending = [
             PendingChunk(
                 chunk.start_ns,
                 chunk.offset,
-                partial(
-                    open_chunk,
-                    *(view, self._cache, chunk, wanted, span, is_checked, next_chunks.get(chunk.offset)),
-                ),
+                partial(open_chunk, view, self._cache, chunk, wanted, span, is_checked),
             )
             for chunk in chunks
         ]
@@ -206,51 +195,50 @@ class LogReader:
             pending.append(PendingChunk(0, 0, unchunked))
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
 
-    @staticmethod
-    def _next_chunks(chunks: Sequence[ChunkRef]) -> dict[int, ChunkRef]:
-        """Return the chunk that is read after each chunk, by its offset."""
-        ordered = sorted(chunks, key=lambda chunk: (chunk.start_ns, chunk.offset))
-        return {before.offset: chunk for before, chunk in pairwise(ordered)}
-
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
-        wanted = set(self._topics_by_id([topic]))
-        parts = [rows for key, rows in to_rows(self._contents.unchunked).items() if key in wanted]
-        chunks = [
-            chunk
-            for chunk in self._contents.chunks
-            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets)
-        ]
-        for chunk in chunks:
-            entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
-            parts += [rows for key, rows in entries.items() if key in wanted]
-        times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
-        return np.sort(times).astype(np.int64)
+        parts = [rows[:, 0] for _, _, rows in self._indexed(self._topics_by_id([topic]))]
+        return np.sort(np.concatenate(parts) if parts else np.empty(0, np.uint64)).astype(np.int64)
 
     def order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the log times in ns and the places in ``topics`` of messages, (N,) each, in log order.
 
         They are read from the indexes alone.
         """
-        places = {key: topics.index(topic) for key, topic in self._topics_by_id(topics).items()}
-        # Rows of log time, offset of the chunk, offset in the chunk, and place. Unchunked messages have their
-        # offset in the file, as in `in_log_order`.
+        names = self._topics_by_id(topics)
+        # Rows of log time, offset of the chunk, offset in the chunk, and place.
         parts = [
-            _positions(rows, rows[:, 1], places[key])
-            for key, rows in to_rows(self._contents.unchunked).items()
-            if key in places
+            _positions(rows, chunk_offsets, topics.index(names[key]))
+            for key, chunk_offsets, rows in self._indexed(names)
         ]
-        for chunk in self._contents.chunks:
-            if not chunk.index_offsets or not places.keys().isdisjoint(chunk.index_offsets):
-                entries = chunk_entries(self._view, chunk, self._cache.searched, set(places))
-                parts += [
-                    _positions(rows, chunk.offset, places[key])
-                    for key, rows in entries.items()
-                    if key in places
-                ]
         rows = np.concatenate(parts) if parts else np.empty((0, 4), np.uint64)
         ordered = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))].astype(np.int64)
         return ordered[:, 0], ordered[:, 3]
+
+    def _indexed(self, wanted: Collection[int]) -> Iterator[tuple[int, Rows | int, Rows]]:
+        """Yield the rows of some channels: the channel id, the offset of their chunk, and the rows.
+
+        Messages outside of chunks have their own offsets in the file, as in `in_log_order`.
+        """
+        for key, rows in to_rows(self._contents.unchunked).items():
+            if key in wanted:
+                yield key, rows[:, 1], rows
+        for chunk in self._chunks_with(wanted):
+            for key, rows in self._entries(chunk, wanted):
+                yield key, chunk.offset, rows
+
+    def _chunks_with(self, wanted: Collection[int]) -> list[ChunkRef]:
+        """Return the chunks that have messages of some channels, or that have no index."""
+        ids = set(wanted)
+        return [
+            chunk
+            for chunk in self._contents.chunks
+            if not chunk.index_offsets or not ids.isdisjoint(chunk.index_offsets)
+        ]
+
+    def _entries(self, chunk: ChunkRef, wanted: Collection[int]) -> list[tuple[int, Rows]]:
+        entries = chunk_entries(self._view, chunk, self._cache.searched, set(wanted))
+        return [(key, rows) for key, rows in entries.items() if key in wanted]
 
     def first_time(self, topic: str) -> int | None:
         """Return the log time of the first message of a topic in ns; None if it has none."""
@@ -266,15 +254,12 @@ class LogReader:
         rows = to_rows(self._contents.unchunked)
         times = [sign * int(time) for key in wanted & rows.keys() for time in rows[key][:, 0]]
         chunks = [
-            (sign * (chunk.end_ns if last else chunk.start_ns), chunk) for chunk in self._contents.chunks
+            (sign * (chunk.end_ns if last else chunk.start_ns), chunk) for chunk in self._chunks_with(wanted)
         ]
         for bound, chunk in sorted(chunks, key=lambda row: row[0]):
             if times and min(times) <= bound:
                 break
-            if chunk.index_offsets and wanted.isdisjoint(chunk.index_offsets):
-                continue
-            entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
-            times += [sign * int(time) for key in wanted & entries.keys() for time in entries[key][:, 0]]
+            times += [sign * int(time) for _, rows in self._entries(chunk, wanted) for time in rows[:, 0]]
         return sign * min(times) if times else None
 
     def channel_hash(self, topic: str) -> str:
@@ -342,12 +327,7 @@ class LogReader:
         if topics is None:
             return read_sizes(self._view, contents, progress)
         wanted = {key for key, channel in contents.channels.items() if channel.topic in topics}
-        chunks = [
-            chunk
-            for chunk in contents.chunks
-            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets)
-        ]
-        sizes = read_sizes(self._view, replace(contents, chunks=chunks), progress)
+        sizes = read_sizes(self._view, replace(contents, chunks=self._chunks_with(wanted)), progress)
         return [size for size in sizes if size.topic in topics]
 
     def _topics_by_id(self, topics: Collection[str] | None) -> dict[int, str]:
@@ -359,12 +339,8 @@ class LogReader:
 
 def _positions(rows: Rows, chunk_offsets: Rows | int, place: int) -> Rows:
     positions = np.empty((len(rows), 4), np.uint64)
-    positions[:, 0], positions[:, 1], positions[:, 2], positions[:, 3] = (
-        rows[:, 0],
-        chunk_offsets,
-        rows[:, 1],
-        place,
-    )
+    positions[:, 0], positions[:, 1] = rows[:, 0], chunk_offsets
+    positions[:, 2], positions[:, 3] = rows[:, 1], place
     return positions
 
 

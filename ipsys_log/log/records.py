@@ -4,7 +4,7 @@ The layouts follow the MCAP specification, https://mcap.dev/spec. The record cla
 """
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
 from typing import NamedTuple, Self, TypeVar
 
@@ -191,6 +191,16 @@ def chunk_head(start_ns: int, end_ns: int, size: int, crc: int, compression: str
     fields = _CHUNK.pack(start_ns, end_ns, size, crc)
     fields += struct.pack("<I", len(name)) + name + struct.pack("<Q", data_size)
     return HEADER.pack(Opcode.CHUNK, len(fields) + data_size) + fields
+
+
+def index_records(entries: Mapping[int, list[tuple[int, int]]], offset: int) -> tuple[bytes, dict[int, int]]:
+    """Return the MessageIndex records of a chunk for `offset`, and the offset of each by channel id."""
+    pieces: list[bytes] = []
+    offsets: dict[int, int] = {}
+    for channel, rows in entries.items():
+        pieces.append(to_bytes(mcap.MessageIndex(channel, rows)))
+        offsets[channel], offset = offset, offset + len(pieces[-1])
+    return b"".join(pieces), offsets
 
 
 def parse_message_index(view: LogBytes, data: bytes, position: int, channel_id: int, offset: int) -> bytes:

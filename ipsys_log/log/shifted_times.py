@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 from google.protobuf import descriptor_pb2
 from google.protobuf.message import DecodeError
-from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import PAYLOADS, payload_type, proto_class
@@ -16,10 +14,6 @@ from ipsys_log.log.contents import StoredChannel
 from ipsys_log.log.protobuf_fields import NS
 
 _TIMESTAMP = "google.protobuf.Timestamp"
-_LONG = 16 << 10  # bytes: to parse and serialize a longer message takes longer than to find its time
-_LENGTH_DELIMITED = 2
-# The size in bytes of a value of the other wire types of protobuf, but varints.
-_FIXED_SIZES = {1: 8, 5: 4}
 
 
 def has_times(channel: StoredChannel) -> bool:
@@ -81,84 +75,12 @@ def shift_times(name: str, data: bytes, offset_ns: int) -> bytes:
     """
     if offset_ns == 0 or name not in PAYLOADS:
         return data
-    if len(data) >= _LONG and (shifted := _shift_only_time(name, data, offset_ns)) is not None:
-        return shifted
     try:
         proto = proto_class(name).FromString(data)
     except DecodeError as error:
         raise LogError(f"a message is not a valid {name}: {error}") from None
     _shift(proto, proto.DESCRIPTOR, offset_ns)
     return proto.SerializeToString(deterministic=True)
-
-
-def _shift_only_time(name: str, data: bytes, offset_ns: int) -> bytes | None:
-    """Return a message with its only time shifted, all other bytes as they are; None if it is not so simple.
-
-    Raises
-    ------
-    LogError
-        The time cannot be shifted.
-    """
-    kind = proto_class(name).DESCRIPTOR
-    fields = _fields_with_times(kind)
-    if len(fields) != 1 or fields[0][1] or fields[0][2].full_name != _TIMESTAMP:
-        return None
-    tag = kind.fields_by_name[fields[0][0]].number << 3 | _LENGTH_DELIMITED
-    try:
-        places = [place for found, *place in _top_fields(data) if found >> 3 == tag >> 3]
-        if len(places) != 1 or tag >= 0x80:
-            return None
-        ((start, value_start, end),) = places
-        stamp = Timestamp.FromString(bytes(data[value_start:end]))
-    except (ValueError, IndexError, DecodeError):
-        return None  # the whole message is parsed, which reports the fault
-    if not stamp.seconds and not stamp.nanos:
-        return data
-    stamp.seconds, stamp.nanos = divmod(shift_time(stamp.seconds * NS + stamp.nanos, offset_ns), NS)
-    text = stamp.SerializeToString(deterministic=True)  # less than 128 bytes: its length is one byte
-    return b"".join((data[:start], bytes((tag, len(text))), text, data[end:]))
-
-
-def _top_fields(data: bytes) -> Iterator[tuple[int, int, int, int]]:
-    """Yield tag, start, start of the value, and end of each field of an encoded message.
-
-    Raises
-    ------
-    ValueError, IndexError
-        The message is not valid.
-
-    References
-    ----------
-    https://protobuf.dev/programming-guides/encoding/
-    """
-    start = 0
-    while start < len(data):
-        tag, position = _read_varint(data, start)
-        if tag & 7 == 0:
-            _, end = _read_varint(data, position)
-        elif tag & 7 == _LENGTH_DELIMITED:
-            length, position = _read_varint(data, position)
-            end = position + length
-        else:
-            size = _FIXED_SIZES.get(tag & 7)
-            if size is None:
-                raise ValueError(f"wire type {tag & 7}")
-            end = position + size
-        if end > len(data):
-            raise ValueError("the last field is cut off")
-        yield tag, start, position, end
-        start = end
-
-
-def _read_varint(data: bytes, position: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        byte = data[position]
-        position += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, position
-    raise ValueError("a number has more than ten bytes")
 
 
 def _shift(proto: Any, kind: Any, offset_ns: int) -> None:

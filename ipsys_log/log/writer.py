@@ -60,7 +60,14 @@ class LogWriter:
     ['/a', '/runs/poly/b']
     """
 
-    def __init__(self, path: Path, output: Output, contents: Contents, limits: ChunkLimits) -> None:
+    def __init__(
+        self,
+        path: Path,
+        output: Output,
+        contents: Contents,
+        limits: ChunkLimits,
+        hashes: Mapping[str, ChannelHash] | None = None,
+    ) -> None:
         self.path = path
         self._output = output
         self._contents = contents
@@ -71,7 +78,7 @@ class LogWriter:
         self._declared: dict[str, tuple[Schema | None, str]] = {}
         # A live run grows for days. Until its end, only its summary needs these.
         self._packed_chunks: list[bytes] = []
-        self._hashes: dict[str, ChannelHash] = {}
+        self._hashes: dict[str, ChannelHash] = dict(hashes or {})
         self._stored: dict[str, ChannelHash] = {}
         self._open = True
 
@@ -230,13 +237,10 @@ class LogWriter:
         self._channels[topic] = (channel.id, self._images if image else self._small)
         self._declared[topic] = schema, message_encoding
 
-    def adopt_channel(
-        self, channel: mcap.Channel, schema: mcap.Schema | None, is_distinct: bool = False
-    ) -> int:
+    def adopt_channel(self, channel: mcap.Channel, schema: mcap.Schema | None) -> int:
         """Declare a channel of another log; return its id here, which is the same if this id is free.
 
-        A channel with the same topic and schema is continued, with `is_distinct` only if its metadata are the
-        same, too.
+        A channel with the same topic, schema and metadata is continued.
 
         Raises
         ------
@@ -247,14 +251,7 @@ class LogWriter:
         own = Schema(schema.name, schema.encoding, schema.data) if schema else None
         self._check_kind(channel.topic, own, channel.message_encoding)
         known = (c for c in self._contents.channels.values() if c.topic == channel.topic)
-        same = next(
-            (
-                c
-                for c in known
-                if self._schema_of(c) == own and not (is_distinct and c.metadata != channel.metadata)
-            ),
-            None,
-        )
+        same = next((c for c in known if self._schema_of(c) == own and c.metadata == channel.metadata), None)
         if same is None:
             schema_id = self._schema_id(own, schema.id) if own and schema else 0
             key = self._free_id(self._contents.channels, channel.id)
@@ -266,6 +263,39 @@ class LogWriter:
         self._channels[channel.topic] = (same.id, self._images if image else self._small)
         self._declared.pop(channel.topic, None)
         return same.id
+
+    def define(self, record: mcap.Schema | mcap.Channel) -> None:
+        """Write a definition of a damaged log as it is; its id must be free here.
+
+        Raises
+        ------
+        LogError
+            The log has the topic of the channel with a schema of another name, or another encoding.
+        """
+        if isinstance(record, mcap.Schema):
+            self._contents.schemas[record.id] = record
+        else:
+            self._check_kind(record.topic, self._schema_of(record), record.message_encoding)
+            self._contents.channels[record.id] = record
+        self._output.emit(to_bytes(record))
+
+    def defines(self, record: mcap.Schema | mcap.Channel) -> bool:
+        """Return whether the log has exactly this definition."""
+        if isinstance(record, mcap.Schema):
+            return self._contents.schemas.get(record.id) == record
+        return self._contents.channels.get(record.id) == record
+
+    def has_channel(self, channel_id: int) -> bool:
+        return channel_id in self._contents.channels
+
+    def use(self, channel_id: int) -> str:
+        """Write the next messages of a topic to this one of its channels; return the topic."""
+        channel = self._contents.channels[channel_id]
+        schema = self._schema_of(channel)
+        image = schema is not None and schema.name in IMAGE_SCHEMAS
+        self._channels[channel.topic] = (channel_id, self._images if image else self._small)
+        self._declared.pop(channel.topic, None)
+        return channel.topic
 
     def copy_chunk(
         self,
@@ -318,12 +348,8 @@ class LogWriter:
         """Return the hash of the messages that this writer has written to a channel."""
         return self._hashes.get(topic, ChannelHash())
 
-    def write(
-        self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes, crc: int | None = None
-    ) -> None:
+    def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Add a message to a channel that was declared with `add_channel`; times in ns.
-
-        `crc` is the CRC-32 of the data if the caller knows it.
 
         Raises
         ------
@@ -345,7 +371,7 @@ class LogWriter:
         state = self._hashes.get(topic)
         if state is None:
             state = self._hashes[topic] = self._hash_so_far(topic)
-        crc = zlib.crc32(data) if crc is None else crc
+        crc = zlib.crc32(data)
         state.add_row(log_time_ns, publish_time_ns, len(data), crc)
         sequence = state.count & 0xFFFFFFFF
         if self._contents.unchunked:

@@ -29,6 +29,8 @@ CONTRADICTIONS = frozenset(
 NODE_ANSWERS, NODE_AWAITED = "node_answers", "node_awaited"
 # The kind of an event for a node whose frames are not recorded: a second one, or one of another version.
 NODE_REFUSED = "node_refused"
+# The kind of an event for messages from a damaged part of the log, which no CRC confirms.
+DAMAGED = "damaged"
 # The kinds of events of an operator: a remark at an instant, and the start and the end of a named segment.
 MARK, SEGMENT_STARTED, SEGMENT_ENDED = "mark", "segment_started", "segment_ended"
 OPERATOR_KINDS = frozenset((MARK, SEGMENT_STARTED, SEGMENT_ENDED))

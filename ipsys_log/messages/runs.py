@@ -83,7 +83,8 @@ class MergedLog:
     """A log in a merged log: its name, the offset of its times, and its channels there.
 
     ``offset_ns`` was added to all times of the log; ``offset_sigma_s`` is the standard deviation of an
-    estimated offset. ``renamed_runs`` are the new names of runs by their old names.
+    estimated offset. ``renamed_runs``, in merged logs of older versions, are the new names of runs by their
+    old names.
     """
 
     name: str

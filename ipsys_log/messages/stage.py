@@ -74,14 +74,11 @@ class Pieces(NamedTuple):
     resets : the bounds of the pieces.
     step : makes the step for one piece; its first messages are the rig and the intrinsics.
     reports : makes the function that sees the payloads of all pieces, in log order.
-    interim : types of payloads that only ``reports`` gets: dataclasses of payloads, texts and tuples of
-        numbers.
     """
 
     resets: Resets
     step: Callable[[], Step]
     reports: Callable[[], Reports]
-    interim: tuple[type, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,8 +124,6 @@ class Stage:
     in_threads : it works outside of Python: one thread for each camera is faster.
     of_model : each model has its own run of this stage, and of the stages that read it.
     on_demand : it runs only if the user names it, or a stage that needs it.
-    stateless : the channels, by the parameters of a run and its view, of which each message follows from one
-        input message and from lasting channels such as the rig. A part of a log can repeat them.
     pieces : the pieces of a run with these parameters, if its frames can be processed in pieces.
     """
 
@@ -144,7 +139,6 @@ class Stage:
     in_threads: bool = False
     of_model: bool = False
     on_demand: bool = False
-    stateless: Callable[[Mapping[str, str], StageView], Collection[Channel]] = lambda parameters, view: ()
     pieces: Callable[[Mapping[str, str]], Pieces] | None = None
 
     def __repr__(self) -> str:
@@ -165,13 +159,12 @@ def model_read(_parameters: Mapping[str, str], view: StageView) -> str:
 class Resets:
     """The instants at which a stage clears its memory of each camera, at absolute multiples of a period.
 
-    The instants depend on the log time and the name of the camera only. So a cut or a merge keeps them, and
-    the frames of a camera between two resets can be processed without the frames before them.
+    The instants depend on the log time and the name of the camera only. So a cut keeps them, and the frames
+    of a camera between two resets can be processed without the frames before them.
 
     Parameters
     ----------
     period_ns : time between two resets of a camera.
-    shift_ns : time that merges have added to the log times since the resets were fixed.
 
     Examples
     --------
@@ -182,7 +175,6 @@ class Resets:
     """
 
     period_ns: int
-    shift_ns: int = 0
 
     def number(self, camera: str, log_time_ns: int) -> int:
         """Return the number of the last reset of a camera at or before a log time in ns."""
@@ -195,4 +187,4 @@ class Resets:
     def _first_ns(self, camera: str) -> int:
         # Simultaneous searches of all cameras would take too long for live tracking. The name of a camera,
         # unlike its number in the rig, stays the same in all parts of a log.
-        return self.shift_ns + (zlib.crc32(camera.encode()) * self.period_ns >> 32)
+        return zlib.crc32(camera.encode()) * self.period_ns >> 32

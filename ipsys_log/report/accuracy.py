@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats, root_mean_square_m
 from ipsys_log.analysis.ground_truth import TrackErrors, gather_paths, track_errors
 from ipsys_log.analysis.trajectory_errors import (
-    ErrorSummary,
     TrajectoryErrors,
     pool_trajectories,
     trajectory_errors,
@@ -26,9 +25,51 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
 from ipsys_log.models.table import is_known, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
+from ipsys_log.report.rows import cm
 from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
+
+
+class ErrorRow(NamedTuple):
+    """The errors of a model in a camera as the row of a table, in space and on the floor.
+
+    ``repeats`` is the number of errors of each point; without it, the RMSE is not known.
+    """
+
+    camera: str
+    against: str
+    space: ErrorStatistics | None
+    floor: ErrorStatistics
+    repeats: int | None = 1
+
+    def rmse_m(self, errors: ErrorStatistics | None) -> float | None:
+        """Return the RMSE of the errors in space or on the floor."""
+        if errors is None or self.repeats is None:
+            return None
+        return root_mean_square_m(errors, self.repeats)
+
+    def text(self, column: str, digits: int = 2) -> str:
+        """Return the cell of a column in cm, such as ``n``, ``3D mean``, ``2D RMSE`` or ``3D 95 % CI``."""
+        if column == "n":
+            return str(self.floor.count)
+        kind, _, name = column.partition(" ")
+        errors = self.space if kind == "3D" else self.floor
+        if errors is None:
+            return cm(None)
+        if name == "95 % CI":
+            return interval_cm(errors)
+        if name == "mean (95 % CI)":
+            low_high = interval_cm(errors, " to ")
+            return f"{cm(errors.mean_m)} ({low_high})" if errors.mean_low_m is not None else cm(errors.mean_m)
+        return cm(self.rmse_m(errors) if name == "RMSE" else getattr(errors, f"{name}_m"), digits)
+
+
+def interval_cm(errors: ErrorStatistics, between: str = "-") -> str:
+    """Format the 95 % confidence interval of a mean in cm, or return a dash."""
+    if errors.mean_low_m is None or errors.mean_high_m is None:
+        return cm(None)
+    return f"{cm(errors.mean_low_m)}{between}{cm(errors.mean_high_m)}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,13 +100,12 @@ class Accuracy:
             return self.rows(cross_validated)
         return [row for row in rows if (row.scheme == CROSS_VALIDATION) == cross_validated]
 
-    def rmse_m(self, row: CameraEvaluation, errors: ErrorStatistics | None) -> float | None:
-        """Return the RMSE of the errors of a row, in space or on the floor."""
+    def errors_of(self, row: CameraEvaluation) -> ErrorRow:
+        """Return the errors of a row for tables and JSON, with their RMSE."""
         rows = self.evaluation.cameras if self.evaluation else ()
         if self.evaluation and any(other is row for other in self.evaluation.with_excluded):
             rows = self.evaluation.with_excluded
-        repeats = count_repeats(row, rows)
-        return None if errors is None or repeats is None else root_mean_square_m(errors, repeats)
+        return ErrorRow(row.camera, row.against, row.error_3d, row.error_2d, count_repeats(row, rows))
 
 
 def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accuracy]:
@@ -189,31 +229,24 @@ def _trajectories_json(trajectories: Sequence[TrajectoryErrors]) -> dict[str, An
 def _trajectory_json(trajectory: TrajectoryErrors) -> dict[str, Any]:
     absolute = {"3d": trajectory.absolute_3d, "2d": trajectory.absolute_2d}
     return {
-        "ate": {name: _summary_json(errors) for name, errors in absolute.items()},
+        "ate": {name: _statistics(errors, root_mean_square_m(errors)) for name, errors in absolute.items()},
         "rpe": [
-            {"delta": one.delta, "unit": one.unit, "relation": one.relation, **_summary_json(one.summary)}
+            {
+                "delta": one.delta,
+                "unit": one.unit,
+                "relation": one.relation,
+                **_statistics(one.summary, root_mean_square_m(one.summary)),
+            }
             for one in trajectory.relative
         ],
     }
 
 
-def _summary_json(errors: ErrorSummary) -> dict[str, float | int]:
-    values = {
-        "rmse_cm": errors.rmse_m,
-        "mean_cm": errors.mean_m,
-        "median_cm": errors.median_m,
-        "std_cm": errors.std_m,
-        "max_cm": errors.max_m,
-        "p95_cm": errors.p95_m,
-    }
-    return {**{name: value_m * CM_PER_M for name, value_m in values.items()}, "n": errors.count}
-
-
 def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:
     summary: dict[str, Any] = {}
     if row.error_3d is not None:
-        summary["3d"] = _statistics(row.error_3d, accuracy.rmse_m(row, row.error_3d))
-    summary["2d"] = _statistics(row.error_2d, accuracy.rmse_m(row, row.error_2d))
+        summary["3d"] = _statistics(row.error_3d, accuracy.errors_of(row).rmse_m(row.error_3d))
+    summary["2d"] = _statistics(row.error_2d, accuracy.errors_of(row).rmse_m(row.error_2d))
     if row.bias_m is not None:
         summary["bias_cm"] = (row.bias_m * CM_PER_M).tolist()
     if row.within_68 is not None and row.within_95 is not None:

@@ -10,12 +10,12 @@ import numpy as np
 
 from ipsys_log.analysis.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.analysis.calibration_points import find_pairs, measured
-from ipsys_log.analysis.coverage import FloorCoverage, MountedCamera, Overlap, cover_floor, find_overlaps
+from ipsys_log.analysis.coverage import FloorCoverage, Overlap, cover_floor, find_overlaps
 from ipsys_log.analysis.stationary import find_stationary
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.poses import invert_pose, make_pose
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL
@@ -55,7 +55,7 @@ class AlignedLab:
     rig: Rig
     alignments: tuple[Alignment, ...]
     lenses: Lenses
-    mounted_cameras: tuple[MountedCamera, ...]
+    mounted_cameras: tuple[PosedCamera, ...]
     coverage: FloorCoverage | None
     overlaps: tuple[Overlap, ...]
     diagonal_m: float
@@ -153,7 +153,7 @@ def _part_of_picture(alignment: Alignment, lens: CameraCalibration) -> float:
 
 def _mount(
     alignments: Sequence[Alignment], pairs: Mapping[str, Sequence[Pair]], lenses: Lenses, notes: list[str]
-) -> Iterator[MountedCamera]:
+) -> Iterator[PosedCamera]:
     """Yield the cameras with a pose in the world that follows from calibration points."""
     for alignment in alignments:
         camera, camera_pairs = alignment.camera, pairs.get(alignment.camera, ())
@@ -182,7 +182,7 @@ def _mount(
                 f"camera {camera} has moved since its calibration points were measured: "
                 "its coverage is for the old pose"
             )
-        yield MountedCamera(camera, lenses[camera], invert_pose(make_pose(axes, origin_m)))
+        yield PosedCamera(camera, lenses[camera], axes.T, origin_m)
 
 
 def _marker(rig: Rig) -> tuple[float, float]:
@@ -194,7 +194,7 @@ def _marker(rig: Rig) -> tuple[float, float]:
 
 
 def _cover(
-    rig: Rig, mounted: Sequence[MountedCamera], length_m: float, height_m: float, notes: list[str]
+    rig: Rig, mounted: Sequence[PosedCamera], length_m: float, height_m: float, notes: list[str]
 ) -> FloorCoverage | None:
     if not mounted:
         notes.append(

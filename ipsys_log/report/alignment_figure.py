@@ -79,19 +79,19 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: FloorCoverage) -> None:
     axes.imshow(shown, cmap=shades, vmin=0, vmax=2, origin="lower", extent=frame, zorder=0.5)
     for colour, text in ((_ONE, "whole in one image"), (_MORE, "in two or more"), (_NONE, "in none")):
         axes.plot([], [], "s", ms=9, mfc=colour, mec=REST, label=text)
-    styles = camera_styles(mounted.camera for mounted in lab.mounted_cameras)
+    styles = camera_styles(mounted.name for mounted in lab.mounted_cameras)
     for mounted in lab.mounted_cameras:
-        colour, shape = styles[mounted.camera]
+        colour, shape = styles[mounted.name]
         # The area outside of the floor has no data, so the edge of the floor closes the outline.
-        seen = np.pad(coverage.whole[mounted.camera].astype(float), 1)
+        seen = np.pad(coverage.whole[mounted.name].astype(float), 1)
         around_m = [
             np.concatenate([[v[0] - half_m], v, [v[-1] + half_m]]) for v in (coverage.xs_m, coverage.ys_m)
         ]
         axes.contour(*around_m, seen, levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
-        label = legend_label(shorten(mounted.camera), len(styles))
+        label = legend_label(shorten(mounted.name), len(styles))
         axes.plot(*mounted.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=label)
     beside_m = 0.03 * float(np.ptp(axes.get_ylim()))
-    places_m = {one.camera: np.array(one.foot_m) - [0.0, beside_m] for one in lab.mounted_cameras}
+    places_m = {one.name: np.array(one.foot_m) - [0.0, beside_m] for one in lab.mounted_cameras}
     name_cameras(axes, places_m, {name: colour for name, (colour, _) in styles.items()})
     for overlap in coverage.overlaps:
         good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M

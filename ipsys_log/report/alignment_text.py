@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.alignment import LEVEL_M, Alignment
 from ipsys_log.analysis.coverage import FloorCoverage, Overlap, Patch
 from ipsys_log.report.alignment import AlignedLab
+from ipsys_log.report.rows import Rows, cm
 from ipsys_log.units import CM_PER_M
 
 _GOOD, _BAD = "green", "red"
@@ -49,7 +49,7 @@ def advise(alignment: Alignment) -> str:
     turns = _turns(alignment)
     if alignment.remaining_m is not None and alignment.remaining_m >= LEVEL_M:
         text = (
-            f"{turns}, but a spread of {alignment.remaining_m * CM_PER_M:.1f} cm remains"
+            f"{turns}, but a spread of {cm(alignment.remaining_m, 1)} cm remains"
             if turns
             else "no turn of the camera corrects the spread"
         )
@@ -75,32 +75,21 @@ def _on_floor(alignment: Alignment) -> str:
     """Return the shift of the principal point on the floor as text; it is easier to see than an angle."""
     if alignment.height_m is None or alignment.tilt_rad is None:
         return ""
-    return f" ({alignment.height_m * math.tan(alignment.tilt_rad) * CM_PER_M:.0f} cm on the floor)"
+    return f" ({cm(alignment.height_m * math.tan(alignment.tilt_rad), 0)} cm on the floor)"
 
 
-def alignment_table(lab: AlignedLab) -> Table:
+def alignment_table(lab: AlignedLab) -> Rows:
     """Return a table with one row per camera: green if the spread is under 5 cm, else red."""
-    table = Table(
-        title="Alignment of the cameras", title_justify="left", title_style="bold", box=None, pad_edge=False
-    )
-    table.add_column("camera", overflow="fold")
-    for name in ("markers", "spread cm", "tilt deg"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("what to do", overflow="fold")
+    cells: list[list[str | Text]] = []
     for alignment in lab.alignments:
         colour = {None: "", True: _GOOD, False: _BAD}[alignment.level]
-        spread = "-" if alignment.spread_m is None else f"{alignment.spread_m * CM_PER_M:.1f}"
-        total = len(alignment.floor_markers) + len(alignment.raised_markers)
-        count = f"{len(alignment.floor_markers)} of {total}" if alignment.raised_markers else str(total)
-        # As Text: rich must not read names from a log as its markup.
-        table.add_row(
-            Text(alignment.camera),
-            count,
-            Text(spread, style=colour),
-            _tilt(alignment),
-            Text(advise(alignment), style=colour),
-        )
-    return table
+        used = len(alignment.floor_markers)
+        total = used + len(alignment.raised_markers)
+        count = f"{used} of {total}" if alignment.raised_markers else str(total)
+        spread, advice = Text(cm(alignment.spread_m, 1), style=colour), Text(advise(alignment), style=colour)
+        cells.append([alignment.camera, count, spread, _tilt(alignment), advice])
+    columns = ("camera", ">markers", ">spread cm", ">tilt deg", "what to do")
+    return Rows("Alignment of the cameras", columns, cells)
 
 
 def _tilt(one: Alignment) -> str:
@@ -120,9 +109,9 @@ def coverage_lines(lab: AlignedLab) -> list[tuple[str, bool]]:
 
 def _floor_lines(coverage: FloorCoverage) -> list[tuple[str, bool]]:
     floor_m2 = coverage.floor.width_m * coverage.floor.depth_m
-    size = f"a marker of {coverage.diagonal_m / math.sqrt(2) * CM_PER_M:.0f} cm"
+    size = f"a marker of {cm(coverage.diagonal_m / math.sqrt(2), 0)} cm"
     if coverage.height_m:
-        size += f", {coverage.height_m * CM_PER_M:.0f} cm above the floor,"
+        size += f", {cm(coverage.height_m, 0)} cm above the floor,"
     return [
         _patch_line(coverage.unseen, floor_m2, "every part of the floor is in an image", "in no image"),
         _patch_line(
@@ -147,13 +136,11 @@ def _patch_line(patches: Sequence[Patch], floor_m2: float, good: str, bad: str) 
 
 def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[str, bool]:
     names, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
-    needed = f"a marker needs {diagonal_m * CM_PER_M:.0f} cm, its diagonal"
-    width_cm = overlap.width_m * CM_PER_M
+    needed = f"a marker needs {cm(diagonal_m, 0)} cm, its diagonal"
     if overlap.width_m >= diagonal_m:
-        return f"{names} overlap by {width_cm:.0f} cm or more. This is enough: {needed}", True
-    fault = (
-        f"overlap by only {width_cm:.0f} cm" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
-    )
+        return f"{names} overlap by {cm(overlap.width_m, 0)} cm or more. This is enough: {needed}", True
+    gap = f"leave a gap of {cm(-overlap.width_m, 0)} cm"
+    fault = f"overlap by only {cm(overlap.width_m, 0)} cm" if overlap.width_m > 0 else gap
     end = "neither image shows all of a marker between them"
     position = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
     return f"{names} {fault}{position}: {needed}; {end}", False

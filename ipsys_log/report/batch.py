@@ -8,33 +8,33 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
+from rich.text import Text
 
 from ipsys_log.batch.tasks import LogResult
 from ipsys_log.exchange.parquet_rows import write_rows
 from ipsys_log.plain_text import plain_text
-from ipsys_log.report.tables import name_cell, plain_table
+from ipsys_log.report.rows import Rows, counted
 
 # A longer list is counted by state.
 _MOST_LISTED = 20
 _MOST_LINES = 30
 
 
-def batch_table(results: Sequence[LogResult]) -> Table:
+def batch_table(results: Sequence[LogResult]) -> Rows:
     """Return a table with a row for each log; for many logs, with a row for each state."""
+    title = counted(len(results), "log")
     if len(results) > _MOST_LISTED:
-        table = plain_table(f"{len(results)} logs", ("state",), ("logs", "messages"))
-        for state, count in Counter(result.state for result in results).most_common():
-            messages = sum(result.messages for result in results if result.state == state)
-            table.add_row(state, str(count), str(messages))
-        return table
-    table = plain_table(f"{len(results)} logs" if len(results) != 1 else "1 log", ("log", "state", "runs"))
-    table.add_column("messages", justify="right", no_wrap=True)
+        messages: Counter[str] = Counter()
+        for result in results:
+            messages[result.state] += result.messages
+        counts = Counter(result.state for result in results).most_common()
+        cells = [[state, str(count), str(messages[state])] for state, count in counts]
+        return Rows(title, ("state", ">logs", ">messages"), cells)
+    rows = []
     for result in results:
-        style = None if result.good else "red"
-        runs = name_cell(", ".join(result.runs) or "-")
-        table.add_row(name_cell(result.log), result.state, runs, str(result.messages), style=style)
-    return table
+        texts = (result.log, result.state, ", ".join(result.runs) or "-", str(result.messages))
+        rows.append([Text(plain_text(text), style="" if result.good else "red") for text in texts])
+    return Rows(title, ("log", "state", "runs", ">messages"), rows)
 
 
 def failure_lines(results: Sequence[LogResult]) -> Iterator[str]:
@@ -75,7 +75,6 @@ def write_results(path: Path, results: Sequence[LogResult]) -> None:
         "messages": "int64",
         "trace": "string",
         "pieces": "int64",
-        "lost_attempts": "int64",
         "derived": "string",
     }
     rows = ({name: None if value == "" else value for name, value in asdict(one).items()} for one in results)

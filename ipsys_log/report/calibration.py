@@ -7,31 +7,24 @@ import re
 from collections import Counter
 from typing import Any
 
-from rich.table import Table
-
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.calibration.image_selection import ExcludedSighting
-from ipsys_log.units import MM_PER_M
+from ipsys_log.report.rows import Rows, counted, mm
 
 _SHOWN_DROPPED = 6
 
 
-def calibration_table(found: CalibrationResult) -> Table:
+def calibration_table(found: CalibrationResult) -> Rows:
     """Return a table of the intrinsics with their standard deviations."""
-    title = f"{found.camera}: {found.lens.distortion_model}, {found.lens.width} x {found.lens.height} px"
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    table.add_column("", no_wrap=True)
-    for name in ("value", "+- 1 sigma", ""):
-        table.add_column(name, justify="left" if not name else "right", no_wrap=True)
+    cells = []
     for n, name in enumerate(found.names):
         value, sigma = float(found.values[n]), float(found.sigmas[n])
-        digits = 2 if n < 4 else 5
-        note = "" if n >= 4 else "px"
-        if n == 1 and found.square:
-            note = "px, equal to fx: square pixels"
+        digits, unit = (2, "px") if n < 4 else (5, "")
+        note = "px, equal to fx: square pixels" if n == 1 and found.square else unit
         spread = f"{sigma:.{digits}f}" if sigma > 0 else "not fitted"
-        table.add_row(name, f"{value:.{digits}f}", spread, note)
-    return table
+        cells.append([name, f"{value:.{digits}f}", spread, note])
+    title = f"{found.camera}: {found.lens.distortion_model}, {found.lens.width} x {found.lens.height} px"
+    return Rows(title, ("", ">value", ">+- 1 sigma", ""), cells)
 
 
 def calibration_lines(found: CalibrationResult) -> list[str]:
@@ -40,7 +33,7 @@ def calibration_lines(found: CalibrationResult) -> list[str]:
     counts += [f"{len(found.dropped)} bad"] if found.dropped else []
     counts += [f"{len(found.spare)} not needed"] if found.spare else []
     bending = " and ".join(
-        f"{MM_PER_M * value:.2f} +- {MM_PER_M * sigma:.2f} mm in {axis}"
+        f"{mm(value, 2)} +- {mm(sigma, 2)} mm in {axis}"
         for axis, value, sigma in zip("xy", found.bending_m, found.bending_sigma_m, strict=True)
     )
     lines = [
@@ -53,8 +46,7 @@ def calibration_lines(found: CalibrationResult) -> list[str]:
         f"bending of the board: {bending}",
     ]
     if found.outlier_corners:
-        corners = "corner" if found.outlier_corners == 1 else "corners"
-        lines.append(f"excluded: {found.outlier_corners} single {corners} with a large error")
+        lines.append(f"excluded: {counted(found.outlier_corners, 'single corner')} with a large error")
     return lines + _dropped_lines(found.dropped, "excluded") + _dropped_lines(found.unseen, "board not found")
 
 

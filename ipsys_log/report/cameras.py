@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.differences import Comparison
@@ -20,6 +19,8 @@ from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom, RecordedFile
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
+from ipsys_log.plain_text import plain_text
+from ipsys_log.report.rows import Rows, cm, ms, percent
 from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 
 # After this time, the measured growth of a log is better than the estimate.
@@ -70,19 +71,17 @@ class LiveStatus:
         """The last check of each camera."""
         return self._monitor.checks
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Handle one recorded message."""
         self._announce(message)
         self._monitor(message)
-        if message is None:
-            return
         begin_ns, end_ns = self._span_ns or (message.log_time_ns, message.log_time_ns)
         self._span_ns = min(begin_ns, message.log_time_ns), max(end_ns, message.log_time_ns)
         self._overlap(message)
         if isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
 
-    def _announce(self, message: Message | None) -> None:
+    def _announce(self, message: Message) -> None:
         """Report the recording as soon as the file has grown by the first frame."""
         file = self._open_log()
         if self._say is None or file is None:
@@ -90,7 +89,7 @@ class LiveStatus:
         if self._size_with_frame and file.size >= self._size_with_frame:
             self._say(f"recording into {self._target}; Ctrl-C to end")
             self._say = None
-        elif not self._size_with_frame and message is not None:
+        elif not self._size_with_frame:
             frame = message.payload
             if isinstance(frame, (CompressedImage, CompressedVideo)):
                 self._size_with_frame = file.size + len(frame.data)
@@ -109,7 +108,7 @@ class LiveStatus:
         now_s = self._now_s()
         for name, state in self._states.items():
             self._rates[name] = self._rate(name, state, now_s)
-        parts: list[Table | Text] = [cameras_table(self._states, self._monitor.checks, self._rates)]
+        parts: list[Rows | Text] = [cameras_table(self._states, self._monitor.checks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
         parts += [Text(line) for line in self._overlap.lines()]
@@ -166,26 +165,24 @@ class LiveStatus:
         ]
 
 
-def robots_table(tracks: Mapping[str, Track]) -> Table:
+def robots_table(tracks: Mapping[str, Track]) -> Rows:
     """Return a table of the robots' positions: named robots first, and only as many as fit into a window."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("robot", "x cm", "y cm", "z cm", "heading", "cameras"):
-        table.add_column(heading, justify="left" if heading in ("robot", "cameras") else "right")
     order = sorted(tracks.items(), key=lambda item: (item[0] == f"marker_{item[1].id}", item[1].id))
+    cells = []
     for name, track in order[:_MOST_ROBOTS]:
         heading = "-" if track.heading_rad is None else f"{degrees(track.heading_rad):.0f} deg"
-        position_cm = (f"{CM_PER_M * value:.1f}" for value in (track.x_m, track.y_m, track.z_m))
-        table.add_row(name, *position_cm, heading, ", ".join(track.cameras))
+        position = (cm(value_m, 1) for value_m in (track.x_m, track.y_m, track.z_m))
+        cells.append([name, *position, heading, ", ".join(track.cameras)])
     if len(order) > _MOST_ROBOTS:
-        table.add_row(f"and {len(order) - _MOST_ROBOTS} more")
-    return table
+        cells.append([f"and {len(order) - _MOST_ROBOTS} more"])
+    return Rows("", ("robot", ">x cm", ">y cm", ">z cm", ">heading", "cameras"), cells)
 
 
 def cameras_table(
     states: Mapping[str, CameraState],
     checks: Mapping[str, FrameCheck],
     rates: Mapping[str, tuple[float, float]],
-) -> Table:
+) -> Rows:
     """Return a table with one row per camera, at most 80 columns wide.
 
     Parameters
@@ -193,26 +190,23 @@ def cameras_table(
     states, checks : states and last checks of the cameras, by name.
     rates : frames and MB per second, by name.
     """
-    table = Table(box=None, pad_edge=False)
-    for heading in ("camera", "frames", "Hz", "MB/s", "drops", "delay", "light", "sharp", "markers"):
-        table.add_column(heading, justify="left" if heading in ("camera", "markers") else "right")
+    cells: list[list[str | Text]] = []
     for name, state in states.items():
         check = checks.get(name)
         rate_hz, mb_s = rates.get(name, (0.0, 0.0))
-        delay = "-" if state.delay_s is None else f"{1e3 * state.delay_s:.0f} ms"
+        delay = "-" if state.delay_s is None else f"{ms(state.delay_s, 0)} ms"
         drops = state.dropped + state.missed
-        table.add_row(
+        row: list[str | Text] = [
             name if state.up or state.finished else Text(f"{name} (lost)", style="red"),
-            str(state.frames),
-            f"{rate_hz:.1f}",
-            f"{mb_s:.1f}",
+            *(str(state.frames), f"{rate_hz:.1f}", f"{mb_s:.1f}"),
             Text(str(drops), style="red" if drops else ""),
             delay,
-            f"{check.brightness:.0f}" if check else "-",
-            f"{100 * check.sharpness:.0f} %" if check else "-",
-            _markers(check) if check else "-",
-        )
-    return table
+        ]
+        if check:
+            row += [f"{check.brightness:.0f}", percent(check.sharpness), _markers(check)]
+        cells.append(row if check else [*row, "-", "-", "-"])
+    columns = ("camera", ">frames", ">Hz", ">MB/s", ">drops", ">delay", ">light", ">sharp", "markers")
+    return Rows("", columns, cells)
 
 
 def _markers(check: FrameCheck) -> Text:
@@ -224,33 +218,23 @@ def _markers(check: FrameCheck) -> Text:
     return Text(", ").join([*ids[:_MOST_IDS], *more]) if ids else Text("none")
 
 
-def latency_table(steps: Mapping[str, Percentiles]) -> Group:
+def latency_table(steps: Mapping[str, Percentiles]) -> Rows:
     """Return a table of the durations of the steps, in ms."""
-    table = Table(box=None, pad_edge=False, title="Duration of each step in ms", title_justify="left")
-    table.add_column("step")
-    for heading in ("median", "90 %", "99 %", "longest"):
-        table.add_column(heading, justify="right")
-    for step, percentiles in steps.items():
-        table.add_row(step, *(f"{1e3 * value:.1f}" for value in asdict(percentiles).values()))
-    return Group(table, Text("total: from the arrival of a frame to its position"))
+    columns = ("step", ">median", ">90 %", ">99 %", ">longest")
+    cells = [[step, *map(ms, asdict(percentiles).values())] for step, percentiles in steps.items()]
+    note = "total: from the arrival of a frame to its position"
+    return Rows("Duration of each step in ms", columns, cells, note)
 
 
-def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Table:
+def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Rows:
     """Return a table with one row per channel; ``sides`` are the headings of the two compared sides."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("channel", *sides, "same", "RMS diff", "max diff"):
-        table.add_column(heading, justify="left" if heading == "channel" else "right")
-    for comparison in found:
-        style = "" if comparison.equal else "red"
-        table.add_row(
-            Text(comparison.topic.removeprefix("/runs/"), style=style),
-            str(comparison.left),
-            str(comparison.right),
-            _same_text(comparison),
-            _distance(comparison.rms, comparison.unit),
-            _distance(comparison.greatest, comparison.unit),
-        )
-    return table
+    cells: list[list[str | Text]] = []
+    for one in found:
+        topic = Text(plain_text(one.topic.removeprefix("/runs/")), style="" if one.equal else "red")
+        distances = (_distance(value, one.unit) for value in (one.rms, one.greatest))
+        cells.append([topic, str(one.left), str(one.right), _same_text(one), *distances])
+    columns = ("channel", *(f">{side}" for side in sides), ">same", ">RMS diff", ">max diff")
+    return Rows("", columns, cells)
 
 
 def _same_text(comparison: Comparison) -> str:

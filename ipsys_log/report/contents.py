@@ -8,7 +8,6 @@ from dataclasses import asdict, replace
 from statistics import fmean, median
 from typing import Any
 
-from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
@@ -23,11 +22,12 @@ from ipsys_log.messages import CameraCalibration, Run
 from ipsys_log.messages.channels import POSITIONS, RUN_EVENTS
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.plain_text import plain_text
+from ipsys_log.report.rows import Rows, mm, name_cell, percent
 from ipsys_log.runs.frame_times import channel_times
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import recorded_stages
 from ipsys_log.survey.from_log import FinishedLog
-from ipsys_log.units import MM_PER_M, NS_PER_S, format_bytes, format_time
+from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 
 def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
@@ -47,23 +47,17 @@ def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
     ]
 
 
-def intervals_table(found: list[dict[str, Any]]) -> Table:
+def intervals_table(found: list[dict[str, Any]]) -> Rows:
     """Return the stationary intervals of :func:`intervals_json` as a table."""
-    table = Table(
-        title="Stationary intervals", title_justify="left", title_style="bold", box=None, pad_edge=False
-    )
-    for name in ("place", "marker", "time s"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("UTC", no_wrap=True)
-    table.add_column("for s", justify="right", no_wrap=True)
-    table.add_column("seen by", overflow="fold")
-    table.add_column("measured as", overflow="fold")
-    for row in found:
-        table.add_row(
+    columns = (">place", ">marker", ">time s", "UTC", ">for s", "seen by", "measured as")
+    cells = [
+        [
             str(row["place"]), str(row["marker"]), f"{row['time_s']:.1f}", row["start"][11:19],
             f"{row['seconds']:.1f}", ", ".join(row["cameras"]), ", ".join(row["measured"]) or "-",
-        )  # fmt: skip
-    return table
+        ]
+        for row in found
+    ]  # fmt: skip
+    return Rows("Stationary intervals", columns, cells)
 
 
 # More cameras than these share one row, and more pairs of cameras than these are not shown.
@@ -216,90 +210,72 @@ def _overrides(run: Run) -> list[str]:
     return [*rig, *(f"lens {lens.camera}" for lens in run.lenses)]
 
 
-def _table(title: str, *columns: str, right: tuple[str, ...] = ()) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
-    return table
-
-
-def contents_tables(found: dict[str, Any]) -> list[Table]:
+def contents_tables(found: dict[str, Any]) -> list[Rows]:
     """Return the contents of :func:`contents_json` as tables, in 80 columns if the names are short enough."""
-    files = _table("Files", "path", "size", "messages", "chunks", right=("size", "messages", "chunks"))
-    for file in found["files"]:
-        files.add_row(file["path"], format_bytes(file["bytes"]), str(file["messages"]), str(file["chunks"]))
-    files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s" if found["start"] else "no messages"
-    files.caption_justify = "left"
-    tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
-    tables += [_remarks_table(found)] if found["calibration_remarks"] else []
-    tables += [_contradictions_table(found["contradictions"])] if found["contradictions"] else []
+    files = [
+        [file["path"], format_bytes(file["bytes"]), str(file["messages"]), str(file["chunks"])]
+        for file in found["files"]
+    ]
+    span = f"{found['start']} UTC, {found['duration_s']:.1f} s" if found["start"] else "no messages"
+    tables = [Rows("Files", ("path", ">size", ">messages", ">chunks"), files, span)]
+    tables += [_cameras_table(found)] if found["cameras"] else []
+    tables.append(_channels_table(found))
+    for title, name, key in (
+        ("Remarks on calibrations", "camera", "calibration_remarks"),
+        ("Contradicted inputs", "run", "contradictions"),
+    ):
+        remarks = [[row[name], Text(plain_text(row["text"]), style="yellow")] for row in found[key]]
+        tables += [Rows(title, (name, "remark"), remarks)] if remarks else []
     tables += [_overlap_table(found["overlap"])] if found["overlap"] else []
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 
 
-def _cameras_table(found: dict[str, Any]) -> Table:
-    table = _table("Cameras", "camera", "frames", "Hz", "calibration", right=("frames", "Hz"))
+def _cameras_table(found: dict[str, Any]) -> Rows:
+    cells = []
     for camera, row in found["cameras"].items():
         channel, lens = found["channels"][row["images"]], row["lens"]
         text = Text("missing", style="yellow")
         if lens is not None:
-            text = Text(plain_text(f"{lens['width']} x {lens['height']} px, {lens['model']}"))
-        table.add_row(camera, str(channel["messages"]), _rate(channel), text)
-    return table
+            text = name_cell(f"{lens['width']} x {lens['height']} px, {lens['model']}")
+        cells.append([camera, str(channel["messages"]), _rate(channel), text])
+    return Rows("Cameras", ("camera", ">frames", ">Hz", "calibration"), cells)
 
 
-def _remarks_table(found: dict[str, Any]) -> Table:
-    table = _table("Remarks on calibrations", "camera", "remark")
-    for row in found["calibration_remarks"]:
-        table.add_row(row["camera"], Text(plain_text(row["text"]), style="yellow"))
-    return table
-
-
-def _contradictions_table(rows: list[dict[str, str]]) -> Table:
-    table = _table("Contradicted inputs", "run", "remark")
-    for row in rows:
-        table.add_row(row["run"], Text(plain_text(row["text"]), style="yellow"))
-    return table
-
-
-def _overlap_table(rows: list[dict[str, Any]]) -> Table:
+def _overlap_table(rows: list[dict[str, Any]]) -> Rows:
     """Return a table of the difference of positions of the same robot and instant, by two cameras."""
-    numbers = ("count", "median mm", "p95 mm", "in 95 % region")
-    table = _table(f"Disagreement of cameras, run {rows[0]['run']}", "cameras", *numbers, right=numbers)
+    columns = ("cameras", ">count", ">median mm", ">p95 mm", ">in 95 % region")
     largest = sorted(rows, key=lambda row: -float(row["median_m"]))[:_MOST_PAIRS]
-    for row in (row for row in rows if row in largest):
-        within = "-" if row["within_95"] is None else f"{100 * row['within_95']:.0f} %"
-        lengths_mm = (f"{row[key] * MM_PER_M:.1f}" for key in ("median_m", "p95_m"))
-        table.add_row(" and ".join(row["cameras"]), str(row["count"]), *lengths_mm, within)
-    if len(rows) > len(largest):
-        table.caption = f"The other {len(rows) - len(largest)} pairs differ less. All pairs: --json"
-        table.caption_justify = "left"
-    return table
+    cells = [
+        [
+            " and ".join(row["cameras"]), str(row["count"]), mm(row["median_m"]), mm(row["p95_m"]),
+            percent(row["within_95"]),
+        ]
+        for row in rows
+        if row in largest
+    ]  # fmt: skip
+    others = len(rows) - len(largest)
+    note = f"The other {others} pairs differ less. All pairs: --json" if others else ""
+    return Rows(f"Disagreement of cameras, run {rows[0]['run']}", columns, cells, note)
 
 
-def _channels_table(found: dict[str, Any]) -> Table:
+def _channels_table(found: dict[str, Any]) -> Rows:
     """Return a table with one row per channel; below the name of a run, its channels have short names."""
-    numbers = ("count", "Hz", "gaps (longest)")
-    table = _table("Channels", "topic", *numbers, "schema", right=numbers)
-    for column in table.columns[:4]:
-        column.no_wrap = True
-    table.columns[4].overflow = "ellipsis"
     run = ""
     channels = _grouped(found["channels"])
+    cells: list[list[str | Text]] = []
     for topic, row in channels.items():
         within, _, rest = topic.removeprefix("/runs/").partition("/")
         if topic.startswith("/runs/") and rest:
             if within != run:
                 run = within
-                table.add_row(Text(plain_text(f"/runs/{run}/"), style="bold"))
+                cells.append([Text(plain_text(f"/runs/{run}/"), style="bold")])
             topic = f"  {rest}"  # noqa: PLW2901
         gaps = f"{row['gaps']} ({row['longest_gap_s']:.1f} s)" if row["gaps"] else ""
         schema = re.split(r"[./]", row["schema"] or "-")[-1]
-        table.add_row(topic, row.get("count") or str(row["messages"]), _rate(row), gaps, schema)
-    if len(channels) < len(found["channels"]):
-        table.caption = "*: all cameras, with their mean rate and the sum of gaps; each one: --json"
-        table.caption_justify = "left"
-    return table
+        cells.append([topic, row.get("count") or str(row["messages"]), _rate(row), gaps, schema])
+    has_groups = len(channels) < len(found["channels"])
+    note = "*: all cameras, with their mean rate and the sum of gaps; each one: --json" if has_groups else ""
+    return Rows("Channels", ("topic", ">count", ">Hz", ">gaps (longest)", "schema"), cells, note)
 
 
 def _grouped(channels: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -341,19 +317,16 @@ def _rate(channel: dict[str, Any]) -> str:
     return "" if channel["rate_hz"] is None else f"{channel['rate_hz']:.1f}"
 
 
-def runs_table(runs: list[dict[str, Any]]) -> Table:
+def runs_table(runs: list[dict[str, Any]]) -> Rows:
     """Return a table with one row per stage of a run, with its state if the state is known."""
     states = ["state"] if any("state" in run for run in runs) else []
-    columns = ("run", "stage", "from", "parameters", "count", "ipsys", *states)
-    table = _table("Runs", *columns, right=("count",))
+    cells = []
     for run in runs:
         parameters = [f"{key}={value}" for key, value in run["parameters"].items()]
         parameters += [f"other {name}" for name in run["overrides"]]
         count = sum(output["messages"] for output in run["outputs"])
-        sources = ", ".join(run["input_runs"]) or "-"
+        names = (run["run"], run["stage"], ", ".join(run["input_runs"]) or "-", ", ".join(parameters) or "-")
         version = run["fingerprint"].get("ipsys_log", "-")
-        state = [run["state"]] if states else []
-        table.add_row(
-            run["run"], run["stage"], sources, ", ".join(parameters) or "-", str(count), version, *state
-        )
-    return table
+        cells.append([*names, str(count), version, *([run["state"]] if states else [])])
+    columns = ("run", "stage", "from", "parameters", ">count", "ipsys", *states)
+    return Rows("Runs", columns, cells)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from ipsys_log.analysis.camera_moves import CameraState, MarkerMove, Move
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Motion
-from ipsys_log.report.tables import name_cell, plain_table, wrap_text
+from ipsys_log.report.rows import Rows, wrap_text
 from ipsys_log.survey.drift_reading import DriftReading
 from ipsys_log.units import MM_PER_M, format_time
 
@@ -86,18 +85,17 @@ def _split_text(motion: Motion) -> str:
     )
 
 
-def drift_table(reading: DriftReading) -> Table:
+def drift_table(reading: DriftReading) -> Rows:
     """Return a table with the mean shift of each floor map since the baseline, one row for each log."""
-    drift = reading.drift
-    cameras = sorted(drift.baselines)
-    title = f"Mean shift of the floor maps since {reading.names[0]}, in mm"
-    table = plain_table(title, ["log", "end (UTC)"], cameras)
+    cameras = sorted(reading.drift.baselines)
+    cells = []
     for name in reading.names:
-        states = {state.camera: state for state in drift.states if state.log == name}
+        states = {state.camera: state for state in reading.drift.states if state.log == name}
         if states:
             time = format_time(min(state.time_ns for state in states.values()))[:16]
-            table.add_row(name_cell(name), time, *(_cell(states.get(camera)) for camera in cameras))
-    return table
+            cells.append([name, time, *(_cell(states.get(camera)) for camera in cameras)])
+    title = f"Mean shift of the floor maps since {reading.names[0]}, in mm"
+    return Rows(title, ("log", "end (UTC)", *(f">{camera}" for camera in cameras)), cells)
 
 
 def _cell(state: CameraState | None) -> str:

@@ -76,7 +76,7 @@ def cross_validation_csv(findings: Findings) -> bytes:
             cells = [accuracy.model, row.camera or "all", row.against, str(row.error_2d.count)]
             for errors in (row.error_3d, row.error_2d):
                 cells += [_cm(getattr(errors, name) if errors else None) for name in _STATISTICS.values()]
-                cells.append(_cm(accuracy.rmse_m(row, errors)))
+                cells.append(_cm(accuracy.errors_of(row).rmse_m(errors)))
             cells += map(_cm, [None] * 3 if row.bias_m is None else row.bias_m.tolist())
             cells += ["" if v is None else f"{v:.4f}" for v in (row.within_68, row.within_95)]
             rows.append(cells)

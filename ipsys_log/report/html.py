@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, SUBSETS
 from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
-from ipsys_log.analysis.latency import Percentiles, latency_percentiles, step_times_s
+from ipsys_log.analysis.latency import latency_percentiles, step_times_s
 from ipsys_log.analysis.recording import CameraRecording, EventGroup, group_events, read_cameras
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
@@ -23,17 +23,18 @@ from ipsys_log.models.table import CORNER_MODELS, MODELS
 from ipsys_log.plain_text import plain_text, shell_words
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
-from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
+from ipsys_log.report.cameras import latency_table
+from ipsys_log.report.contents import runs_table, states_json
 from ipsys_log.report.figures import MOST_IN_LEGEND, style_axes
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.report.html_figures import new_figure, picture
 from ipsys_log.report.latency_figure import draw_shares, draw_steps
+from ipsys_log.report.rows import Rows
 from ipsys_log.report.styles import camera_styles, shorten
-from ipsys_log.report.tables import TRAJECTORY_COLUMNS, rows_of_run
+from ipsys_log.report.tables import advice_table, height_note, suspects_table, trajectory_table
 from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.select import has_corners
-from ipsys_log.runs.states import recorded_stages
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration, format_time
 
@@ -71,7 +72,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     )
     return environment.get_template("session.html").render(
         **_text_values(findings),
-        flat=html_sections.flat_rows(_measured(session, findings)),
+        flat=html_sections.weak_points_table(_measured(session, findings)),
         **_figure_values(findings),
         **_overlap(session, findings),
         **_tracks(session),
@@ -89,10 +90,10 @@ def _recording_values(session: Session) -> dict[str, Any]:
     return {
         "duration": format_duration((session.end_ns - start_ns) / NS_PER_S),
         "sizes": [(reader.path.name, format_bytes(reader.size)) for reader in session.readers],
-        "cameras": [_camera_row(session, camera) for camera in cameras],
-        "gaps": _gap_rows(cameras, start_ns),
+        "cameras": _cameras_table(session, cameras),
+        "gaps": _gaps_table(cameras, start_ns),
         "gap_count": sum(len(camera.gaps.lengths_s) for camera in cameras),
-        "events": [_event_row(group, start_ns) for group in events],
+        "events": _events_table(events, start_ns),
         "timeline_pictures": _timeline(session, cameras, events),
         **_latency(session),
     }
@@ -106,15 +107,17 @@ def _plain(value: Any) -> Any:
 
 
 def _text_values(findings: Findings) -> dict[str, Any]:
+    advice = findings.advice
     return {
         "head": html_sections.headline(findings) if findings.cameras else None,
-        "advice": html_sections.advice_rows(findings),
-        "models": html_sections.model_rows(findings),
-        "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
-        "told_note": HEIGHT_NOTE if any(map(uses_height, findings.models)) else "",
-        "suspects": html_sections.suspects(findings),
+        "advice": advice,
+        "advice_table": advice_table(advice) if advice else None,
+        "models": html_sections.models_table(findings),
+        "by_camera": [(camera, html_sections.models_table(findings, camera)) for camera in findings.cameras],
+        "told_note": height_note(findings.models),
+        "suspects": suspects_table(findings.accuracies, is_wide=True),
         "coverage": html_sections.coverage(findings),
-        "calibration": html_sections.calibration(findings),
+        "calibration": html_sections.calibration_table(findings),
     }
 
 
@@ -152,9 +155,12 @@ def _tracks(session: Session) -> dict[str, Any]:
     run = newest_run(session, TRACKS)
     return {
         "tracks_picture": html_figures.tracks_picture(session, run),
-        "trajectories": rows_of_run(run, read_trajectories(session, run)) if run is not None else [],
-        "trajectory_columns": TRAJECTORY_COLUMNS,
+        "trajectories": None if run is None else trajectory_table([_with_trajectories(session, run)]),
     }
+
+
+def _with_trajectories(session: Session, run: str) -> Accuracy:
+    return Accuracy(run, None, None, tuple(read_trajectories(session, run)))
 
 
 def _commands(session: Session, findings: Findings) -> dict[str, str]:
@@ -183,23 +189,18 @@ def _provenance(session: Session, findings: Findings) -> dict[str, Any]:
         if findings.accuracies
         else records
     )
+    names = {(run.run, run.stage) for run in runs}
     newest = next((run for run in reversed(runs) if writes(run, EVALUATION)), runs[-1] if runs else None)
     return {
         "logs": [path.name for path in session.paths],
         "lab": findings.rig.name if findings.rig else "",
         "recorded": _span(format_time(session.start_ns)[:16], format_time(session.end_ns)[:16]),
-        "runs": _with_states(session, runs),
+        "runs": runs_table([row for row in states_json(session) if (row["run"], row["stage"]) in names]),
         "fingerprint": dict(sorted(newest.fingerprint.items())) if newest else {},
         "folds": FOLDS,
         "repeats": REPEATS,
         "subsets": SUBSETS,
     }
-
-
-def _with_states(session: Session, runs: Sequence[Run]) -> list[tuple[Run, str]]:
-    """Return runs, each with its state."""
-    states = {(stage.run.run, stage.run.stage): stage.state for stage in recorded_stages(session)}
-    return [(run, states.get((run.run, run.stage), "")) for run in runs]
 
 
 def _span(start: str, end: str) -> str:
@@ -222,18 +223,16 @@ def _sources(records: Sequence[Run], names: Sequence[str]) -> list[Run]:
     return [record for record in records if record.run in collected and record.stage not in later]
 
 
-def _camera_row(session: Session, recorded: CameraRecording) -> dict[str, str]:
-    lens = _size(session, recorded.camera)
-    rate_hz = recorded.gaps.rate_hz
-    missing_s = sum(recorded.gaps.lengths_s)
-    return {
-        "camera": recorded.camera,
-        "frames": str(recorded.frames),
-        "rate": "–" if rate_hz is None else f"{rate_hz:.1f}",
-        "lens": lens,
-        "gaps": str(len(recorded.gaps.lengths_s)),
-        "missing": f"{missing_s:.1f}" if missing_s else "0",
-    }
+def _cameras_table(session: Session, cameras: Sequence[CameraRecording]) -> Rows:
+    columns = ("camera", ">frames", ">rate in Hz", ">gaps", ">length of all gaps in s", "intrinsics")
+    cells = []
+    for one in cameras:
+        rate_hz, lengths_s = one.gaps.rate_hz, one.gaps.lengths_s
+        rate = "-" if rate_hz is None else f"{rate_hz:.1f}"
+        missing = f"{sum(lengths_s):.1f}" if lengths_s else "0"
+        numbers = (str(one.frames), rate, str(len(lengths_s)), missing)
+        cells.append([one.camera, *numbers, _size(session, one.camera)])
+    return Rows("", columns, cells)
 
 
 def _size(session: Session, camera: str) -> str:
@@ -243,30 +242,26 @@ def _size(session: Session, camera: str) -> str:
     return f"{lens.width} x {lens.height} px, {lens.distortion_model}"
 
 
-def _gap_rows(cameras: Sequence[CameraRecording], start_ns: int) -> list[dict[str, str]]:
+def _gaps_table(cameras: Sequence[CameraRecording], start_ns: int) -> Rows:
     """Return the longest gaps of all cameras."""
     gaps = [
         (length_s, camera.camera, (begin_ns - start_ns) / NS_PER_S)
         for camera in cameras
         for begin_ns, length_s in zip(camera.gaps.starts_ns, camera.gaps.lengths_s, strict=True)
     ]
-    return [
-        {"camera": camera, "start": f"{begin_s:.1f}", "length": f"{length_s:.2f}"}
-        for length_s, camera, begin_s in sorted(gaps, key=lambda gap: (-gap[0], gap[2]))[:_MOST_GAPS]
-    ]
+    longest = sorted(gaps, key=lambda gap: (-gap[0], gap[2]))[:_MOST_GAPS]
+    cells = [(camera, f"{begin_s:.1f}", f"{length_s:.2f}") for length_s, camera, begin_s in longest]
+    return Rows("", ("gap of camera", ">start in s", ">length in s"), cells)
 
 
-def _event_row(group: EventGroup, start_ns: int) -> dict[str, str]:
-    first_s, last_s = ((time_ns - start_ns) / NS_PER_S for time_ns in (group.times_ns[0], group.times_ns[-1]))
-    return {
-        "kind": group.kind,
-        "camera": group.camera or "–",
-        "run": group.run or "–",
-        "count": str(len(group.times_ns)),
-        "first": f"{first_s:.1f}",
-        "last": f"{last_s:.1f}",
-        "text": group.text,
-    }
+def _events_table(events: Sequence[EventGroup], start_ns: int) -> Rows:
+    columns = ("event", "camera", "run", ">count", ">first in s", ">last in s", "last text")
+    cells = []
+    for group in events:
+        ends = (f"{(group.times_ns[end] - start_ns) / NS_PER_S:.1f}" for end in (0, -1))
+        names = (group.kind, group.camera or "-", group.run or "-")
+        cells.append((*names, str(len(group.times_ns)), *ends, group.text))
+    return Rows("", columns, cells)
 
 
 def _timeline(
@@ -312,21 +307,16 @@ def _latency(session: Session) -> dict[str, Any]:
     entries = session.payloads(session.topics(LATENCY))
     times_s = step_times_s(entries) if entries else {}
     if not entries:
-        return {"latency": [], "latency_count": 0, "latency_pictures": []}
+        return {"latency": None, "latency_count": 0, "latency_pictures": []}
     shares, axes = new_figure(3.4)
     draw_shares(axes, np.sort(times_s["total"]) * _MS_PER_S, is_narrow=True)
     steps, step_axes = new_figure(3.4)
     draw_steps(step_axes, times_s)
     return {
-        "latency": [_latency_row(step, one) for step, one in latency_percentiles(times_s).items()],
+        "latency": latency_table(latency_percentiles(times_s)),
         "latency_count": len(entries),
         "latency_pictures": [
             picture(shares, "Share of the positions within a latency, from the arrival of a frame"),
             picture(steps, "Duration of each step: median and 99th percentile"),
         ],
     }
-
-
-def _latency_row(step: str, found: Percentiles) -> tuple[str, list[str]]:
-    values_s = (found.median_s, found.p90_s, found.p99_s, found.max_s)
-    return step, [f"{value_s * _MS_PER_S:.1f}" for value_s in values_s]

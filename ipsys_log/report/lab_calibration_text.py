@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from rich.table import Table
-
 from ipsys_log.analysis.expected_error import FloorGap
+from ipsys_log.report.rows import Rows, cm, counted, mm
 from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.units import CM_PER_M, MM_PER_M
 
@@ -24,40 +23,35 @@ def lab_headline(lab: LabCalibration) -> Iterator[str]:
     elif lab.missing:
         yield f"Not enough: camera {', '.join(lab.missing)} has no model."
     elif lab.is_enough:
-        yield f"Enough: the expected mean error of each camera is {_mm(worst.mean_m)} mm or less."
+        yield f"Enough: the expected mean error of each camera is {mm(worst.mean_m)} mm or less."
     else:
         yield (
-            f"Not enough: the expected mean error of {worst.camera} is {_mm(worst.mean_m)} mm; the goal is "
+            f"Not enough: the expected mean error of {worst.camera} is {mm(worst.mean_m)} mm; the goal is "
             f"{lab.goal_m * MM_PER_M:g} mm."
         )
     if lab.faults:
         count = len(lab.faults)
-        yield f"{count} probable fault{'s' if count > 1 else ''} of the observations:"
+        yield f"{counted(count, 'probable fault')} of the observations:"
         for fault in lab.faults[:_MOST_FAULTS]:
             yield f"  {fault.text}"
         if count > _MOST_FAULTS:
             yield f"  and {count - _MOST_FAULTS} more; --json prints all"
 
 
-def lab_table(lab: LabCalibration) -> Table:
+def lab_table(lab: LabCalibration) -> Rows:
     """Return a table with the expected errors, coverage and residuals of each camera."""
-    title = f"Expected 2D error over the floor, {lab.height_m * CM_PER_M:g} cm above it, by run {lab.run}"
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    table.add_column("camera", overflow="fold")
-    for name in ("mean mm", "p95 mm", "covered", "points", "drive", "residual px", "clock ms", "row us"):
-        table.add_column(name, justify="right", no_wrap=True)
+    cells = []
     for camera in lab.cameras:
         seen = len(camera.expected.errors_m)
-        points, moving = camera.sightings
-        table.add_row(
-            camera.camera,
-            *((_mm(camera.mean_m), _mm(camera.p95_m), f"{camera.covered:.0%}") if seen else ("-", "-", "-")),
-            str(points), str(moving), f"{camera.rmse_px:.3f}",
-            "-" if camera.clock_s is None else f"{camera.clock_s * 1000:+.2f}",
-            "-" if camera.row_time_s is None else f"{camera.row_time_s * 1e6:.1f}",
-        )  # fmt: skip
-    table.add_row("all", _mm(lab.mean_m), _mm(lab.p95_m), "", str(len(lab.points_m)))
-    return table
+        expected = (mm(camera.mean_m), mm(camera.p95_m), f"{camera.covered:.0%}") if seen else ("-", "-", "-")
+        clock = "-" if camera.clock_s is None else f"{camera.clock_s * 1000:+.2f}"
+        row_time = "-" if camera.row_time_s is None else f"{camera.row_time_s * 1e6:.1f}"
+        counts = map(str, camera.sightings)
+        cells.append([camera.camera, *expected, *counts, f"{camera.rmse_px:.3f}", clock, row_time])
+    cells.append(["all", mm(lab.mean_m), mm(lab.p95_m), "", str(len(lab.points_m))])
+    names = ("mean mm", "p95 mm", "covered", "points", "drive", "residual px", "clock ms", "row us")
+    title = f"Expected 2D error over the floor, {lab.height_m * CM_PER_M:g} cm above it, by run {lab.run}"
+    return Rows(title, ("camera", *(f">{name}" for name in names)), cells)
 
 
 def lab_advice(lab: LabCalibration) -> Iterator[str]:
@@ -68,22 +62,20 @@ def lab_advice(lab: LabCalibration) -> Iterator[str]:
     if lab.tape_advice:
         yield lab.tape_advice
     if lab.gap is not None:
-        low, high = (
-            [f"{value * CM_PER_M:.0f}" for value in corner_m] for corner_m in (lab.gap.low_m, lab.gap.high_m)
-        )
+        low, high = ([cm(value_m, 0) for value_m in corner_m] for corner_m in (lab.gap.low_m, lab.gap.high_m))
         yield (
             f"Drive a robot through x {low[0]} to {high[0]}, y {low[1]} to {high[1]} cm: camera "
             f"{lab.gap.camera} saw no marker there."
         )
     for number, point in enumerate(lab.points):
-        x_cm, y_cm = (f"{value * CM_PER_M:.0f}" for value in point.point_m)
+        x_cm, y_cm = (cm(value_m, 0) for value_m in point.point_m)
         tapes = ", ".join(
-            f"{p.name} {math.hypot(point.point_m[0] - p.x_m, point.point_m[1] - p.y_m) * CM_PER_M:.0f}"
+            f"{p.name} {cm(math.hypot(point.point_m[0] - p.x_m, point.point_m[1] - p.y_m), 0)}"
             for p in lab.rig.reference_points
         )
         yield (
             f"{'Tape' if number == 0 else 'Then'} a point near x {x_cm}, y {y_cm} cm ({tapes}), seen by "
-            f"{', '.join(point.cameras)}: {_mm(point.mean_after_m)} mm."
+            f"{', '.join(point.cameras)}: {mm(point.mean_after_m)} mm."
         )
 
 
@@ -146,7 +138,3 @@ def _gap_json(gap: FloorGap) -> dict[str, Any]:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _mm(length_m: float) -> str:
-    return f"{length_m * MM_PER_M:.1f}"

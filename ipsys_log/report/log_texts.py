@@ -12,20 +12,18 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.channel_sizes import ChannelSize
 from ipsys_log.log.contents import RawMessage, StoredChannel
 from ipsys_log.messages import Message
 from ipsys_log.plain_text import plain_text
+from ipsys_log.report.rows import Rows, counted, percent
 from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
 from ipsys_log.units import format_bytes, format_time
 
 _LONGEST_VALUE = 200
 _TIME = "timestamp"  # every payload repeats its publish time
-_NUMBERS = ("messages", "payload", "in the file", "share")
 _MOST_LINES = 30
 
 
@@ -71,21 +69,19 @@ def sizes_json(path: str, file_bytes: int, sizes: Sequence[ChannelSize]) -> dict
     }
 
 
-def sizes_table(sizes: dict[str, Any]) -> Table:
+def sizes_table(sizes: dict[str, Any]) -> Rows:
     """Return the sizes of :func:`sizes_json` as a table, in 80 columns if the topics are short enough."""
-    title = f"{plain_text(sizes['path'])}, {format_bytes(sizes['bytes'])}"
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    table.add_column("topic", overflow="fold")
-    for name in _NUMBERS:
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in sizes["channels"]:
-        table.add_row(
-            Text(plain_text(row["topic"])), str(row["messages"]), format_bytes(row["payload_bytes"]),
-            format_bytes(row["stored_bytes"]), _percent(row["share"]),
-        )  # fmt: skip
-    share = sizes["other_bytes"] / sizes["bytes"]
-    table.add_row("(definitions, indexes)", "", "", format_bytes(sizes["other_bytes"]), _percent(share))
-    return table
+    cells = [
+        [
+            row["topic"], str(row["messages"]), format_bytes(row["payload_bytes"]),
+            format_bytes(row["stored_bytes"]), percent(row["share"], 1),
+        ]
+        for row in sizes["channels"]
+    ]  # fmt: skip
+    other, share = format_bytes(sizes["other_bytes"]), sizes["other_bytes"] / sizes["bytes"]
+    cells.append(["(definitions, indexes)", "", "", other, percent(share, 1)])
+    columns = ("topic", ">messages", ">payload", ">in the file", ">share")
+    return Rows(f"{sizes['path']}, {format_bytes(sizes['bytes'])}", columns, cells)
 
 
 def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
@@ -160,10 +156,6 @@ def _short(key: str, value: Any) -> str:
     return f"{key}={text[:_LONGEST_VALUE]}"
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
-
-
 def _finding_json(finding: LogFinding) -> dict[str, Any]:
     return {key: value for key, value in asdict(finding).items() if value not in (None, "")}
 
@@ -177,7 +169,7 @@ def _answer(check: LogCheck) -> str:
     if fault is not None:
         return f"{check.state}: {plain_text(fault.text)}"
     number = len(check.remarks)
-    return SOUND if not number else f"readable, {number} remark{'s' if number > 1 else ''}"
+    return SOUND if not number else f"readable, {counted(number, 'remark')}"
 
 
 def _finding_line(finding: LogFinding) -> str:

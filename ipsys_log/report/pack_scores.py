@@ -7,7 +7,6 @@ from dataclasses import asdict
 from typing import Any
 
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION
@@ -15,8 +14,9 @@ from ipsys_log.plain_text import shell_words
 from ipsys_log.publish.packing import PackResult
 from ipsys_log.publish.scores import Score
 from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
-from ipsys_log.report.advice import HEIGHT_NOTE, label, uses_height
-from ipsys_log.report.tables import name_cell, plain_table, wrap_text
+from ipsys_log.report.advice import label
+from ipsys_log.report.rows import Rows, counted, name_cell, wrap_text
+from ipsys_log.report.tables import height_note
 from ipsys_log.units import format_bytes
 
 _HEADS = ("mean", "median", "p95", "RMSE")
@@ -28,7 +28,7 @@ def pack_text(result: PackResult) -> str:
     models = len({score.model for score in result.scores})
     return wrap_text(
         f"{result.path} written: {len(result.files)} files, {format_bytes(result.size)}, expected scores of "
-        f"{models} {'model' if models == 1 else 'models'}. To check it: "
+        f"{counted(models, 'model')}. To check it: "
         f"ipsys score {shell_words(result.path)}"
     )
 
@@ -44,7 +44,7 @@ def _comparison_lines(result: ScoreResult) -> Iterator[str]:
     if not result.comparisons:
         return
     models = len({comparison.stated.model for comparison in result.comparisons})
-    named = f"{models} {'model' if models == 1 else 'models'}"
+    named = counted(models, "model")
     title = name_cell(result.title).plain
     if not wrong:
         largest_mm = max(comparison.difference_mm or 0.0 for comparison in result.comparisons)
@@ -113,7 +113,7 @@ def ranked_scores(scores: Iterable[Score]) -> list[Score]:
     return sorted(rows, key=lambda score: score.mean_mm)
 
 
-def score_tables(result: ScoreResult) -> Iterator[Table]:
+def score_tables(result: ScoreResult) -> Iterator[Rows]:
     """Yield the table of a re-scoring: a row for each model, within 80 columns."""
     if result.comparisons:
         yield _comparison_table(result.comparisons)
@@ -121,52 +121,45 @@ def score_tables(result: ScoreResult) -> Iterator[Table]:
         yield _own_table(result)
 
 
-def _comparison_table(comparisons: Sequence[ScoreComparison]) -> Table:
+def _comparison_table(comparisons: Sequence[ScoreComparison]) -> Rows:
     """Return the repeated errors of each model, and the largest difference of all its figures."""
     ranked = ranked_scores(comparison.stated for comparison in comparisons)
-    table = plain_table(
-        f"Errors in mm, {_kind(ranked[0])}" if ranked else "Errors in mm",
-        ["model"],
-        [*_HEADS, "difference", "tolerance", "agrees"],
-    )
     by_key = {comparison.stated.key: comparison for comparison in comparisons}
+    cells = []
     for stated in ranked:
         own = [comparison for comparison in comparisons if comparison.stated.model == stated.model]
         computed = by_key[stated.key].computed
         differences = [comparison.difference_mm for comparison in own]
         known = [value_mm for value_mm in differences if value_mm is not None]
-        table.add_row(
-            name_cell(label(stated.model)),
-            *(["-"] * len(_HEADS) if computed is None else map(_two, computed.figures)),
-            _mm(max(known)) if len(known) == len(differences) else "-",
-            f"{stated.tolerance_mm:g}",
-            "yes" if all(comparison.as_stated for comparison in own) else "no",
+        cells.append(
+            [
+                label(stated.model),
+                *(["-"] * len(_HEADS) if computed is None else map(_two, computed.figures)),
+                _mm(max(known)) if len(known) == len(differences) else "-",
+                f"{stated.tolerance_mm:g}",
+                "yes" if all(comparison.as_stated for comparison in own) else "no",
+            ]
         )
-    _add_caption(table, ranked, _CAPTION)
-    return table
-
-
-def _add_caption(table: Table, scores: Iterable[Score], text: str = "") -> None:
-    """Add a text below a table, and the note on models that get heights."""
-    notes = [HEIGHT_NOTE] if any(uses_height(score.model) for score in scores) else []
-    lines = [*([text] if text else []), *notes]
-    if lines:
-        table.caption, table.caption_justify, table.caption_style = Text("\n".join(lines)), "left", ""
+    title = f"Errors in mm, {_kind(ranked[0])}" if ranked else "Errors in mm"
+    columns = ("model", *(f">{head}" for head in (*_HEADS, "difference", "tolerance", "agrees")))
+    note = f"{_CAPTION}\n{height_note(score.model for score in ranked)}"
+    return Rows(title, columns, cells, note)
 
 
 _CAPTION = "difference: the largest of all scores of a model, also held out and in 2D"
 
 
-def _own_table(result: ScoreResult) -> Table:
+def _own_table(result: ScoreResult) -> Rows:
     """Return the errors of the user's models beside the stated ones, the lowest mean first."""
     ranked = ranked_scores((*result.stated, *result.own))
     own = {score.model for score in result.own}
-    table = plain_table(f"Errors in mm, {_kind(ranked[0])}", ["model"], ["points", *_HEADS, "source"])
+    cells = []
     for score in ranked:
         source = "computed" if score.model in own else "as stated"
-        table.add_row(name_cell(label(score.model)), str(score.points), *map(_two, score.figures), source)
-    _add_caption(table, ranked)
-    return table
+        cells.append([label(score.model), str(score.points), *map(_two, score.figures), source])
+    columns = ("model", *(f">{head}" for head in ("points", *_HEADS, "source")))
+    note = height_note(score.model for score in ranked)
+    return Rows(f"Errors in mm, {_kind(ranked[0])}", columns, cells, note)
 
 
 def _two(value_mm: float) -> str:

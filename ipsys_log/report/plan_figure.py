@@ -17,8 +17,8 @@ from ipsys_log.analysis.joint_plan import PlannedDrive
 from ipsys_log.arrays import Array
 from ipsys_log.report.figures import figure_bytes, legend_label, name_cameras
 from ipsys_log.report.files import write_files
+from ipsys_log.report.rows import means_cm
 from ipsys_log.report.styles import NOTE, REST, camera_styles
-from ipsys_log.report.tables import means_cm
 from ipsys_log.survey.floor_plan import PlannedFloor, mesh
 from ipsys_log.units import CM_PER_M
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from math import ceil
 
-from rich.table import Table
-
 from ipsys_log.log.chunk_builder import IMAGE_SCHEMAS
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import RepairReport
+from ipsys_log.log.recovery import RepairReport
+from ipsys_log.report.rows import Rows
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 # A recorder flushes its messages at least once in this time.
@@ -20,7 +19,7 @@ _COPIED_NS = 10 * NS_PER_S
 _MOST_NOTES = 12
 
 
-def repair_lines(report: RepairReport) -> Iterator[str | Table]:
+def repair_lines(report: RepairReport) -> Iterator[str | Rows]:
     """Yield lines and tables, at most 80 columns wide if topics and paths are short."""
     kept = f"{report.messages_kept} messages" if report.messages_kept else "no message"
     if report.changed and report.last_kept_ns is not None:
@@ -29,9 +28,9 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
         yield f"{report.path} {'repaired' if report.changed else 'is undamaged and unchanged'}: {kept}"
     yield from _about_the_loss(report)
     if report.unchecked:
-        yield f"{report.unchecked} of them are from damaged chunks: no CRC confirms them"
+        yield f"{report.unchecked} of them are from damaged parts: no CRC confirms them"
     if report.damaged_file is not None:
-        yield f"the removed bytes are in {report.damaged_file}"
+        yield f"the old data are in {report.damaged_file}"
     yield from report.notes[:_MOST_NOTES]
     if len(report.notes) > _MOST_NOTES:
         yield f"and {len(report.notes) - _MOST_NOTES} more notes"
@@ -41,7 +40,7 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
         yield from _about_the_end(report)
 
 
-def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
+def _about_the_loss(report: RepairReport) -> Iterator[str | Rows]:
     """Yield the number of unreadable bytes, and the known lost messages."""
     if not (report.bytes_lost or report.lost_counts):
         return
@@ -58,13 +57,13 @@ def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
         yield _lost_table(report)
 
 
-def _lost_table(report: RepairReport) -> Table:
-    table = _table("channel", "lost", "from", "to (UTC)")
+def _lost_table(report: RepairReport) -> Rows:
+    cells = []
     for topic, number in sorted(report.lost_counts.items()):
         times_ns = report.lost.get(topic, ())
         span = (_clock(min(times_ns)), _clock(max(times_ns))) if len(times_ns) == number else ("", "")
-        table.add_row(topic, str(number), *span)
-    return table
+        cells.append([topic, str(number), *span])
+    return Rows("", ("channel", ">lost", ">from", ">to (UTC)"), cells)
 
 
 def _about_the_rig(report: RepairReport) -> Iterator[str]:
@@ -76,21 +75,21 @@ def _about_the_rig(report: RepairReport) -> Iterator[str]:
         yield "the log has frames but no rig: give one to each command (--rig lab.toml)"
 
 
-def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
+def _about_the_end(report: RepairReport) -> Iterator[str | Rows]:
     """Yield the last message of each recorded channel, and the largest possible number of lost messages."""
     assert report.last_kept_ns is not None
     late_ns = report.written_ns - report.last_kept_ns
     copied = not -_FLUSH_NS < late_ns < _COPIED_NS
     end_ns = None if copied else report.written_ns + _FLUSH_NS
-    table = _table("channel", "messages", "last (UTC)", "lost, at most")
+    cells = []
     with LogReader(report.path) as log:
         for topic, channel in sorted(log.channels.items()):
             if run_of_topic(topic) is None and channel.message_count:
                 images = channel.schema is not None and channel.schema.name in IMAGE_SCHEMAS
                 times_ns = [int(time_ns) for time_ns in log.times(topic)]
                 gone = _gone(log, topic, times_ns, end_ns) if images else ""
-                table.add_row(topic, str(len(times_ns)), _clock(times_ns[-1]), gone)
-    yield table
+                cells.append([topic, str(len(times_ns)), _clock(times_ns[-1]), gone])
+    yield Rows("", ("channel", ">messages", ">last (UTC)", ">lost, at most"), cells)
     if copied:
         yield "The end of the log is lost. Its time is unknown: the file was copied later."
     else:
@@ -115,13 +114,6 @@ def _gone(log: LogReader, topic: str, times_ns: Sequence[int], end_ns: int | Non
         span_ns = max(times_ns[-1] - times_ns[0], 1)
     rate_hz = (len(times_ns) - 1) * NS_PER_S / span_ns
     return f"{ceil(max(end_ns - times_ns[-1], 0) * rate_hz / NS_PER_S)} at {rate_hz:.1f}/s"
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "channel" else "right")
-    return table
 
 
 def _clock(time_ns: int) -> str:

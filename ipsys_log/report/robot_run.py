@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.robot_run import RobotResult, RobotRunResult, Stop, read_robot_run
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ErrorStatistics
-from ipsys_log.units import CM_PER_M, NS_PER_S
+from ipsys_log.report.rows import Rows, cm
+from ipsys_log.units import NS_PER_S
 
 # The panels hold photographs: more pixels would only make the page larger.
 _PANELS_DPI = 110
@@ -22,11 +21,9 @@ _PANELS_DPI = 110
 
 def robot_run_tables(result: RobotRunResult) -> Group:
     """Return the errors of each robot at its waypoints and over its drive, in cm."""
-    parts: list[Table | Text] = []
+    parts: list[Rows | Text] = []
     for robot in result.robots:
-        parts.append(Text(f"{robot.name}: errors in cm at the waypoints; true: median, 95 %, max", "bold"))
-        parts += [_waypoint_table(robot, result.start_ns), Text("Positions over the drive, errors in cm")]
-        parts.append(_drive_table(robot))
+        parts += [_waypoints(robot, result.start_ns), _drive(robot)]
         parts += [Text(stop_line(robot.name, stop, result.start_ns)) for stop in robot.stops]
         if not robot.is_finished:
             text = f"{robot.name} reached {len(robot.reached)} of {len(robot.path)} waypoints"
@@ -36,35 +33,28 @@ def robot_run_tables(result: RobotRunResult) -> Group:
     return Group(*parts)
 
 
-def _waypoint_table(robot: RobotResult, start_ns: int) -> Table:
-    table = Table(box=None, pad_edge=False)
-    models = list(robot.positioning_m)
-    for heading in ("waypoint", "time", "control", "true", *models):
-        table.add_column(heading, justify="left" if heading == "waypoint" else "right")
-    for row in _rows(robot, start_ns, models):
-        table.add_row(*row)
-    return table
-
-
-def _rows(robot: RobotResult, start_ns: int, models: Iterable[str]) -> list[list[str]]:
-    """Return the cells of the table of waypoints."""
-    rows = []
+def _waypoints(robot: RobotResult, start_ns: int) -> Rows:
+    """Return a row for each reached waypoint; a run has its median error there."""
+    cells = []
     for point in robot.reached:
         time_s = (point.start_ns - start_ns) / NS_PER_S
-        cells = [f"P{point.number} ({point.place.x_m:g}, {point.place.y_m:g})", f"{time_s:.1f} s"]
-        cells += [_cm(point.control_m), _three(point.true_m)]
-        cells += [_cm(e.median_m) if (e := point.positioning_m.get(run)) else "-" for run in models]
-        rows.append(cells)
-    return rows
+        place = f"P{point.number} ({point.place.x_m:g}, {point.place.y_m:g})"
+        row = [place, f"{time_s:.1f} s", cm(point.control_m)]
+        row.append("-" if point.true_m is None else " ".join(_three(point.true_m)))
+        row += [cm(e.median_m) if (e := point.positioning_m.get(run)) else "-" for run in robot.positioning_m]
+        cells.append(row)
+    columns = ("waypoint", ">time", ">control", ">true", *(f">{run}" for run in robot.positioning_m))
+    return Rows(f"{robot.name}: errors in cm at the waypoints; true: median, 95 %, max", columns, cells)
 
 
-def _drive_table(robot: RobotResult) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for heading in ("run", "median", "95 %", "max", "instants"):
-        table.add_column(heading, justify="left" if heading == "run" else "right")
-    for run, errors in robot.positioning_m.items():
-        table.add_row(run, *map(_cm, (errors.median_m, errors.p95_m, errors.max_m)), str(errors.count))
-    return table
+def _drive(robot: RobotResult) -> Rows:
+    cells = [[run, *_three(errors), str(errors.count)] for run, errors in robot.positioning_m.items()]
+    columns = ("run", ">median", ">95 %", ">max", ">instants")
+    return Rows("Positions over the drive, errors in cm", columns, cells)
+
+
+def _three(errors: ErrorStatistics) -> list[str]:
+    return [cm(errors.median_m), cm(errors.p95_m), cm(errors.max_m)]
 
 
 def stop_line(robot: str, stop: Stop, start_ns: int) -> str:
@@ -75,16 +65,8 @@ def stop_line(robot: str, stop: Stop, start_ns: int) -> str:
         text += f", {stop.age_s:.2f} s after its last position"
     if stop.braking_m is None or stop.moved_m is None:
         return text
-    braking_cm, moved_cm = CM_PER_M * stop.braking_m, CM_PER_M * stop.moved_m
-    return f"{text}; it moved {braking_cm:.1f} cm since then, {moved_cm:.1f} cm after its stop"
-
-
-def _three(errors: ErrorStatistics | None) -> str:
-    return "-" if errors is None else " ".join(map(_cm, (errors.median_m, errors.p95_m, errors.max_m)))
-
-
-def _cm(value_m: float | None) -> str:
-    return "-" if value_m is None else f"{CM_PER_M * value_m:.2f}"
+    moved, after = cm(stop.braking_m, 1), cm(stop.moved_m, 1)
+    return f"{text}; it moved {moved} cm since then, {after} cm after its stop"
 
 
 def robot_run_json(result: RobotRunResult) -> dict[str, Any]:
@@ -175,9 +157,8 @@ def _robot_values(robot: RobotResult, start_ns: int) -> dict[str, Any]:
     """Return the texts of a robot on the page."""
     return {
         "name": robot.name,
-        "models": list(robot.positioning_m),
-        "rows": _rows(robot, start_ns, robot.positioning_m),
-        "drive": [(run, _three(errors)) for run, errors in robot.positioning_m.items()],
+        "waypoints": _waypoints(robot, start_ns),
+        "drive": _drive(robot),
         "stops": [stop_line(robot.name, stop, start_ns) for stop in robot.stops],
         "reached": f"{len(robot.reached)} of {len(robot.path)}",
     }

@@ -1,4 +1,4 @@
-"""The summary of an evaluation: the best model, its error and the outliers; and a table of all models."""
+"""The summary of an evaluation in sentences: the best model, its error and the outliers."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.consistency import FEWEST_POINTS
+from ipsys_log.analysis.trajectory_errors import pool_trajectories
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.models.table import reads_corners
 from ipsys_log.report.accuracy import Accuracy, gather_outliers, remaining_json
-from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
+from ipsys_log.report.advice import advise, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
-from ipsys_log.report.tables import format_interval, name_cell, plain_table, trajectory_lines, wrap_text
+from ipsys_log.report.rows import cm, counted, name_cell, wrap_text
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 
@@ -38,7 +38,7 @@ def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
     for accuracy in shown:
         if accuracy.tracks is not None:
             lines += _track_lines(accuracy, in_space(accuracies), len(shown) > 1)
-            lines += trajectory_lines(accuracy)
+            lines += _trajectory_lines(accuracy)
     if any(accuracy.evaluation and accuracy.evaluation.cameras for accuracy in accuracies):
         lines += _outlier_lines(accuracies)
     advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])
@@ -69,9 +69,26 @@ def _track_lines(accuracy: Accuracy, space: bool, several: bool) -> Iterator[str
         others = tracks.others[0] if space else tracks.others[1]
         yield (
             f"{text} This is at the {tracks.counted} of {tracks.instants} instants at which the marker has "
-            f"the height in the rig. At the other {others.count}, the mean error is {_cm(others.mean_m)} cm; "
-            f"over all, it is {_cm(whole.mean_m)} cm."
+            f"the height in the rig. At the other {others.count}, the mean error is "
+            f"{cm(others.mean_m, 1)} cm; over all, it is {cm(whole.mean_m, 1)} cm."
         )
+
+
+def _trajectory_lines(accuracy: Accuracy) -> Iterator[str]:
+    """Yield the RMSE of the absolute trajectory error and of the relative pose errors of all robots."""
+    if not accuracy.trajectories:
+        return
+    pooled = pool_trajectories(accuracy.trajectories)
+    space_cm, floor_cm = (
+        cm(root_mean_square_m(pooled.absolute_3d)),
+        cm(root_mean_square_m(pooled.absolute_2d)),
+    )
+    text = f"Absolute trajectory error (ATE): RMSE {space_cm} cm in 3D, {floor_cm} cm on the floor"
+    relative = [
+        f"{cm(root_mean_square_m(errors.summary))} cm over {errors.delta:g} {errors.unit}"
+        for errors in pooled.relative
+    ]
+    yield f"{text}; relative pose error (RPE): RMSE {', '.join(relative)}." if relative else f"{text}."
 
 
 def _excluded_line(best: Accuracy, row: CameraEvaluation, space: bool) -> str:
@@ -85,7 +102,7 @@ def _excluded_line(best: Accuracy, row: CameraEvaluation, space: bool) -> str:
     whole = overall_row_with_excluded(best, row.scheme == CROSS_VALIDATION)
     if whole is None:
         return text
-    mean_cm = _cm(ranking_errors(whole, space).mean_m)
+    mean_cm = cm(ranking_errors(whole, space).mean_m, 1)
     return f"{text} With {'it' if one else 'them'}, the mean error is {mean_cm} cm."
 
 
@@ -98,13 +115,13 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     knows = ", with known marker heights" if uses_height(best.model) else ""
     yield Text(f"{'Best model' if several else 'Model'}: {name_cell(best.model)}{knows}", style="bold")
     errors = ranking_errors(row, space)
-    yield f"Mean distance to the tape points: {_figures(errors, best.rmse_m(row, errors))}"
+    yield f"Mean distance to the tape points: {_figures(errors, best.errors_of(row).rmse_m(errors))}"
     cameras = {camera_row.camera for camera_row in (best.evaluation.cameras if best.evaluation else ())} - {
         POOLED
     }
     yield (
         f"({'3D' if space and not uses_height(best.model) else '2D'}, {_scheme(row)}: "
-        f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; each pair of "
+        f"{counted(row.error_2d.count, 'point')} of {counted(len(cameras), 'camera')}; each pair of "
         "a camera and a point counts as one)."
     )
     yield from _remaining_lines(errors)
@@ -113,47 +130,38 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     truth = overall_row(best, row.scheme == CROSS_VALIDATION, _TRUTH)
     if truth is not None:
         errors = ranking_errors(truth, space)
-        yield f"Against the ground truth: {_figures(errors, best.rmse_m(truth, errors))}."
+        yield f"Against the ground truth: {_figures(errors, best.errors_of(truth).rmse_m(errors))}."
     told = _height_model(accuracies, best)
     if told and (told_row := overall_row(told, True) or overall_row(told, False)):
         errors = ranking_errors(told_row, space)
-        figures = _figures(errors, told.rmse_m(told_row, errors))
+        figures = _figures(errors, told.errors_of(told_row).rmse_m(errors))
         yield f"With known marker heights: {told.model}, {figures} (2D)."
 
 
 def _remaining_lines(errors: ErrorStatistics) -> Iterator[str]:
     """Yield the mean position error without the error of the tape, if the tape has a sigma."""
-    if errors.remaining_m is None or errors.remaining_low_m is None or errors.remaining_high_m is None:
-        return
-    low, high = (f"{value_m * CM_PER_M:.2f}" for value_m in (errors.remaining_low_m, errors.remaining_high_m))
-    yield (
-        f"Mean position error, after the stated error of the tape: {errors.remaining_m * CM_PER_M:.2f} cm "
-        f"(95 % CI {low} to {high})."
-    )
+    if errors.remaining_m is not None:
+        low, high = cm(errors.remaining_low_m), cm(errors.remaining_high_m)
+        yield (
+            f"Mean position error, after the stated error of the tape: {cm(errors.remaining_m)} cm "
+            f"(95 % CI {low} to {high})."
+        )
 
 
 def _scheme(row: CameraEvaluation) -> str:
     return "cross-validated" if row.scheme == CROSS_VALIDATION else "held out"
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
 def _figures(errors: ErrorStatistics, rmse_m: float | None) -> str:
     """Return the statistics of errors as text."""
-    parts = [f"{_cm(errors.mean_m)} cm"]
+    parts = [f"{cm(errors.mean_m, 1)} cm"]
     if errors.mean_low_m is not None and errors.mean_high_m is not None:
-        parts[0] += f" (95 % CI {_cm(errors.mean_low_m)} to {_cm(errors.mean_high_m)})"
+        parts[0] += f" (95 % CI {cm(errors.mean_low_m, 1)} to {cm(errors.mean_high_m, 1)})"
     if rmse_m is not None:
-        parts.append(f"RMSE {_cm(rmse_m)} cm")
+        parts.append(f"RMSE {cm(rmse_m, 1)} cm")
     if errors.p95_m is not None:
-        parts.append(f"95 % below {_cm(errors.p95_m)} cm")
+        parts.append(f"95 % below {cm(errors.p95_m, 1)} cm")
     return ", ".join(parts)
-
-
-def _cm(value_m: float) -> str:
-    return f"{value_m * CM_PER_M:.1f}"
 
 
 def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
@@ -163,7 +171,7 @@ def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
         searched = "none" if any(map(_screened, accuracies)) else f"not searched. {_needed()}"
         yield f"Outliers: {searched}."
         return
-    yield f"Outliers: measure {_count(len(suspects), 'point')} again, the worst first:"
+    yield f"Outliers: measure {counted(len(suspects), 'point')} again, the worst first:"
     for suspect, _ in suspects[:_EXPLAINED]:
         text = suspect.text or "no simple mistake explains it"
         name = name_cell(suspect.measurement).plain
@@ -174,7 +182,7 @@ def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
 
 
 def _length(residual_m: Any) -> str:
-    return _cm(float(np.linalg.norm(residual_m)))
+    return cm(float(np.linalg.norm(residual_m)), 1)
 
 
 def _screened(accuracy: Accuracy) -> bool:
@@ -202,7 +210,7 @@ def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
     if best is None or row is None:
         return {}
     errors = ranking_errors(row, in_space(accuracies))
-    rmse_m = best.rmse_m(row, errors)
+    rmse_m = best.errors_of(row).rmse_m(errors)
     figures: dict[str, Any] = {"mean_cm": errors.mean_m * CM_PER_M} | (
         {} if rmse_m is None else {"rmse_cm": rmse_m * CM_PER_M}
     )
@@ -216,74 +224,3 @@ def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
             mean_m = ranking_errors(whole, in_space(accuracies)).mean_m
             figures["mean_with_excluded_cm"] = mean_m * CM_PER_M
     return {"answer": {"model": best.model, "scheme": row.scheme, **figures, "outliers": names}}
-
-
-def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
-    """Return a table with one row per model, the best first; None without rows.
-
-    For a single model, it has one row per camera.
-    """
-    space = in_space(accuracies)
-    lines = [(accuracy, rows) for accuracy in rank(accuracies) for rows in _rows(accuracy, len(accuracies))]
-    if not lines:
-        return None
-    crossed = any(rows[True] for _, rows in lines)
-    kind, scheme = "3D" if space else "2D", "cross-validated" if crossed else "held out"
-    figures = [f"{kind} mean", "95 % CI", "RMSE", "p95", *(["2D mean", "RMSE"] if space else ["max"])]
-    excluded = any(accuracy.evaluation and accuracy.evaluation.with_excluded for accuracy, _ in lines)
-    held_out = crossed and any(rows[False] for _, rows in lines) and not excluded
-    figures += [f"held out {kind}"] if held_out else []
-    figures += [f"{kind}, all points"] if excluded else []
-    by_camera = len(accuracies) == 1
-    table = plain_table(f"Errors in cm, {scheme}", ["camera" if by_camera else "model"], figures)
-    for accuracy, rows in lines:
-        row = rows[crossed] or rows[False]
-        assert row is not None
-        cells = _cells(accuracy, row, space)
-        cells += [_held_out(rows[False], space)] if held_out else []
-        cells += [_with_excluded(accuracy, row, space)] if excluded else []
-        table.add_row(name_cell((row.camera or "(all)") if by_camera else label(accuracy.model)), *cells)
-    if not by_camera and any(uses_height(accuracy.model) for accuracy, _ in lines):
-        table.caption, table.caption_justify, table.caption_style = Text(HEIGHT_NOTE), "left", ""
-    return table
-
-
-def _rows(accuracy: Accuracy, models: int) -> list[dict[bool, CameraEvaluation | None]]:
-    """Return rows against the tape, by cross-validation (True or False): over all cameras, or by camera."""
-    if models > 1:
-        pooled = {crossed: overall_row(accuracy, crossed) for crossed in (True, False)}
-        return [pooled] if any(pooled.values()) else []
-    by_camera: dict[str, dict[bool, CameraEvaluation | None]] = {}
-    for crossed in (True, False):
-        for row in accuracy.rows(crossed):
-            if row.against != _TRUTH:
-                by_camera.setdefault(row.camera, {True: None, False: None})[crossed] = row
-    return list(by_camera.values())
-
-
-def _cells(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> list[str]:
-    errors = ranking_errors(row, space)
-    cells = [_two(errors.mean_m), format_interval(errors), _two(accuracy.rmse_m(row, errors))]
-    cells.append(_two(errors.p95_m))
-    if space:
-        return [*cells, _two(row.error_2d.mean_m), _two(accuracy.rmse_m(row, row.error_2d))]
-    return [*cells, _two(errors.max_m)]
-
-
-def _held_out(row: CameraEvaluation | None, space: bool) -> str:
-    return "-" if row is None else _two(ranking_errors(row, space).mean_m)
-
-
-def _with_excluded(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> str:
-    """Return the mean error of the same camera and scheme with the gross outliers."""
-    rows = accuracy.rows_with_excluded(row.scheme == CROSS_VALIDATION)
-    same = [other for other in rows if (other.camera, other.against) == (row.camera, row.against)]
-    return _two(ranking_errors(same[0], space).mean_m) if same else "-"
-
-
-def _two(value_m: float | None) -> str:
-    """Format a length in cm with two decimals, or without decimals if a column would be too wide."""
-    if value_m is None:
-        return "-"
-    value_cm = value_m * CM_PER_M
-    return f"{value_cm:.2f}" if value_cm < 100 else f"{value_cm:.0f}"

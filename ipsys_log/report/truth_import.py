@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.exchange.import_truth import ImportedTruth
-from ipsys_log.report.tables import wrap_text
-from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
+from ipsys_log.report.rows import cm, counted, mm, wrap_text
+from ipsys_log.units import NS_PER_S
 
 _MS_PER_S = 1000.0
 
@@ -31,8 +31,8 @@ def truth_lines(imported: ImportedTruth) -> Iterator[str]:
         yield wrap_text(f"Alignment {align}: {_motion_text(imported)}.")
     if (residuals := imported.residuals) is not None:
         yield wrap_text(
-            f"Residuals against run {imported.tracks_run}: RMSE {residuals.rmse_2d_m * CM_PER_M:.2f} cm on "
-            f"the floor, {residuals.rmse_3d_m * CM_PER_M:.2f} cm in 3D, at {residuals.instants} instants"
+            f"Residuals against run {imported.tracks_run}: RMSE {cm(residuals.rmse_2d_m)} cm on "
+            f"the floor, {cm(residuals.rmse_3d_m)} cm in 3D, at {residuals.instants} instants"
             f"{_outliers(residuals.outliers)}."
         )
     if found is not None:
@@ -51,7 +51,7 @@ def _motion_text(imported: ImportedTruth) -> str:
         if np.isfinite(sigma)
     ]
     parts += [
-        f"{name} {shift * CM_PER_M:.2f} cm (sigma {sigma * MM_PER_M:.1f} mm)"
+        f"{name} {cm(shift)} cm (sigma {mm(sigma)} mm)"
         for name, shift, sigma in zip("xyz", found.motion.shift_m, found.shift_sigmas_m, strict=True)
         if np.isfinite(sigma)
     ]
@@ -59,7 +59,7 @@ def _motion_text(imported: ImportedTruth) -> str:
 
 
 def _outliers(count: int) -> str:
-    return f"; {count} outlier{'' if count == 1 else 's'} not used for the estimate" if count else ""
+    return f"; {counted(count, 'outlier')} not used for the estimate" if count else ""
 
 
 def truth_json(imported: ImportedTruth) -> dict[str, Any]:

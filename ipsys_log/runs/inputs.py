@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 
 def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
     """Yield the input of a causal stage: settings before the first frame, then its channels in log order."""
-    yield from first_settings(session, task, task.topics)
+    yield from given_settings(session, task.rig, task.lenses)
+    # The first rig and intrinsics of the log hold from its start, even if they were recorded a little later.
+    for topic in sorted(task.topics):
+        if topic in (*session.topics(RIG), *session.calibrations.values()):
+            yield next(session.messages([topic]))
     total = sum(session.count(topic) for topic in task.topics)
     progress(task.stage.name, 0, total)
     skipped = left_out_frames(session, task)
@@ -37,18 +41,6 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
             # The next frames need it. Frames that live processing skipped before a keyframe have no effect.
             yield replace(message, payload=SkippedVideo(message.payload))
         progress(task.stage.name, done, total)
-
-
-def first_settings(session: Session, task: Task, topics: Collection[str]) -> Iterator[Message]:
-    """Yield the settings that hold from the start: those of the user, and the first ones of some topics.
-
-    The first rig and intrinsics of the log are valid from its start, even if they were recorded a little
-    later.
-    """
-    yield from given_settings(session, task.rig, task.lenses)
-    for topic in sorted(topics):
-        if topic in (*session.topics(RIG), *session.calibrations.values()):
-            yield next(session.messages([topic]))
 
 
 def given_settings(
@@ -63,10 +55,6 @@ def given_settings(
 
 
 def left_out_frames(session: Session, task: Task) -> set[int]:
-    """Return the log times in ns of the frames that a run leaves out."""
-    return skipped_frames(session.payloads(session.topics(EVENTS))) if leaves_out_frames(task) else set()
-
-
-def leaves_out_frames(task: Task) -> bool:
-    """Return whether a run leaves out the frames that live processing skipped."""
-    return "as_live" in task.parameters
+    """Return the log times in ns of the frames that a run leaves out: those that live processing skipped."""
+    as_live = "as_live" in task.parameters
+    return skipped_frames(session.payloads(session.topics(EVENTS))) if as_live else set()

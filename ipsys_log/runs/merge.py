@@ -44,9 +44,9 @@ def merge(
     """Write the messages of several logs into a new log, in log order.
 
     The offset of a log is added to its log times, its publish times and the times within its messages. All
-    else stays the same, except the names of runs that an earlier log has, too, and a combined rig. The new
-    log gets its name when it is complete. It has the attachments and metadata of the logs, and the record of
-    the merge as its last message.
+    else stays the same, except a combined rig. Channels that an earlier log has, with the same messages, come
+    once. The new log gets its name when it is complete. It has the attachments and metadata of the logs, and
+    the record of the merge as its last message.
 
     Parameters
     ----------
@@ -56,8 +56,8 @@ def merge(
     Raises
     ------
     IpsysError
-        There are fewer than two logs, they have a camera in common, their settings contradict each other, or
-        the output exists or is one of the logs.
+        There are fewer than two logs, they have a camera or a result in common, their settings contradict
+        each other, or the output exists or is one of the logs.
     """
     check_copy(paths, output, overwrite)
     with ExitStack() as stack:
@@ -105,7 +105,7 @@ def open_logs(paths: Sequence[LogLocation], stack: ExitStack) -> list[Session]:
 
 def _states(plan: MergePlan, writer: LogWriter) -> dict[str, ChannelHash]:
     """Return the number and the hash of the messages of each channel of the merged log."""
-    topics = sorted({name for source in plan.sources for name in source.topics.values()})
+    topics = sorted({topic for source in plan.sources for topic in source.topics})
     states = {topic: writer.hash_of(topic) for topic in topics}
     for topic, state in states.items():
         if not state.valid:
@@ -123,15 +123,13 @@ def _hash_in_log_order(plan: MergePlan, topic: str) -> ChannelHash:
 
 def _record(session: Session, plan: MergePlan, number: int, states: dict[str, ChannelHash]) -> MergedLog:
     """Return the record of a log; earlier records of cuts and merges describe the log, and not the merge."""
-    source, offset = plan.sources[number], plan.offsets[number]
-    owners = Counter(name for one in plan.sources for name in one.topics.values())
+    source, offset, equal = plan.sources[number], plan.offsets[number], plan.equal[number]
+    owners = Counter(topic for one in plan.sources for topic in one.topics)
     channels = []
-    for topic, name in sorted({**source.topics, **plan.equal[number]}.items()):
-        if topic in (CUTS.topic, MERGES.topic):
-            continue
+    for topic in sorted({*source.topics, *equal} - {CUTS.topic, MERGES.topic}):
+        name = equal.get(topic, topic)
         state = states[name]
         is_shared = owners[name] > 1 or name in plan.changed
         identity = session.count(topic), session.hash(topic)
         channels.append(ChannelCut(name, *identity, state.count, state.digest.hex(), shared=is_shared))
-    renamed = dict(sorted(plan.renamed_runs[number].items()))
-    return MergedLog(source.reader.path.name, offset.offset_ns, offset.sigma_s, tuple(channels), renamed)
+    return MergedLog(source.reader.path.name, offset.offset_ns, offset.sigma_s, tuple(channels))

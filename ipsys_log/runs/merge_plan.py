@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import count
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_intrinsics
-from ipsys_log.log.codec import decode, encode, schema_name
-from ipsys_log.log.combined_logs import find_new_ids
+from ipsys_log.log.codec import encode
+from ipsys_log.log.combined_logs import check_same_parameters, find_new_ids
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import MergeSource
 from ipsys_log.log.shifted_times import check_shift
-from ipsys_log.messages import Cut, FrameTransforms, Merge, Rig, Run
-from ipsys_log.messages.channels import CUTS, MEASUREMENTS, MERGES, POSES, RECORD, RIG
+from ipsys_log.messages import Rig
+from ipsys_log.messages.channels import CUTS, MEASUREMENTS, MERGES, RECORD, RIG, RUN_EVENTS
 from ipsys_log.plain_text import shell_words
 from ipsys_log.rig.combination import combine_rigs
-from ipsys_log.runs.origins import own_inputs
-from ipsys_log.runs.renaming import rename_channels, rename_frames, rename_record, rename_topic
 
 
 class LogOffset(NamedTuple):
@@ -31,8 +28,8 @@ class LogOffset(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Settings:
-    """The settings that the logs share: by topic, their owner's topic; and the combined rig of the owner."""
+class _Common:
+    """The common content of logs: by topic its owner's topic, and the combined rig of the owner."""
 
     equal: list[dict[str, str]]
     rig: Rig | None = None
@@ -47,14 +44,12 @@ class MergePlan:
     ----------
     sources : the logs, in the order of the command.
     offsets : their offsets.
-    renamed_runs : for each log, the new names of its runs by their old names.
-    equal : for each log, the topics of equal settings that an earlier log has, with their topics there.
+    equal : for each log, the topics whose messages come with an earlier log, with their topics there.
     changed : the topics of the merged log whose content is that of no log: the combined rig.
     """
 
     sources: Sequence[MergeSource]
     offsets: Sequence[LogOffset]
-    renamed_runs: Sequence[Mapping[str, str]]
     equal: Sequence[Mapping[str, str]]
     changed: frozenset[str] = field(default_factory=frozenset)
 
@@ -97,50 +92,46 @@ def _cameras(session: Session) -> set[str]:
 def plan_merge(sessions: Sequence[Session], offsets: Sequence[LogOffset]) -> MergePlan:
     """Plan the merge of logs, each in its own session, whose cameras differ.
 
-    Equal settings come with the first log that has them. The rigs are combined. A run whose name an earlier
-    log has gets a new name.
+    Equal settings, and channels with the same messages, come with the first log that has them. The rigs are
+    combined. The results of a run of the same name for other cameras join it.
 
     Raises
     ------
     IpsysError
-        Settings contradict each other, or times within a log cannot be shifted.
+        Settings contradict each other, two logs have different results of one run, or times within a log
+        cannot be shifted.
     """
-    settings = _Settings([{} for _ in sessions])
-    _plan_rig(sessions, settings)
-    _plan_intrinsics(sessions, settings)
-    renamed_runs = _new_run_names(sessions)
+    common = _Common([{} for _ in sessions])
+    _plan_rig(sessions, common)
+    _plan_intrinsics(sessions, common)
+    check_same_parameters((session.paths[0], session.runs()) for session in sessions)
+    _plan_same_channels(sessions, common)
     sources = [
-        _source(session, number, offset.offset_ns, settings, renamed_runs[number])
+        _source(session, number, offset.offset_ns, common)
         for number, (session, offset) in enumerate(zip(sessions, offsets, strict=True))
     ]
-    changed = frozenset(settings.rig_topics[1] if settings.rig is not None else ())
-    return MergePlan(sources, offsets, renamed_runs, settings.equal, changed)
+    changed = frozenset(common.rig_topics[1] if common.rig is not None else ())
+    return MergePlan(sources, offsets, common.equal, changed)
 
 
-def _source(
-    session: Session, number: int, offset_ns: int, settings: _Settings, names: Mapping[str, str]
-) -> MergeSource:
+def _source(session: Session, number: int, offset_ns: int, common: _Common) -> MergeSource:
     (reader,) = session.readers
-    topics = {
-        topic: rename_topic(topic, names)
-        for topic, channel in reader.channels.items()
-        if channel.message_count and topic not in settings.equal[number]
-    }
+    equal = common.equal[number]
+    topics = [topic for topic, one in reader.channels.items() if one.message_count and topic not in equal]
     if offset_ns:
         for topic in topics:
             try:
                 check_shift(reader.channels[topic])
             except IpsysError as error:
                 raise IpsysError(f"{session}: {error}") from None
-    changes = _name_changes(session, names) if names else {}
-    if settings.rig is not None and settings.rig_topics[0] == number:
-        rig_data = encode(settings.rig)
-        changes |= dict.fromkeys(settings.rig_topics[1], lambda _: rig_data)
+    replaced = {}
+    if common.rig is not None and common.rig_topics[0] == number:
+        replaced = dict.fromkeys(common.rig_topics[1], encode(common.rig))
     metadata = {"merged_from": reader.path.name, "offset_ns": str(offset_ns)} if number else {}
-    return MergeSource(reader, offset_ns, topics, changes, metadata)
+    return MergeSource(reader, offset_ns, topics, replaced, metadata)
 
 
-def _plan_rig(sessions: Sequence[Session], settings: _Settings) -> None:
+def _plan_rig(sessions: Sequence[Session], common: _Common) -> None:
     """Note the combined rig if it is not that of its owner, and the equal topics of later logs.
 
     Raises
@@ -157,9 +148,9 @@ def _plan_rig(sessions: Sequence[Session], settings: _Settings) -> None:
     for number in with_rig[1:]:
         rig = _only_rig(sessions[number], topics[number])
         combined = combine_rigs(combined, rig, (str(sessions[owner]), str(sessions[number])))
-        settings.equal[number] |= dict.fromkeys(topics[number], topics[owner][0])
-    settings.rig_topics = owner, topics[owner]
-    settings.rig = None if combined == own else combined
+        common.equal[number] |= dict.fromkeys(topics[number], topics[owner][0])
+    common.rig_topics = owner, topics[owner]
+    common.rig = None if combined == own else combined
 
 
 def _only_rig(session: Session, topics: Sequence[str]) -> Rig:
@@ -171,7 +162,7 @@ def _only_rig(session: Session, topics: Sequence[str]) -> Rig:
     return rigs[0]
 
 
-def _plan_intrinsics(sessions: Sequence[Session], settings: _Settings) -> None:
+def _plan_intrinsics(sessions: Sequence[Session], common: _Common) -> None:
     """Note the equal intrinsics of later logs.
 
     Raises
@@ -180,7 +171,7 @@ def _plan_intrinsics(sessions: Sequence[Session], settings: _Settings) -> None:
         Two logs have different intrinsics of one camera.
     """
     owners: dict[str, Session] = {}
-    for session, equal in zip(sessions, settings.equal, strict=True):
+    for session, equal in zip(sessions, common.equal, strict=True):
         for camera, topic in session.calibrations.items():
             owner = owners.setdefault(camera, session)
             if owner is session:
@@ -195,45 +186,26 @@ def _plan_intrinsics(sessions: Sequence[Session], settings: _Settings) -> None:
             equal[topic] = owner.calibrations[camera]
 
 
-def _new_run_names(sessions: Sequence[Session]) -> list[dict[str, str]]:
-    """Return for each log the new names of its runs whose names an earlier log has, by their old names."""
-    taken: set[str] = set()
-    renamed = []
-    for session in sessions:
-        names = session.run_names()
-        new: dict[str, str] = {}
-        for name in sorted(names & taken):
-            numbered = (f"{name}_{number}" for number in count(2))
-            new[name] = next(one for one in numbered if one not in taken | names | {*new.values()})
-        taken |= {new.get(name, name) for name in names}
-        renamed.append(new)
-    return renamed
+def _plan_same_channels(sessions: Sequence[Session], common: _Common) -> None:
+    """Note the channels of later logs whose messages are those of an earlier log.
 
-
-def _name_changes(session: Session, names: Mapping[str, str]) -> dict[str, Callable[[bytes], bytes]]:
-    """Return the changes of the messages that contain names of runs, by topic."""
-
-    def change_record(data: bytes) -> bytes:
-        run: Run = decode(schema_name(Run), data)
-        return encode(rename_record(run, names, own_inputs(session, run).keys()))
-
-    def change_frames(data: bytes) -> bytes:
-        return encode(rename_frames(decode(schema_name(FrameTransforms), data), names))
-
-    def change_cut(data: bytes) -> bytes:
-        return encode(rename_channels(decode(schema_name(Cut), data), names))
-
-    def change_merge(data: bytes) -> bytes:
-        record: Merge = decode(schema_name(Merge), data)
-        logs = tuple(rename_channels(log, names) for log in record.logs)
-        return encode(replace(record, logs=logs))
-
-    runs = sorted(session.run_names())
-    records = [topic for run in runs for topic in session.topics(RECORD, run)]
-    poses = [topic for run in names for topic in session.topics(POSES, run)]
-    return {
-        **dict.fromkeys(records, change_record),
-        **dict.fromkeys(poses, change_frames),
-        CUTS.topic: change_cut,
-        MERGES.topic: change_merge,
-    }
+    Raises
+    ------
+    IpsysError
+        Two logs have different results of one run.
+    """
+    owners: dict[str, Session] = {}
+    for session, equal in zip(sessions, common.equal, strict=True):
+        for topic in sorted(session.readers[0].channels.keys() - {*equal, CUTS.topic, MERGES.topic}):
+            if not session.count(topic):
+                continue
+            owner, run = owners.setdefault(topic, session), run_of_topic(topic)
+            if owner is session:
+                continue
+            if session.count(topic) == owner.count(topic) and session.hash(topic) == owner.hash(topic):
+                equal[topic] = topic
+            elif run is not None and topic not in (RECORD.topic_of(run), RUN_EVENTS.topic_of(run)):
+                raise IpsysError(
+                    f"{owner} and {session} have different results of run {run}: {topic}; leave the run of "
+                    f"one log out: ipsys cut {shell_words(*session.paths)} -o part.mcap --exclude-runs {run}"
+                )

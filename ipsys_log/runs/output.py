@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from ipsys_log.atomic_files import partial_of
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.interrupts import undivided
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
@@ -56,9 +55,7 @@ def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
     -------
     The number of messages by topic.
     """
-    with ExitStack() as stack:
-        with undivided():
-            writer = stack.enter_context(LogWriter.create(path, atomic=True))
+    with LogWriter.create(path, atomic=True) as writer:
         return write_messages(writer, messages)
 
 
@@ -81,9 +78,7 @@ def check_copy(paths: Sequence[LogLocation], output: Path, overwrite: bool) -> N
 @contextmanager
 def create_copy(output: Path, overwrite: bool) -> Iterator[LogWriter]:
     """Yield the writer of a log that is made from other logs; it gets its name when it is complete."""
-    with ExitStack() as stack:
-        with undivided():
-            writer = stack.enter_context(LogWriter.create(output, atomic=True, overwrite=overwrite))
+    with LogWriter.create(output, atomic=True, overwrite=overwrite) as writer:
         yield writer
 
 
@@ -221,12 +216,12 @@ def open_target(
         return
     _check_free(output)
     # Another process may write a log of that name at the same time: the first one to finish gets the name.
-    partial = output.with_name(f"{output.name}.{secrets.token_hex(4)}.partial")
+    partial = partial_of(output)
     with ExitStack() as stack:
-        with undivided():
-            LogWriter.create(partial).close()
-            for path in (partial, journal_path(partial)):
-                stack.callback(path.unlink, missing_ok=True)
+        for path in (partial, journal_path(partial)):
+            path.unlink(missing_ok=True)  # of an earlier process with this number
+            stack.callback(path.unlink, missing_ok=True)
+        LogWriter.create(partial).close()
         yield [*paths, partial], partial
         with LogReader(partial) as log:
             anything = log.message_count > 0

@@ -6,11 +6,9 @@ the messages of the run, with the same bytes as one process without pieces. Neit
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -30,9 +28,9 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import ANNOTATIONS, RIG
 from ipsys_log.messages.stage import Pieces, Resets
 from ipsys_log.runs.inputs import given_settings, left_out_frames
-from ipsys_log.runs.provenance import read_channels
 from ipsys_log.runs.stream import WiredStage, derive
 from ipsys_log.stages import load_stage
+from ipsys_log.units import format_time
 
 if TYPE_CHECKING:
     from ipsys_log.runs.graph import Task
@@ -40,6 +38,8 @@ if TYPE_CHECKING:
 # A smaller run is done before workers have started, and opened the log.
 _MIN_FRAMES = 1_000
 _MIN_PIECES = 4
+# Number of pieces for each worker that may be finished before the pieces in front of them.
+_AHEAD = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -96,6 +96,9 @@ class Piece(NamedTuple):
     start_ns: int
     end_ns: int
 
+    def __str__(self) -> str:
+        return f"the piece of {self.camera} that begins at {format_time(self.start_ns)}"
+
 
 class FrameResult(NamedTuple):
     """The publish time of a frame in ns, and the payloads that were made from it, some of them encoded."""
@@ -120,17 +123,15 @@ class PieceFrames(NamedTuple):
 
 
 class PiecePlan(NamedTuple):
-    """The division of a run into pieces, in the order of their first frames.
-
-    Attributes
-    ----------
-    identity : returns a text that differs if the run has another input by content, or other parameters.
-    """
+    """The division of a run into pieces, in the order of their first frames."""
 
     run: PieceRun
     frames: PieceFrames
     pieces: list[Piece]
-    identity: Callable[[], str] = str
+
+    def ahead(self, workers: int) -> int:
+        """Return how many pieces may be in work or finished before the pieces in front of them are used."""
+        return _AHEAD * workers + len(self.frames.cameras)
 
     @property
     def is_long(self) -> bool:
@@ -144,16 +145,20 @@ class PieceWorkers(Protocol):
     Attributes
     ----------
     divides : False if this process computes all runs itself.
+    first_only : True if a replay ends after its first stage: the later ones are computed elsewhere.
     """
 
     @property
     def divides(self) -> bool: ...
 
-    def prepare(self, plan: PiecePlan) -> None:
+    @property
+    def first_only(self) -> bool: ...
+
+    def prepare(self, plan: PiecePlan, /) -> None:
         """Begin to prepare the computation of a plan; return before the preparation is complete."""
         ...
 
-    def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
+    def compute(self, plan: PiecePlan, /) -> Iterator[PieceResult]:
         """Yield the results of the pieces in the order of the plan."""
         ...
 
@@ -179,21 +184,7 @@ def plan_pieces(task: Task, session: Session) -> PiecePlan | None:
     if frames is None:
         return None
     run = PieceRun.of_task(task, session)
-    pieces = split_frames(frames, run.load().resets)
-    return PiecePlan(run, frames, pieces, partial(_identity, session, run))
-
-
-def _identity(session: Session, run: PieceRun) -> str:
-    """Return the hash of a run's stage, parameters, settings, and input by content."""
-    parts = (
-        run.stage,
-        sorted(run.parameters.items()),
-        read_channels(session, run.topics),
-        None if run.rig is None else encode(run.rig),
-        [(camera, encode(lens)) for camera, lens in sorted(run.lenses.items())],
-        sorted(run.skipped),
-    )
-    return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
+    return PiecePlan(run, frames, split_frames(frames, run.load().resets))
 
 
 def order_frames(session: Session, topics: Iterable[str]) -> PieceFrames | None:
@@ -253,12 +244,7 @@ def compute_piece(session: Session, run: PieceRun, piece: Piece) -> PieceResult:
 def _encode_drawing(payload: Any) -> Any:
     """Encode what only viewers read: its many small parts would go to another process one by one."""
     kind = type(payload)
-    return Encoded(kind, encode(payload)) if stays_encoded(kind) else payload
-
-
-def stays_encoded(kind: type) -> bool:
-    """Return whether only viewers read a type of payload: it goes encoded from a worker into the log."""
-    return kind in ANNOTATIONS.payloads
+    return Encoded(kind, encode(payload)) if kind in ANNOTATIONS.payloads else payload
 
 
 def _messages(session: Session, run: PieceRun, piece: Piece) -> Iterator[Message]:

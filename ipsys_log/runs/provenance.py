@@ -7,10 +7,11 @@ versions, except version 1. Versions of packages make no run out of date: they a
 from __future__ import annotations
 
 import platform
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
+from typing import NamedTuple
 
 import threadpoolctl
 
@@ -18,9 +19,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import IMPORTED, CameraCalibration, ChannelRead, Run
+from ipsys_log.messages import IMPORTED, CameraCalibration, ChannelRead, ChannelWritten, Run
 from ipsys_log.messages.channels import MARKERS, Channel
-from ipsys_log.runs.origins import has_result, present_inputs, was_complete
 
 # The parameter ``format`` of the record of markers that nodes have sent.
 NODE_FORMAT = "node"
@@ -82,35 +82,111 @@ def replaced_lenses(run: Run) -> dict[str, CameraCalibration]:
     }
 
 
+class Original(NamedTuple):
+    """A channel before a cut or a merge has copied it: the number and hash of its messages, and its logs."""
+
+    messages: int
+    hash: str
+    logs: tuple[str, ...]
+
+
+def originals(session: Session, topic: str) -> Iterator[Original]:
+    """Yield a channel before each cut and each merge, the last one first.
+
+    A record of a copy counts only if the channel is now, or was before a later copy, as it says.
+    """
+    readers = [reader for reader in session.readers if topic in reader.channels]
+    if len(readers) > 1:  # the channel goes on in a second log, which the record does not know
+        return
+    states = {(session.count(topic), session.hash(topic))} if session.copies else set()
+    for reader in readers or session.copies:
+        for copy in reversed(session.copies.get(reader, [])):
+            before = next((one for one in copy.channels if one.topic == topic and not one.shared), None)
+            if before is not None and (before.kept, before.kept_hash or "") in states:
+                states.add((before.messages, before.hash))
+                yield Original(before.messages, before.hash, copy.logs)
+
+
+def is_whole(session: Session, read: ChannelRead) -> bool:
+    """Return whether a channel is now as a stage has read it."""
+    return session.count(read.topic) == read.messages and session.hash(read.topic) == read.hash
+
+
+def original_of(session: Session, read: ChannelRead) -> Original | None:
+    """Return a channel as a stage has read it, before a cut or a merge; None if it never was so."""
+    same = [one for one in originals(session, read.topic) if one[:2] == (read.messages, read.hash)]
+    return same[-1] if same else None
+
+
+def _original_with(session: Session, output: ChannelWritten) -> Original | None:
+    """Return a channel with all messages of a stage, before a cut or a merge; None if it never was so."""
+    whole = [one for one in originals(session, output.topic) if one.messages >= output.messages]
+    return whole[-1] if whole else None
+
+
+def copied_from(session: Session, run: Run) -> tuple[str, ...]:
+    """Return the logs from which a stage of a run was copied, if the copy has only a part of its channels.
+
+    Returns
+    -------
+    () if all its channels are whole, or if one of them has changed since in another way.
+    """
+    changed = [original_of(session, read) for read in run.inputs if not is_whole(session, read)]
+    changed += [_original_with(session, output) for output in run.outputs if not _has_all(session, output)]
+    logs = [one.logs for one in changed if one is not None]
+    return logs[0] if logs and len(logs) == len(changed) else ()
+
+
 def complete_runs(session: Session) -> list[Run]:
     """Return the records whose channels are all in the log, oldest first."""
     return [run for run in session.runs() if is_complete(session, run)]
 
 
 def is_complete(session: Session, run: Run) -> bool:
-    """Return whether all channels of a stage are in the log, or were before the log was cut."""
+    """Return whether all channels of a stage are in the log, or were in the log from which it was copied."""
     return all(
-        session.count(output.topic) >= output.messages or was_complete(session, output.topic, output.messages)
-        for output in run.outputs
+        _has_all(session, output) or _original_with(session, output) is not None for output in run.outputs
     )
+
+
+def _has_all(session: Session, output: ChannelWritten) -> bool:
+    return session.count(output.topic) >= output.messages
 
 
 def find_run(session: Session, wanted: Run, purpose: Channel, name: str | None = None) -> str | None:
     """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any.
 
-    In a part of a log, a run is found if its inputs were cut and did not change otherwise.
+    A copied run is found if its inputs were only copied, in part or with other times, and not changed.
 
     Parameters
     ----------
-    purpose : the channel of the result, which a part must have.
+    purpose : the channel of the result, of which a copy must have a part.
     """
     essence = _identity(wanted)
     for run in reversed(complete_runs(session)):
         if run.stage == wanted.stage and name in (None, run.run):
-            here = replace(run, inputs=present_inputs(session, run)) if session.cuts else run
-            if _identity(here) == essence and has_result(session, run, purpose):
+            inputs = tuple(now for read in run.inputs if (now := _as_copied(session, read)) is not None)
+            if _identity(replace(run, inputs=inputs)) == essence and _has_result(session, run, purpose):
                 return run.run
     return None
+
+
+def _as_copied(session: Session, read: ChannelRead) -> ChannelRead | None:
+    """Return an input of a run as it is here, if it was only copied; None if the copy has nothing of it."""
+    if is_whole(session, read) or original_of(session, read) is None:
+        return read
+    count = session.count(read.topic)
+    return ChannelRead(read.topic, count, session.hash(read.topic)) if count else None
+
+
+def _has_result(session: Session, run: Run, purpose: Channel) -> bool:
+    """Return whether the log has a part of the result of a run, if there was any."""
+    results = [
+        output
+        for output in run.outputs
+        if output.messages and purpose.topic_of(run.run, camera_of_topic(output.topic)) == output.topic
+    ]
+    return not results or any(session.count(output.topic) for output in results)
 
 
 def with_inputs(names: Iterable[str], reads: Mapping[str, Collection[str]]) -> set[str]:

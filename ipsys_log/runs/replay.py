@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from threading import Thread
 
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
@@ -15,13 +12,12 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import IMAGES, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
-from ipsys_log.models.table import create, reads_corners
+from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_earlier_runs, describe_changed_images
 from ipsys_log.runs.execute import compute_messages, run_stage
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.runs.model_checks import check_fits
-from ipsys_log.runs.one_pass import OnePass
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.runs.provenance import Outcome, imported_inputs
@@ -37,7 +33,6 @@ class Replay:
     stages, models : those to compute, in order.
     logs, target : the logs to read as one, and the log that gets the results.
     workers : they compute the pieces of a long log.
-    one_pass : the stages that follow another one.
     progress, say : called with the state of the work, and with remarks.
     unchecked : several models of which it is not known yet if all can be fitted.
     outcomes : one for each stage so far.
@@ -50,7 +45,6 @@ class Replay:
     logs: Sequence[LogLocation]
     target: Path
     workers: PieceWorkers
-    one_pass: OnePass
     progress: Progress
     say: Callable[[str], None]
     unchecked: list[str] = field(init=False)
@@ -69,12 +63,10 @@ class Replay:
             The input has a fault that the user must correct.
         """
         of_model = [stage for stage in self.stages if is_of_model(stage)]
-        # A copied model is known before its turn: its stages can follow the first ones.
-        is_copied = self.request.model_from is not None and len(self.models) == 1
         with Session(self.logs) as session:
             shared = imported_inputs(session)
         first = [stage for stage in self.stages if stage not in of_model]
-        self._run_stages(first, shared, None, of_model if is_copied else [])
+        self._run_stages(first, shared, None)
         for model in self.models:
             try:
                 self._run_stages(of_model, dict(shared), model)
@@ -84,24 +76,13 @@ class Replay:
                     raise
                 self.say(f"{model} is left out: {error}")
 
-    def _run_stages(
-        self,
-        stages: Sequence[Stage],
-        inputs: dict[Channel, str],
-        model: str | None,
-        later: Sequence[Stage] = (),
-    ) -> None:
-        """Run some stages in order, and note the runs of their channels.
-
-        The ``later`` stages can follow them in the same pass.
-        """
-        for number, stage in enumerate(stages, 1):
-            run = self._run_stage(stage, (*stages[number:], *later), inputs, model)
+    def _run_stages(self, stages: Sequence[Stage], inputs: dict[Channel, str], model: str | None) -> None:
+        """Run some stages in order, and note the runs of their channels."""
+        for stage in stages:
+            run = self._run_stage(stage, inputs, model)
             inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
 
-    def _run_stage(
-        self, stage: Stage, following: Sequence[Stage], inputs: Mapping[Channel, str], model: str | None
-    ) -> str:
+    def _run_stage(self, stage: Stage, inputs: Mapping[Channel, str], model: str | None) -> str:
         """Run a stage, or find its result; return its run."""
         request = self.request
         with Session(self.logs) as session:
@@ -113,9 +94,10 @@ class Replay:
                 task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
             if isinstance(task, str):
                 return task
-            compute = partial(self._messages, following=following, model=model or self.models[0])
             until, target = self.stages[-1], self.target
-            outcome = run_stage(session, target, task, request, until, compute, self.say, self._prepare)
+            outcome = run_stage(
+                session, target, task, request, until, self._messages, self.say, self._prepare
+            )
         self.outcomes.append(outcome)
         return outcome.run
 
@@ -128,51 +110,18 @@ class Replay:
             for remark in describe_changed_images(session):
                 self.say(remark)
 
-    def _messages(
-        self, task: Task, session: Session, name: str, following: Sequence[Stage], model: str
-    ) -> Iterator[Message]:
+    def _messages(self, task: Task, session: Session, name: str) -> Iterator[Message]:
         """Compute a run. Before the first fit, check that all models can be fitted."""
         progress = self.progress
         if len(self.models) > 1 and is_of_model(task.stage):
             progress = _name_run(progress, name)
-        waiting = self.one_pass.results(session, task, name, progress)
-        if waiting is not None:
-            yield from waiting
-            return
         with one_blas_thread():
             if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
                 check_fits(session, self.request, task.inputs, self.unchecked)
                 self.unchecked.clear()
-            messages = compute_messages(task, session, name, progress, self.divided)
-            fits = any(MODEL in stage.writes for stage in self.stages)
-            # Threads of this process would wait for the imports, longer than the imports take alone.
-            if self.divided is not None and fits and self.request.model_from is None:
-                messages = preload(messages, self.models)
-            yield from self.one_pass.follow(messages, session, task, name, following, model)
-
-
-def preload(messages: Iterable[Message], models: Sequence[str]) -> Iterator[Message]:
-    """Yield the messages of a stage, and load the libraries of models meanwhile: scikit-learn takes a second.
-
-    The loading begins after the first message, and the end waits for it. So the imports of the stages never
-    meet it: two threads that import modules with mutual imports can see unfinished ones.
-    """
-    thread = None
-    for message in messages:
-        yield message
-        if thread is None:
-            thread = Thread(target=_load_models, args=(tuple(models),), name="preload", daemon=True)
-            thread.start()
-    if thread is not None:
-        thread.join()
+            yield from compute_messages(task, session, name, progress, self.divided)
 
 
 def _name_run(progress: Progress, run: str) -> Progress:
     """Return a progress function whose steps name their run: with several models, a stage has several."""
     return lambda stage, done, total: progress(f"{stage} {run}", done, total)
-
-
-def _load_models(models: Sequence[str]) -> None:
-    for model in models:
-        with suppress(Exception):  # the stage that needs it reports the error
-            create(model)

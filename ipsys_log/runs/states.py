@@ -10,8 +10,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
 from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
-from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run
-from ipsys_log.runs.provenance import is_complete, recorded_version
+from ipsys_log.runs.provenance import copied_from, is_complete, is_whole, original_of, recorded_version
 
 CURRENT = "current"
 # The record of a model that was fitted to measurements of the same log has one of these parameters.
@@ -26,11 +25,11 @@ class Recorded:
     ----------
     run : the record of the stage.
     method : its corner method, camera-point method or model; "" if the stage has none.
-    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, ``part of run <run>,
-        cut from <log>``, ``run <run> merged from <log>``, or what to do if newer software made it.
+    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``,
+        ``copied from <log>``, or what to do if newer software made it.
     out_of_date : the software, the log or an input run has changed since, and the stage can be repeated.
     is_newer : newer software made it.
-    is_part : the log is a part of the log with the whole run, or was merged from it.
+    is_copied : it was copied from another log, and this one has only a part of its channels, or other times.
     """
 
     run: Run
@@ -38,7 +37,7 @@ class Recorded:
     state: str = CURRENT
     out_of_date: bool = False
     is_newer: bool = False
-    is_part: bool = False
+    is_copied: bool = False
 
     @property
     def is_of_other_version(self) -> bool:
@@ -103,20 +102,20 @@ def _judge(session: Session, one: Recorded) -> Recorded:
     if newer := made_by_newer(session, run):
         return replace(one, state=newer, is_newer=True)
     names = versioned_names(run.stage, one.method)
-    is_copied = writes(run, MODEL) and not is_fitted_here(run)
-    origin = origin_of_run(session, run) if session.cuts and not is_copied else None
-    missing = any(read.messages and not session.count(read.topic) for read in run.inputs) and origin is None
-    if is_copied or missing:
+    is_of_copied_model = writes(run, MODEL) and not is_fitted_here(run)
+    logs = () if is_of_copied_model else copied_from(session, run)
+    missing = any(read.messages and not session.count(read.topic) for read in run.inputs) and not logs
+    if is_of_copied_model or missing:
         return replace(one, state="not repeatable")
     reasons = [
         f"made by {name} {recorded_version(run, name)}, this is {name} {VERSIONS[name]}"
         for name in names
         if recorded_version(run, name) < VERSIONS[name]
     ]
-    if origin is not None and not reasons:
-        return replace(one, state=origin.text(run.run), is_part=True)
+    if logs and not reasons:
+        return replace(one, state=f"copied from {', '.join(logs)}", is_copied=True)
     changed = (read for read in run.inputs if not is_whole(session, read))
-    reasons += [_change(read) for read in changed if not is_cut(session, read)]
+    reasons += [_change(read) for read in changed if original_of(session, read) is None]
     return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one
 
 

@@ -65,25 +65,15 @@ def run(source: Iterable[Message], stages: Sequence[WiredStage], map: Map = map)
     yield from source
 
 
-def reader_of(wired: WiredStage) -> Callable[[Message], list[Any]]:
-    """Return the function from a message to the payloads of a stage; none if the stage does not read it."""
+def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator[Message]:
     is_read: dict[tuple[str, type], bool] = {}
 
-    def payloads_of(message: Message) -> list[Any]:
+    def work(message: Message) -> tuple[Message, list[Any]]:
         key = message.topic, type(message.payload)
         if key not in is_read:
             channel = channel_of(*key)
             is_read[key] = channel is not None and Route(channel, run_of_topic(message.topic)) in wired.reads
-        return list(wired.step(message)) if is_read[key] else []
-
-    return payloads_of
-
-
-def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator[Message]:
-    payloads_of = reader_of(wired)
-
-    def work(message: Message) -> tuple[Message, list[Any]]:
-        return message, payloads_of(message)
+        return message, list(wired.step(message)) if is_read[key] else []
 
     for message, payloads in (map if wired.stage.per_camera else builtins.map)(work, source):
         yield message

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ipsys_log.log.codec import encode
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, Run
 from ipsys_log.runs.graph import versioned_names
-from ipsys_log.runs.origins import own_inputs
-from ipsys_log.runs.provenance import is_complete, recorded_version, with_inputs
+from ipsys_log.runs.provenance import is_complete, is_whole, original_of, recorded_version, with_inputs
 from ipsys_log.runs.states import CURRENT, Recorded, recorded_stages
 
 # The number that a new run gets if the name of its branch is taken: poly, poly_2, poly_3.
@@ -107,7 +107,7 @@ def _branches(session: Session, stages: Iterable[Recorded]) -> list[bytes]:
     writers: dict[str, bytes] = {}  # the branch by topic; a stage reads channels of earlier stages only
     branches = []
     for stage in stages:
-        own = own_inputs(session, stage.run)
+        own = _own_inputs(session, stage.run)
         inputs = {
             writers.get(read.topic, b"") if read.topic in own else read.topic.encode()
             for read in stage.run.inputs
@@ -133,5 +133,15 @@ def _read_runs(session: Session, runs: Iterable[Run]) -> dict[str, set[str]]:
     """Return by run the runs of this log that its stages have read."""
     reads: dict[str, set[str]] = {}
     for run in runs:
-        reads.setdefault(run.run, set()).update(own_inputs(session, run).values())
+        reads.setdefault(run.run, set()).update(_own_inputs(session, run).values())
     return reads
+
+
+def _own_inputs(session: Session, run: Run) -> dict[str, str]:
+    """Return the topics of runs of this log that a stage has read, each with its run."""
+    reads = ((read, run_of_topic(read.topic)) for read in run.inputs)
+    return {
+        read.topic: name
+        for read, name in reads
+        if name is not None and (is_whole(session, read) or original_of(session, read) is not None)
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,19 +20,17 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import IMPORTED, Message, Run
+from ipsys_log.messages import IMPORTED, FrameTransforms, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
-from ipsys_log.runs.origins import is_cut, is_whole, origin_of_run, shift_of_run
-from ipsys_log.runs.part_check import compare_with_cut, repeatable_topics
-from ipsys_log.runs.provenance import replaced_lenses
-from ipsys_log.runs.renaming import rename_frames, rename_topic
+from ipsys_log.runs.provenance import copied_from, is_whole, original_of, replaced_lenses
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 
 # Channels with a message for each image.
@@ -53,8 +51,8 @@ def verify(
     cannot be repeated if measurements were added or withdrawn since. Results of another version are not
     repeated; a remark reports this. Later stages are repeated from the recorded channels.
 
-    In a part of a log, channels without memory are repeated message by message. All other channels are
-    compared with the record of the cut, and a remark names their stages.
+    A cut or a merge copies runs. Those whose channels are whole in the log are repeated. The other ones are
+    compared with the hashes that came with the copy, and a remark names their stages.
 
     Parameters
     ----------
@@ -63,7 +61,7 @@ def verify(
 
     Returns
     -------
-    One comparison for each derived channel; the log is on the left.
+    One comparison for each derived channel, and each copied channel; the log is on the left.
 
     Raises
     ------
@@ -74,64 +72,101 @@ def verify(
         names = session.run_names() if run is None else session.run_names() & {run}
         recorded = [stage for stage in recorded_stages(session) if stage.run.run in names]
         imported = {stage.run.run for stage in recorded if stage.run.stage == IMPORTED}
-        records = [
-            stage.run
-            for stage in recorded
-            if stage.run.stage != IMPORTED and not _is_of_copied_model(stage.run)
+        stages = [
+            stage for stage in recorded if stage.run.stage != IMPORTED and not _is_of_copied_model(stage.run)
         ]
-        if not records and (run is not None or not session.cuts):
+        if not stages and (run is not None or not session.copies):
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 f"to compute one: ipsys replay {shell_words(paths[-1])}; "
                 f"to list the runs: ipsys info --runs {shell_words(paths[-1])}"
             )
-        checked = {output.topic for record in records for output in record.outputs}
-        repeated = [
-            stage.run
-            for stage in recorded
-            if stage.run in records
-            and not _is_of_other_version(stage, say)
-            and (origin_of_run(session, stage.run) or _is_up_to_date(session, stage.run, checked, say))
-        ]
-        topics_of = {id(record): _topics(session, record, say) for record in repeated}
-        if not repeated and not session.cuts:
+        checked = {output.topic for stage in stages for output in stage.run.outputs}
+        repeated = [stage.run for stage in stages if _is_repeated(session, stage, checked, say)]
+        if not repeated and not session.copies:
             raise IpsysError(
                 f"{session}: has no run that can be verified; for the reasons: "
                 f"ipsys info --runs {shell_words(paths[-1])}"
             )
         comparisons = []
         for name in sorted(names):
-            stages = [record for record in repeated if record.run == name]
-            others = _of_others(recorded, name, topics_of) if session.cuts else set()
-            topics = {topic for record in stages for topic in topics_of[id(record)]} - others
+            records = [record for record in repeated if record.run == name]
+            of_others = {
+                output.topic
+                for stage in recorded
+                if stage.run.run == name and stage.run not in records
+                for output in stage.run.outputs
+            }
+            topics = {output.topic for record in records for output in record.outputs} - of_others
             # Several stages can write to the channel of events.
             made = heapq.merge(
-                *(_made_again(session, record, progress) for record in stages if topics_of[id(record)]),
+                *(_made_again(session, record, progress) for record in records),
                 key=lambda row: row[0].log_time_ns,
             )
-            if session.cuts:
-                made = (row for row in made if row[0].topic in topics)
-            comparisons += compare_channels(session.stored(sorted(topics)), made)
-        comparisons += compare_with_cut(session, names, {one.topic for one in comparisons}, progress)
+            own = (row for row in made if row[0].topic not in of_others)
+            comparisons += compare_channels(session.stored(sorted(topics)), own)
+        done = {one.topic for one in comparisons}
+        comparisons += _compare_copies(session, names, done, progress, say)
         return sorted([*comparisons, *_unrecorded(session, names - imported)], key=lambda one: one.topic)
 
 
-def _topics(session: Session, run: Run, say: Callable[[str], None]) -> set[str]:
-    """Return the channels of a stage that are repeated: all of them, except in a part of a log."""
-    if origin_of_run(session, run) is not None:
-        return repeatable_topics(session, run, say)
-    return {output.topic for output in run.outputs}
+def _is_repeated(
+    session: Session, stage: Recorded, checked: Collection[str], say: Callable[[str], None]
+) -> bool:
+    """Return whether a stage is repeated; print the reason if not.
+
+    Raises
+    ------
+    IpsysError
+        Its inputs have changed.
+    """
+    run = stage.run
+    if logs := copied_from(session, run):
+        say(f"run {run.run}: {run.stage} was copied from {', '.join(logs)}; its hashes are compared")
+        return False
+    if stage.is_of_other_version:
+        say(f"run {run.run}: {run.stage} is {stage.state}; it is not verified")
+        return False
+    return _is_up_to_date(session, run, checked, say)
 
 
-def _of_others(recorded: Sequence[Recorded], name: str, topics_of: Mapping[int, set[str]]) -> set[str]:
-    """Return the channels of a run to which a stage has written that does not repeat them."""
-    return {
-        output.topic
-        for stage in recorded
-        if stage.run.run == name
-        for output in stage.run.outputs
-        if output.topic not in topics_of.get(id(stage.run), ())
+def _compare_copies(
+    session: Session,
+    names: Collection[str],
+    repeated: Collection[str],
+    progress: Progress,
+    say: Callable[[str], None],
+) -> Iterator[Comparison]:
+    """Yield whether the messages of each copied channel are those that the cut or the merge wrote.
+
+    All bytes of the channels are read.
+
+    Parameters
+    ----------
+    names : the runs; recorded channels are compared too.
+    repeated : channels that are not compared, because they are repeated.
+    """
+    rows = {
+        (reader, one.topic): one
+        for reader, copies in session.copies.items()
+        for copy in copies
+        for one in copy.channels
+        if one.topic not in repeated and run_of_topic(one.topic) in (None, *names)
     }
+    progress("channels", 0, len(rows))
+    for done, ((reader, topic), one) in enumerate(rows.items(), 1):
+        state = ChannelHash()
+        for message in reader.messages([topic]):
+            state.add(message.log_time_ns, message.publish_time_ns, message.data)
+        progress("channels", done, len(rows))
+        if state.count > one.kept:
+            added = state.count - one.kept
+            say(f"{topic}: messages were added after the copy ({added}); it is not compared")
+        elif one.kept:
+            is_same = (state.count, state.digest.hex()) == (one.kept, one.kept_hash)
+            first = None if is_same else "its messages are not those that the cut or the merge wrote"
+            same = state.count if is_same else 0
+            yield Comparison(topic, state.count, one.kept, same, same, first, repeated=False)
 
 
 def _is_of_copied_model(run: Run) -> bool:
@@ -142,13 +177,6 @@ def _is_of_copied_model(run: Run) -> bool:
 def _is_of_model(run: Run) -> bool:
     """Return whether a stage fits a model, or evaluates it: these depend on all measurements."""
     return writes(run, MODEL) or writes(run, EVALUATION)
-
-
-def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
-    """Return whether another version made a stage, and print a remark if so."""
-    if one.is_of_other_version:
-        say(f"run {one.run.run}: {one.run.stage} is {one.state}; it is not verified")
-    return one.is_of_other_version
 
 
 def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
@@ -243,16 +271,23 @@ def _called(message: Message, run: str | None) -> Message:
     """Return a message as a message of another run: the run's name is in its topic and in robot frame ids."""
     if run is None:
         return message
-    names = {str(run_of_topic(message.topic)): run}
-    payload = rename_frames(message.payload, names)
-    return replace(message, topic=rename_topic(message.topic, names), payload=payload)
+    payload = message.payload
+    if isinstance(payload, FrameTransforms):
+        payload = FrameTransforms(
+            tuple(
+                replace(one, child_frame_id=f"{run}/{one.child_frame_id.partition('/')[2]}")
+                for one in payload.transforms
+            )
+        )
+    topic = message.topic.replace(f"/runs/{run_of_topic(message.topic)}/", f"/runs/{run}/", 1)
+    return replace(message, topic=topic, payload=payload)
 
 
 def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Callable[[str], None]) -> bool:
     """Return whether a stage can be repeated; skip inputs that are ``checked`` themselves."""
     for read in run.inputs:
         count = session.count(read.topic)
-        if read.topic in checked or is_whole(session, read) or is_cut(session, read):
+        if read.topic in checked or is_whole(session, read) or original_of(session, read) is not None:
             continue
         if count == 0:
             say(
@@ -273,15 +308,11 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
 
 def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stored]:
     stage = stage_named(run.stage)
-    images = {read.topic for read in run.inputs} & set(session.images.values())
-    if session.cuts and images:  # a merged log has cameras that the stage did not read
-        session = session.with_images(images)
-    # Resets stay at the frames at which they were before a merge has shifted the times.
-    shift_ns = shift_of_run(session, run) if session.cuts else 0
-    options = {**run.parameters, "shift_ns": str(shift_ns)}
-    task = (
-        plan_stage(stage, session, options, input_runs(run), run.rig, replaced_lenses(run)) if stage else ""
-    )
+    cameras = {camera for read in run.inputs if (camera := session.camera_of(read.topic)) is not None}
+    if session.copies and cameras:  # a merged log has cameras that the stage did not read
+        session = session.with_cameras(cameras)
+    inputs = input_runs(run)
+    task = plan_stage(stage, session, run.parameters, inputs, run.rig, replaced_lenses(run)) if stage else ""
     if isinstance(task, Task):
         for message in compute_messages(task, session, run.run, progress):
             yield message, encode(message.payload)

@@ -1,7 +1,7 @@
 """Worker processes of this machine, which compute the pieces of a run.
 
-All workers take the numbers of their pieces from one pipe, besides the pipe that each of them has for the
-results. A worker ends with its pipes, so that none remains after this process.
+Each worker gets the numbers of its pieces through its pipe, and sends their results back. A worker ends with
+its pipe, so that none remains after this process. The pieces of a worker that was killed go to another one.
 """
 
 from __future__ import annotations
@@ -9,21 +9,21 @@ from __future__ import annotations
 import os
 import pickle
 import traceback
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
 from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.interrupts import undivided
 from ipsys_log.piped_process import PipedProcess, parent_pipe
 from ipsys_log.runs.pieces import Piece, PiecePlan, PieceResult, PieceRun
 
-# Number of pieces for each worker that may be finished before the pieces in front of them.
-_AHEAD = 2
-# The size of a piece's number in the common pipe. A system call reads or writes such a number completely.
-_NUMBER_BYTES = 4
+# With fewer waiting pieces for each worker, none gets a second one: it could wait behind a slow one.
+_FEW_PIECES = 2
+# A piece that has ended so many workers is their cause, such as by a lack of memory.
+_MOST_ENDED_WORKERS = 2
 # More processes than these only take memory, 0.15 GB each. A script may run on machines of other sizes.
 _MOST_JOBS_OF_CORE = 4
 _MOST_JOBS_OF_SMALL_MACHINE = 16
@@ -58,35 +58,27 @@ class _Failure(NamedTuple):
 
 
 class _Worker(PipedProcess):
-    """A worker process; ``numbers`` is the file descriptor with the numbers of its pieces."""
+    """A worker process; ``pieces`` has the numbers of its pieces, the first one in work."""
 
-    def __init__(self, numbers: int) -> None:
-        super().__init__(serve, numbers)
+    def __init__(self) -> None:
+        super().__init__(serve)
+        self.pieces: deque[int] = deque()
 
-    def begin(self, plan: PiecePlan) -> None:
-        """Send the run and the pieces whose numbers follow."""
+    def send(self, message: object) -> None:
+        """Send the run with its pieces, or the number of the next piece."""
+        with suppress(OSError):  # if it has ended, receive() tells so
+            self.sender.send(message)
+
+    def receive(self) -> PieceResult | None:
+        """Return the result of its first piece; None if the process has ended."""
         try:
-            self.sender.send((plan.run, plan.pieces))
-        except OSError:
-            raise self._ended() from None
-
-    def receive(self) -> tuple[int, PieceResult]:
-        """Return the number and the result of a piece."""
-        try:
-            answer = self.receiver.recv()
+            answer: PieceResult | _Failure = self.receiver.recv()
         except (EOFError, OSError):
-            raise self._ended() from None
+            return None
         if isinstance(answer, _Failure):
             answer.error.add_note(f"in a worker process:\n{answer.trace}")
             raise answer.error
-        number, result = answer
-        return number, result
-
-    def _ended(self) -> IpsysError:
-        return IpsysError(
-            f"a worker process has ended {self.describe_end()}, perhaps for lack of memory; its results are "
-            "not written. Repeat the command, or give fewer processes with --jobs"
-        )
+        return answer
 
 
 class LocalWorkers:
@@ -97,17 +89,16 @@ class LocalWorkers:
     jobs : number of processes; with 1, runs are computed in this process.
     """
 
+    first_only = False
+
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
         self._workers: list[_Worker] = []
-        self._numbers: tuple[int, ...] = ()  # the ends of the common pipe: to read, to write
 
     def __enter__(self) -> LocalWorkers:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop()
 
     @property
@@ -123,7 +114,15 @@ class LocalWorkers:
         IpsysError
             A worker cannot be started.
         """
-        self._start(min(self.jobs, len(plan.pieces)))
+        count = min(self.jobs, len(plan.pieces))
+        while len(self._workers) < count:
+            try:
+                self._workers.append(_Worker())
+            except OSError as error:
+                raise IpsysError(
+                    f"only {len(self._workers)} of {count} worker processes can be started "
+                    f"({error.strerror}); give fewer processes with --jobs"
+                ) from error
 
     def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
         """Yield the results of the pieces in their order; the workers may finish them in another order.
@@ -131,101 +130,113 @@ class LocalWorkers:
         Raises
         ------
         IpsysError
-            A worker was killed, or cannot be started.
+            A piece has ended several workers, or a worker cannot be started.
         Exception
             An error in a worker, with a note of its traceback.
         """
-        limit = _AHEAD * self.jobs + len(plan.frames.cameras)
+        ended: Counter[int] = Counter()
         finished: dict[int, PieceResult] = {}
-        offered = 0
+        waiting = deque(range(len(plan.pieces)))
         try:
             self.prepare(plan)
             for worker in self._workers:
-                worker.begin(plan)
+                worker.send((plan.run, plan.pieces))
             for number in range(len(plan.pieces)):
-                offered = self._offer(offered, min(number + limit, len(plan.pieces)))
+                self._offer(waiting, number + plan.ahead(self.jobs))
                 while number not in finished:
-                    self._receive(finished)
+                    for worker in self._ready():
+                        result = worker.receive()
+                        if result is not None:
+                            finished[worker.pieces.popleft()] = result
+                        else:
+                            self._replace(worker, plan, waiting, ended)
+                    self._offer(waiting, number + plan.ahead(self.jobs))
                 yield finished.pop(number)
         finally:
             self._stop()
 
-    def _start(self, count: int) -> None:
-        """Start workers up to a number of them.
+    def _offer(self, waiting: deque[int], stop: int) -> None:
+        """Give pieces before ``stop`` to workers: one to each without a piece, and then a second one to each.
+
+        With a second piece, a worker goes on while this process is busy.
+        """
+        for most in (0, 1):
+            for worker in self._workers:
+                has_more = len(waiting) > most * _FEW_PIECES * len(self._workers)
+                if has_more and waiting[0] < stop and len(worker.pieces) == most:
+                    worker.pieces.append(waiting.popleft())
+                    worker.send(worker.pieces[-1])
+
+    def _ready(self) -> list[_Worker]:
+        """Wait for results; return the workers with one, or that have ended."""
+        ready: Sequence[Any] = wait([worker.receiver for worker in self._workers])
+        return [worker for worker in self._workers if worker.receiver in ready]
+
+    def _replace(self, worker: _Worker, plan: PiecePlan, waiting: deque[int], ended: Counter[int]) -> None:
+        """Start another worker instead of one that has ended, and let its pieces wait again.
 
         Raises
         ------
         IpsysError
-            The system has no more processes or file descriptors for this program.
+            Its piece has ended other workers before, or no worker can be started.
         """
-        while len(self._workers) < count:
-            with undivided():
-                try:
-                    self._numbers = self._numbers or os.pipe()
-                    self._workers.append(_Worker(self._numbers[0]))
-                except OSError as error:
-                    raise IpsysError(
-                        f"only {len(self._workers)} of {count} worker processes can be started "
-                        f"({error.strerror}); give fewer processes with --jobs"
-                    ) from error
-
-    def _offer(self, start: int, stop: int) -> int:
-        """Offer the pieces from ``start`` up to ``stop`` to all workers; return the next number.
-
-        A worker takes a piece when it has finished one, even while this process writes. A piece that waits
-        behind another one in a slow worker would leave the others idle at the end.
-        """
-        for number in range(start, stop):
-            os.write(self._numbers[1], number.to_bytes(_NUMBER_BYTES, "little"))
-        return stop
-
-    def _receive(self, finished: dict[int, PieceResult]) -> None:
-        """Wait for results, and add them by the numbers of their pieces."""
-        ready: Sequence[Any] = wait([worker.receiver for worker in self._workers])
-        for worker in self._workers:
-            if worker.receiver in ready:
-                number, result = worker.receive()
-                finished[number] = result
+        text = worker.describe_end()
+        self._workers.remove(worker)
+        worker.close()
+        waiting.extendleft(reversed(worker.pieces))
+        number = worker.pieces[0] if worker.pieces else -1
+        ended[number] += 1
+        if ended[number] >= _MOST_ENDED_WORKERS:
+            place = f" in {plan.pieces[number]}" if worker.pieces else ""
+            raise IpsysError(
+                f"{ended[number]} worker processes have ended {text}{place}, perhaps for lack of memory; "
+                "their results are not written. Repeat the command, or give fewer processes with --jobs"
+            )
+        self.prepare(plan)
+        self._workers[-1].send((plan.run, plan.pieces))
 
     def _stop(self) -> None:
         while self._workers:
-            with undivided():
-                self._workers.pop().stop()
-        with undivided():
-            for end in self._numbers:
-                os.close(end)
-            self._numbers = ()
+            self._workers.pop().stop()
 
 
-def serve(numbers: int) -> None:
-    """Compute the pieces with the numbers from a file descriptor, until it ends. A worker's main function."""
+def serve() -> None:
+    """Compute the pieces with the numbers from the pipe, until it ends. A worker's main function."""
     receiver, sender = parent_pipe()
     try:
-        _serve(receiver, sender, numbers)
-    except (EOFError, ConnectionError, BrokenPipeError):
+        run, pieces = receiver.recv()
+        _serve(run, pieces, receiver, sender)
+    except (EOFError, ConnectionError):
         os._exit(0)  # the process that waits for results has ended
 
 
-def _serve(receiver: Connection, sender: Connection, numbers: int) -> None:
-    run, pieces = receiver.recv()
+def _serve(run: PieceRun, pieces: Sequence[Piece], receiver: Connection, sender: Connection) -> None:
+    import cv2
+
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.runs.pieces import check_versions, compute_piece
+
+    cv2.setNumThreads(1)
     sent: Future[None] | None = None
     try:
         # The next piece is computed while the other process has no time to read a result.
-        with ThreadPoolExecutor(1) as thread:
-            for answer in _answers(run, pieces, numbers):
+        with Session(run.paths) as session, ThreadPoolExecutor(1) as thread:
+            check_versions(session, run)
+            while True:
+                result = compute_piece(session, run, pieces[receiver.recv()])
                 if sent is not None:
                     sent.result()
-                sent = thread.submit(_send, sender, answer)
+                sent = thread.submit(_send, sender, result)
     except (EOFError, ConnectionError):
         raise
     except Exception as error:
         sender.send(_failure(error))
 
 
-def _send(sender: Connection, answer: tuple[int, PieceResult]) -> None:
-    """Send an answer, or the error that prevents it: the other process waits for one of them."""
+def _send(sender: Connection, result: PieceResult) -> None:
+    """Send a result, or the error that prevents it: the other process waits for one of them."""
     try:
-        sender.send(answer)
+        sender.send(result)
     except ConnectionError:
         raise
     except Exception as error:
@@ -235,21 +246,6 @@ def _send(sender: Connection, answer: tuple[int, PieceResult]) -> None:
 def _failure(error: Exception) -> _Failure:
     trace = "".join(traceback.format_exception(error))
     return _Failure(_portable(error), trace)
-
-
-def _answers(run: PieceRun, pieces: Sequence[Piece], numbers: int) -> Iterator[tuple[int, PieceResult]]:
-    """Yield the numbers and the results of the pieces that this worker takes."""
-    import cv2
-
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.runs.pieces import check_versions, compute_piece
-
-    cv2.setNumThreads(1)
-    with Session(run.paths) as session:
-        check_versions(session, run)
-        while taken := os.read(numbers, _NUMBER_BYTES):
-            number = int.from_bytes(taken, "little")
-            yield number, compute_piece(session, run, pieces[number])
 
 
 def _portable(error: Exception) -> Exception:

@@ -13,9 +13,10 @@ from typing import BinaryIO, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 
-from ipsys_log.analysis.floor_cameras import FloorCamera, read_floor_cameras
+from ipsys_log.analysis.floor_cameras import read_floor_cameras
 from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Message, Tracks
 from ipsys_log.messages.channels import MODEL, TRACKS
@@ -195,7 +196,7 @@ class _Bag:
         self.messages += 1
 
 
-def _cameras(session: Session, run: str) -> list[FloorCamera]:
+def _cameras(session: Session, run: str) -> list[PosedCamera]:
     """Return the cameras whose pose the model of a run gives."""
     models = session.payloads(session.topics(MODEL, run)) if session.topics(MODEL, run) else []
     if not models:

@@ -1,12 +1,12 @@
-"""Sinks: consumers of messages. They never block a recording; offline, the log waits for them."""
+"""Sinks: consumers of messages, and the fan-out that hands messages to them. No sink delays a recording."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from types import TracebackType
+from dataclasses import dataclass, replace
+from types import NoneType, TracebackType
 from typing import Protocol, runtime_checkable
 
 from ipsys_log.images.video import is_keyframe
@@ -17,55 +17,45 @@ _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
 _JOIN_TIMEOUT_S = 2.0
 _IMAGES = (CompressedImage, CompressedVideo, RawImage, SkippedVideo)
 
-# Gets messages after they were written, and None if nothing comes. This type is for parts of the recorder
-# that return at once, such as its status; everything else is a sink.
-Consumer = Callable[[Message | None], None]
+# The payloads of a sink that gets all messages.
+ALL: tuple[type, ...] = (object,)
 
 # Makes an event of a kind and a text, and prints it; called from any thread.
 Warn = Callable[[str, str], None]
 
 
-class Sink(Protocol):
-    """A consumer of messages, such as a display or a stream to robots.
+@runtime_checkable
+class InlineSink(Protocol):
+    """A sink that never waits, such as a stream of datagrams: it drops what its receivers cannot take.
 
-    During a recording, ``consume`` runs in its own thread, behind a :class:`LiveQueue`: a slow sink loses
-    messages and does not delay the recording. Offline, the player waits for it, and it loses none.
+    It gets its messages in the thread that publishes them. A queue would delay them: a thread that wakes up
+    waits for Python's lock (GIL), up to 5 ms for each switch of threads. With ``NoneType`` among its
+    ``payloads``, it also gets a tick, a message without a payload, when no frame waits for the stages.
     """
 
     name: str
+    payloads: tuple[type, ...]
+
+    def send(self, message: Message) -> None:
+        """Process one message, and return at once."""
+
+
+@runtime_checkable
+class QueuedSink(Protocol):
+    """A sink with a thread and a queue of its own, such as a viewer. A slow one loses messages, images first.
+
+    It gets only messages with payloads of some types: images do not fill its queue if it does not read them.
+    """
+
+    name: str
+    payloads: tuple[type, ...]
 
     def consume(self, messages: Iterator[Message | None]) -> None:
         """Process all messages; None means that no message waits: then flush the buffers."""
 
 
-@runtime_checkable
-class SelectiveSink(Sink, Protocol):
-    """A sink that gets only messages with payloads of some types: images do not fill its queue."""
-
-    payloads: tuple[type, ...]
-
-
-@runtime_checkable
-class PromptSink(SelectiveSink, Protocol):
-    """A sink that never waits, such as a stream of datagrams: it drops what its receivers cannot take.
-
-    During a recording, it gets its messages in the thread that publishes them. A queue would delay them: a
-    thread that wakes up waits for Python's lock (GIL), up to 5 ms for each switch of threads.
-    """
-
-    def send(self, message: Message) -> None:
-        """Process one message, and return at once."""
-
-    def finish(self) -> None:
-        """Process the end of the messages."""
-
-
-def send_all(sink: PromptSink, messages: Iterator[Message | None]) -> None:
-    """Let a prompt sink process messages until they end."""
-    for message in messages:
-        if message is not None:
-            sink.send(message)
-    sink.finish()
+# A function is an inline sink that gets all messages, for parts of the recorder such as its status.
+Sink = InlineSink | QueuedSink | Callable[[Message], None]
 
 
 class DropReport:
@@ -163,130 +153,109 @@ class LiveQueue:
         )
 
 
-class LiveSinks:
-    """The sinks of a recording, as one consumer. A context manager.
+class FanOut:
+    """The sinks of a recording or a playback, as one function of a message. A context manager.
 
-    A sink that raises an error gets no more messages: an event reports the error, and the recording goes on.
+    Inline sinks get a message at once, before the functions among the sinks. A sink that raises an error gets
+    no more messages: an event reports the error, and the recording goes on.
 
     Parameters
     ----------
-    sinks : each gets every message; prompt sinks at once, the others in their own threads.
     warn : makes an event of a kind and a text, and prints it; called from any thread.
     """
 
     def __init__(self, sinks: Sequence[Sink], warn: Warn) -> None:
-        self._prompt = [sink for sink in sinks if isinstance(sink, PromptSink)]
-        queued = [sink for sink in sinks if not isinstance(sink, PromptSink)]
-        self.queues = {sink.name: LiveQueue() for sink in queued}
-        self._payloads = {sink.name: sink.payloads for sink in queued if isinstance(sink, SelectiveSink)}
-        self._drops = {sink.name: DropReport(sink.name, warn) for sink in queued}
         self._warn = warn
         self._fault: Exception | None = None
-        self._threads = [
-            threading.Thread(target=self._run, args=(sink,), name=f"sink {sink.name}", daemon=True)
-            for sink in queued
-        ]
+        self._outlets: list[_Outlet] = []
+        self._workers: list[_Worker] = []
+        functions = []
+        for sink in sinks:
+            if isinstance(sink, InlineSink):
+                self._outlets.append(_Outlet(sink.name, sink.payloads, sink.send))
+            elif isinstance(sink, QueuedSink):
+                worker = _Worker(sink, warn, self._report)
+                self._workers.append(worker)
+                self._outlets.append(_Outlet(sink.name, sink.payloads, worker.put))
+            else:
+                functions.append(_Outlet("the display", ALL, sink))
+        # Streams come first: each step before them delays the positions.
+        self._outlets += functions
 
-    def __enter__(self) -> LiveSinks:
-        for thread in self._threads:
-            thread.start()
+    def __enter__(self) -> FanOut:
+        for worker in self._workers:
+            worker.thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for sink in tuple(self._prompt):
-            self._call(sink, sink.finish)
-        for waiting in self.queues.values():
-            waiting.close()
-        for thread in self._threads:
-            thread.join(_JOIN_TIMEOUT_S)  # a window stays open as long as its user wants
-        for drops in self._drops.values():
-            drops.finish()
+        for worker in self._workers:
+            worker.queue.close()
+        for worker in self._workers:
+            worker.finish()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Hand a message to each sink."""
-        if message is None:
-            return
         if isinstance(message.payload, SkippedVideo):
             message = replace(message, payload=message.payload.frame)
-        for sink in tuple(self._prompt):
-            if isinstance(message.payload, sink.payloads):
-                self._call(sink, sink.send, message)
-        for name, waiting in self.queues.items():
-            wanted = name not in self._payloads or isinstance(message.payload, self._payloads[name])
-            if wanted and not waiting.put(message):
-                self._drops[name].add("the sink is too slow")
+        for outlet in tuple(self._outlets):
+            if outlet.wants(message):
+                try:
+                    outlet.take(message)
+                except Exception as fault:  # any error: the frames are more important
+                    self._outlets.remove(outlet)
+                    self._report(outlet.name, fault)
 
     def check(self) -> None:
         """Raise the error of the first sink that failed, if one did."""
         if self._fault is not None:
             raise self._fault
 
-    def _call(self, sink: PromptSink, function: Callable[..., None], *arguments: Message) -> None:
-        try:
-            function(*arguments)
-        except Exception as fault:  # any error: the frames are more important
-            self._prompt.remove(sink)
-            self._report(sink, fault)
-
-    def _run(self, sink: Sink) -> None:
-        waiting = self.queues[sink.name]
-        try:
-            sink.consume(iter(waiting))
-        except Exception as fault:  # any error: the frames are more important
-            waiting.close()
-            self._report(sink, fault)
-
-    def _report(self, sink: Sink, fault: Exception) -> None:
+    def _report(self, name: str, fault: Exception) -> None:
         self._fault = self._fault or fault
-        self._warn("sink_stopped", f"{sink.name} stopped ({_text_of(fault)}); the recording continues")
+        self._warn("sink_stopped", f"{name} stopped ({_text_of(fault)}); the recording continues")
 
 
-class Consumers:
-    """The consumers of a recording, and its sinks; it passes messages to them. A context manager.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outlet:
+    """A function that takes the messages of a sink: those with some payloads."""
 
-    A consumer that raises an error gets no more messages.
+    name: str
+    payloads: tuple[type, ...]
+    take: Callable[[Message], None]
 
-    Parameters
-    ----------
-    consumers : each gets every message.
-    warn : makes an event of a kind and a text, and prints it.
-    sinks : each gets every message that is not dropped for it, in its own thread.
-    """
+    def wants(self, message: Message) -> bool:
+        """Return whether the sink gets a message; only some get a tick."""
+        is_tick = message.payload is None
+        return NoneType in self.payloads if is_tick else isinstance(message.payload, self.payloads)
 
-    def __init__(self, consumers: Sequence[Consumer], warn: Warn, sinks: Sequence[Sink] = ()) -> None:
-        self._sinks = LiveSinks(sinks, warn)
-        # Streams come first: each step before them delays the positions.
-        self._consumers: list[Consumer] = [self._sinks, *consumers]
-        self._warn = warn
-        self._fault: Exception | None = None
 
-    def __enter__(self) -> Consumers:
-        self._sinks.__enter__()
-        return self
+class _Worker:
+    """The queue and the thread of a sink."""
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._sinks.__exit__(kind, error, trace)
+    def __init__(self, sink: QueuedSink, warn: Warn, report: Callable[[str, Exception], None]) -> None:
+        self.queue = LiveQueue()
+        self.thread = threading.Thread(target=self._run, name=f"sink {sink.name}", daemon=True)
+        self._sink, self._report = sink, report
+        self._drops = DropReport(sink.name, warn)
 
-    def __call__(self, message: Message | None) -> None:
-        for consumer in tuple(self._consumers):
-            try:
-                consumer(message)
-            except Exception as fault:  # any error: the frames are more important
-                self._fault = self._fault or fault
-                self._consumers.remove(consumer)
-                self._warn(
-                    "sink_stopped", f"the display stopped ({_text_of(fault)}); the recording continues"
-                )
+    def put(self, message: Message) -> None:
+        """Enqueue a message, or count it as lost."""
+        if not self.queue.put(message):
+            self._drops.add("the sink is too slow")
 
-    def check(self) -> None:
-        """Raise the error of the first consumer or sink that failed, if one did."""
-        if self._fault is not None:
-            raise self._fault
-        self._sinks.check()
+    def finish(self) -> None:
+        """Wait for the thread, but not for ever: a window stays open as long as its user wants."""
+        self.thread.join(_JOIN_TIMEOUT_S)
+        self._drops.finish()
+
+    def _run(self) -> None:
+        try:
+            self._sink.consume(iter(self.queue))
+        except Exception as fault:  # any error: the frames are more important
+            self.queue.close()
+            self._report(self._sink.name, fault)
 
 
 def _text_of(fault: Exception) -> str:

@@ -8,11 +8,11 @@ from contextlib import ExitStack, suppress
 from ipsys_log.errors import IpsysError, UnreadError, os_error_text, reason_without
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.contents import StoredChannel, camera_of_topic
-from ipsys_log.log.damage.findings import Watch
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.reader import LogReader
+from ipsys_log.log.survey import Watch
 from ipsys_log.messages import IMPORTED
 from ipsys_log.messages.channels import IMAGES, MODEL, RECORD, clock_topic
 from ipsys_log.plain_text import shell_words
@@ -185,7 +185,7 @@ def _check_stage(session: Session, stage: Recorded) -> LogFinding:
         return LogFinding("run", REMARK, text, "", topic)
     if stage.state == "unfinished" or stage.out_of_date:
         return LogFinding("run", REMARK, text, "ipsys replay computes it again", topic)
-    if any(not topic.endswith(f"/{_IMAGE_NAME}") for topic in missing) and not (is_copy or stage.is_part):
+    if any(not topic.endswith(f"/{_IMAGE_NAME}") for topic in missing) and not (is_copy or stage.is_copied):
         text = f"run {run.run}, {run.stage}: its input {missing[0]} is not in the log"
         return LogFinding("run", REMARK, text, "give the log with this input too", topic)
     return LogFinding("run", NOTE, text, "", topic)

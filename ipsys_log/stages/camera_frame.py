@@ -305,5 +305,4 @@ STAGE = Stage(
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("method", PERIMETER),
     # An event names a marker once.
-    stateless=lambda parameters, view: (CAMERA_POINTS,),
 )

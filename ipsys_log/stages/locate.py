@@ -209,5 +209,4 @@ STAGE = Stage(
     method=model_read,
     # An event names a marker once, of whichever cameras.
     per_camera=False,
-    stateless=lambda parameters, view: (POSITIONS,),
 )

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
 from ipsys_log.analysis.drift import Motion
-from ipsys_log.analysis.floor_cameras import FloorCamera, read_floor_cameras
+from ipsys_log.analysis.floor_cameras import read_floor_cameras
 from ipsys_log.analysis.reference_markers import image_sizes, read_windows
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Rig
@@ -175,7 +176,7 @@ def _check_same(log: _Log, first: _Log) -> None:
 
 def _find_cameras(
     paths: Sequence[LogLocation], until_ns: int
-) -> tuple[str, tuple[LogLocation, str], dict[str, FloorCamera]]:
+) -> tuple[str, tuple[LogLocation, str], dict[str, PosedCamera]]:
     """Return the name and the source of the first model with camera poses, and its cameras."""
     for path in paths:
         with Session([path]) as session:

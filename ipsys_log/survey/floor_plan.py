@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, plan_points
 from ipsys_log.analysis.tape import TapeCovariances, expected_tape_covariances
 from ipsys_log.arrays import Array
@@ -118,18 +119,20 @@ def plan_floor(
     measured_m = np.unique(np.vstack([view.fitted_m for view in views]), axis=0)
     height_m = _usual_height(rig, measured_m)
     low_m, high_m = _corners(rig, measured_m)
-    step_m, xs_m, ys_m = _cells(low_m, high_m)
+    grid = _cells(low_m, high_m)
     side_m = _side(rig)
     plan = plan_points(
         views,
-        mesh(xs_m, ys_m, [height_m]),
-        _candidates(rig, low_m, high_m, step_m, side_m / 2, heights_m or _used_heights(measured_m[:, 2])),
+        mesh(grid.xs_m, grid.ys_m, [height_m]),
+        _candidates(
+            rig, low_m, high_m, grid.step_m, side_m / 2, heights_m or _used_heights(measured_m[:, 2])
+        ),
         _tape(session, rig),
         _RADIUS * side_m,
         count,
     )
     notes = tuple(_notes(model, rig, lenses, plan))
-    return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes)
+    return PlannedFloor(model.name, run, rig, plan, grid.xs_m, grid.ys_m, height_m, measured_m, notes)
 
 
 def _plan_corner_model(
@@ -143,7 +146,6 @@ def _plan_corner_model(
 ) -> PlannedFloor:
     """Plan points and a drive for a model of corners: its covariance gives their effect."""
     # Late: scipy takes 1 s, and plans of other models do not need these.
-    from ipsys_log.analysis.expected_error import FloorGrid
     from ipsys_log.analysis.joint_plan import choose_drive, expect_on_floor, plan_joint_points
     from ipsys_log.joint.payload import restore_joint
 
@@ -156,15 +158,15 @@ def _plan_corner_model(
     if rig.floor is None and not len(measured_m):
         raise IpsysError("the rig has no floor; write its width_m and depth_m into lab.toml, and give --rig")
     low_m, high_m = _corners(rig, measured_m)
-    step_m, xs_m, ys_m = _cells(low_m, high_m)
+    grid = _cells(low_m, high_m)
     side_m, height_m = _side(rig), _usual_height(rig, measured_m)
-    expected = expect_on_floor(models, sizes_px, FloorGrid(xs_m, ys_m, step_m), height_m, side_m)
-    candidates_m = _candidates(rig, low_m, high_m, _COARSE * step_m, side_m / 2, heights_m or [0.0])
+    expected = expect_on_floor(models, sizes_px, grid, height_m, side_m)
+    candidates_m = _candidates(rig, low_m, high_m, _COARSE * grid.step_m, side_m / 2, heights_m or [0.0])
     tape_m2 = _tape_covariances(session, rig)
     plan = plan_joint_points(models, sizes_px, expected, candidates_m, tape_m2, side_m, count)
     drive = choose_drive(models, sizes_px, expected, low_m, high_m, height_m, side_m)
     notes = tuple(_joint_notes(rig, {*models}))
-    return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes, drive)
+    return PlannedFloor(model.name, run, rig, plan, grid.xs_m, grid.ys_m, height_m, measured_m, notes, drive)
 
 
 def _usual_height(rig: Rig, measured_m: Array) -> float:
@@ -175,11 +177,10 @@ def _usual_height(rig: Rig, measured_m: Array) -> float:
     return round(float(np.median(carried_m or measured_m[:, 2].tolist() or [0.0])), 3)
 
 
-def _cells(low_m: Array, high_m: Array) -> tuple[float, Array, Array]:
-    """Return the size of the floor's cells, and the x and y of their centres."""
+def _cells(low_m: Array, high_m: Array) -> FloorGrid:
+    """Return the grid of the centres of the floor's cells."""
     step_m = _STEP_M * max(1, round(float((high_m - low_m).max()) / _SPAN_M))
-    xs_m, ys_m = (np.arange(a + step_m / 2, b, step_m) for a, b in zip(low_m, high_m, strict=True))
-    return step_m, xs_m, ys_m
+    return FloorGrid.of_cells(low_m, high_m, step_m)
 
 
 def _side(rig: Rig) -> float:

@@ -11,10 +11,10 @@ from ipsys_log.analysis.calibration_points import measured, split_ids
 from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
     FloorGap,
-    FloorGrid,
     expect_errors,
     find_gaps,
 )
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.analysis.intrinsics_test import find_contradictions
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
 from ipsys_log.analysis.tape import expected_tape_covariances

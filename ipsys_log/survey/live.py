@@ -72,9 +72,9 @@ class LiveScene:
         # For each camera and measurement: the id, the marker, and its mean camera point (3,).
         self._measured: dict[str, list[tuple[str, int, NDArray[np.float64]]]] = {c: [] for c in cameras}
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Handle one frame, or one result of a stage."""
-        if message is None or message.camera not in self._images:
+        if message.camera not in self._images:
             return
         payload, camera = message.payload, message.camera
         with self._lock:

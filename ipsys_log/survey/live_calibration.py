@@ -24,7 +24,7 @@ _CELLS = 8, 5
 
 
 class LiveCalibration:
-    """A consumer of a recording that fits the lab again every few seconds, in its own thread.
+    """A sink of a recording that fits the lab again every few seconds, in its own thread.
 
     An error of a fit is text for the user. It cannot end the recording. A bug is raised by a later
     message, or by ``close``.
@@ -59,10 +59,8 @@ class LiveCalibration:
         self._worker = ThreadPoolExecutor(1, "calibration")
         self._fitting: Future[None] | None = None
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Take a message; start a fit if it is time for one and no other fit works."""
-        if message is None:
-            return
         payload, camera = message.payload, str(message.camera)
         if isinstance(payload, Measurement):
             self._entered.append(payload)

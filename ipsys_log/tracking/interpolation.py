@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.arrays import Array, Indices, Times
+from ipsys_log.geometry.time_brackets import bracket_times
 from ipsys_log.tracking.motion import MotionNoise, transition
 from ipsys_log.units import NS_PER_S
 
@@ -77,12 +78,9 @@ def interpolate(rows: TrackRows, times_ns: Times, noise: MotionNoise | None = No
     -------
     TrackSamples : at the instant of a row, those of the row.
     """
-    count = len(rows.times_ns)
-    if not count:
+    if not len(rows.times_ns):
         return _outside(len(times_ns))
-    before = np.clip(np.searchsorted(rows.times_ns, times_ns, side="right") - 1, 0, count - 1)
-    after = np.where(rows.times_ns[before] < times_ns, np.minimum(before + 1, count - 1), before)
-    inside = (times_ns >= rows.times_ns[before]) & (times_ns <= rows.times_ns[after])
+    before, after, _, inside = bracket_times(rows.times_ns, times_ns, np.inf)
     inside &= rows.numbers[before] == rows.numbers[after]
     samples = _between(rows, before, after, times_ns, noise or MotionNoise())
     for one in fields(samples):

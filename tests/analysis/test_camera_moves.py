@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.camera_moves import DriftLog, LabDrift, find_drift
 from ipsys_log.analysis.drift import MeanCorners
-from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, move_camera, shift_floor_map
+from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.analysis.reference_markers import Window
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import pose_facing_up, transform
 from ipsys_log.messages import Floor
 from ipsys_log.simulation.cameras import mount_cameras
@@ -30,7 +31,7 @@ LENGTH_M = 0.2
 KNOCK = np.array([0.0006, 0.0012, 0.0003, 0.0, 0.0, 0.0])
 
 CAMERAS = {
-    one.name: FloorCamera(one.name, one.lens, one.camera_from_world[:3, :3], one.origin_m)
+    one.name: PosedCamera.at_pose(one.name, one.lens, one.camera_from_world)
     for one in mount_cameras(LabSettings(seed=3))
 }
 Motions = Callable[[str, int, int], Array]
@@ -49,7 +50,7 @@ def log(week: int, motions: Motions, places: Mapping[int, tuple[float, float]] =
         start_ns = week * WEEK_NS + number * NS_PER_S
         seen: dict[str, dict[int, MeanCorners]] = {}
         for name, camera in CAMERAS.items():
-            moved = move_camera(camera, motions(name, week, number))
+            moved = camera.move(motions(name, week, number))
             for marker_id, (x_m, y_m) in places.items():
                 placed_m = transform(pose_facing_up(x_m, y_m, 0.0, 0.3), marker_corners(LENGTH_M))
                 if in_image(moved.transform(placed_m), moved.lens).all():

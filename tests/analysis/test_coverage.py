@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.coverage import MountedCamera, cover_floor
+from ipsys_log.analysis.coverage import cover_floor
 from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import look_down, pose_facing_up, transform
 from ipsys_log.messages import CameraCalibration, Floor
 from ipsys_log.simulation.cameras import Camera, mount_cameras, sees
@@ -18,11 +19,11 @@ Array = NDArray[np.float64]
 FLOOR = Floor(2.0, 3.0)
 
 
-def pinhole(camera: str, x_m: float, y_m: float, height_m: float = 2.0) -> MountedCamera:
+def pinhole(camera: str, x_m: float, y_m: float, height_m: float = 2.0) -> PosedCamera:
     """Return a camera that sees 2.4 m x 1.6 m of the floor from a height of 2 m."""
     K = np.array([[1000.0, 0, 600], [0, 1000, 400], [0, 0, 1]])
     lens = CameraCalibration(0, camera, 1201, 801, "plumb_bob", np.zeros(5), K)
-    return MountedCamera(camera, lens, look_down(np.array([x_m, y_m, height_m])))
+    return PosedCamera.at_pose(camera, lens, look_down(np.array([x_m, y_m, height_m])))
 
 
 @pytest.mark.parametrize(("apart_m", "width_m"), [(1.1, 0.5), (1.4, 0.2), (1.7, -0.1)])
@@ -71,7 +72,7 @@ def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]
 def test_tilted_fisheye_coverage_equals_a_corner_test() -> None:
     lab = LabSettings(cameras=("red",), tilt_deg=(4.0, 6.0), mount_height_m=2.4)
     (camera,) = mount_cameras(lab)
-    hung = MountedCamera("red", camera.lens, camera.camera_from_world)
+    hung = PosedCamera.at_pose("red", camera.lens, camera.camera_from_world)
     found = cover_floor(Floor(4.88, 4.88), [hung], 0.2, 0.1)
     mask = found.whole["red"]
     step = 5

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.drift import Baseline, MeanCorners, Motion, build_baseline, estimate_motion
-from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, move_camera, shift_floor_map
+from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.geometry.lenses import intersect_height, project, undistort
 from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
 from ipsys_log.messages import Floor
 from ipsys_log.simulation.cameras import mount_cameras
@@ -28,13 +29,13 @@ THREE, LINE = ((1.0, 2.0), (3.8, 2.0), (2.4, 3.1)), ((1.0, 2.4), (2.4, 2.42), (3
 FOUR = (*THREE, (2.0, 1.9))
 
 
-def camera(seed: int = 1) -> FloorCamera:
+def camera(seed: int = 1) -> PosedCamera:
     mounted = mount_cameras(LabSettings(seed=seed))[1]
-    return FloorCamera(mounted.name, mounted.lens, mounted.camera_from_world[:3, :3], mounted.origin_m)
+    return PosedCamera.at_pose(mounted.name, mounted.lens, mounted.camera_from_world)
 
 
 def corners(
-    own: FloorCamera, places: Sequence[tuple[float, float]], rng: np.random.Generator | None = None
+    own: PosedCamera, places: Sequence[tuple[float, float]], rng: np.random.Generator | None = None
 ) -> dict[int, MeanCorners]:
     """Return the corners of markers on the floor, with slow changes of light if there is a generator."""
     means = {}
@@ -47,7 +48,7 @@ def corners(
     return means
 
 
-def baseline(own: FloorCamera, means: Mapping[int, MeanCorners]) -> Baseline:
+def baseline(own: PosedCamera, means: Mapping[int, MeanCorners]) -> Baseline:
     return build_baseline(own, floor_grid(own, FLOOR), means, dict.fromkeys(means, LENGTH_M))
 
 
@@ -55,9 +56,7 @@ def estimate(
     places: Sequence[tuple[float, float]], motion: Array, rng: np.random.Generator | None = None
 ) -> Motion:
     own = camera()
-    found = estimate_motion(
-        baseline(own, corners(own, places, rng)), corners(move_camera(own, motion), places, rng)
-    )
+    found = estimate_motion(baseline(own, corners(own, places, rng)), corners(own.move(motion), places, rng))
     assert found is not None
     return found
 
@@ -66,7 +65,7 @@ def true_shift_m(motion: Array) -> float:
     """Return the mean shift of the floor map by pixels: moved camera, old lens and pose, floor."""
     own = camera()
     points_m = floor_grid(own, FLOOR)
-    uv = undistort(project(move_camera(own, motion).transform(points_m), own.lens), own.lens)
+    uv = undistort(project(own.move(motion).transform(points_m), own.lens), own.lens)
     rays = np.column_stack([uv, np.ones(len(uv))]) @ own.camera_from_world
     located_m = intersect_height(own.origin_m, rays, np.zeros(len(rays)))
     return float(np.linalg.norm(located_m - points_m, axis=1).mean())
@@ -167,8 +166,7 @@ def test_marker_on_a_wall_shows_a_motion() -> None:
     steep = rotation(np.array([0.0, 0.0, 0.4])) @ rotation(np.array([1.2, 0.0, 0.0]))
     placed_m = transform(make_pose(steep, np.array([2.4, 2.9, 0.1])), marker_corners(LENGTH_M))
     seen = [
-        {90: MeanCorners(project(one.transform(placed_m), one.lens), 50)}
-        for one in (own, move_camera(own, motion))
+        {90: MeanCorners(project(one.transform(placed_m), one.lens), 50)} for one in (own, own.move(motion))
     ]
     found = estimate_motion(baseline(own, seen[0]), seen[1])
     assert found is not None

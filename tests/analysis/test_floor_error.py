@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
-from ipsys_log.analysis.floor_error import (
+from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import CameraCalibration, CameraPoints, Marker, Markers, Message, Positions, Rig
+from ipsys_log.simulation.cameras import sees
+from ipsys_log.simulation.settings import FLOOR_M, LabSettings
+from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.stages.fit import fit_model
+from ipsys_log.stages.locate import Locate
+from tests.geometric.floor_error import (
     KnownSightings,
     Locator,
     align_rigidly,
@@ -21,14 +29,6 @@ from ipsys_log.analysis.floor_error import (
     region_shares,
     summarize,
 )
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
-from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration, CameraPoints, Marker, Markers, Message, Positions, Rig
-from ipsys_log.simulation.cameras import sees
-from ipsys_log.simulation.settings import FLOOR_M, LabSettings
-from ipsys_log.stages.camera_frame import CameraFrame
-from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

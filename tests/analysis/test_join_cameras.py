@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import align_camera, join_cameras
-from ipsys_log.analysis.coverage import MountedCamera
 from ipsys_log.analysis.stationary import StationaryMarker
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, rotation, transform
 from ipsys_log.messages import CameraCalibration
 
@@ -34,16 +34,17 @@ def lying(camera: str, pose: Array) -> list[StationaryMarker]:
     return [StationaryMarker(n, p, NONE) for n, p in zip(ids, transform(pose, places_m), strict=True)]
 
 
-def joined(red: list[StationaryMarker], white: list[StationaryMarker]) -> list[MountedCamera]:
+def joined(red: list[StationaryMarker], white: list[StationaryMarker]) -> list[PosedCamera]:
     alignments = [align_camera("red", red), align_camera("white", white)]
     return join_cameras(alignments, {"red": LENS, "white": LENS})
 
 
 def test_two_common_markers_join_two_cameras() -> None:
     red, white = joined(lying("red", RED), lying("white", WHITE))
-    found = red.camera_from_world @ invert_pose(white.camera_from_world)
-    assert np.abs(found - RED @ invert_pose(WHITE)).max() < 1e-6
-    assert np.abs(invert_pose(red.camera_from_world)[2] - invert_pose(RED)[2]).max() < 1e-6
+    expected = RED @ invert_pose(WHITE)
+    assert np.abs(red.camera_from_world @ white.camera_from_world.T - expected[:3, :3]).max() < 1e-6
+    assert np.abs(red.transform(white.origin_m) - expected[:3, 3]).max() < 1e-6
+    assert abs(red.origin_m[2] - invert_pose(RED)[2, 3]) < 1e-6
 
 
 def test_different_markers_do_not_join_cameras() -> None:

@@ -12,11 +12,11 @@ from hypothesis.extra.numpy import arrays
 
 from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
-    FloorGrid,
     MarkerView,
     expect_errors,
     see_markers,
 )
+from ipsys_log.analysis.floor_grid import FloorGrid
 from ipsys_log.analysis.joint_plan import choose_drive, plan_joint_points
 from ipsys_log.analysis.taped_points import choose_points, mean_error, posterior_root, some_modes
 from ipsys_log.errors import IpsysError

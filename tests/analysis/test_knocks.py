@@ -9,10 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.analysis import knocks
-from ipsys_log.analysis.floor_cameras import FloorCamera, move_camera, shift_floor_map
+from ipsys_log.analysis.floor_cameras import shift_floor_map
 from ipsys_log.analysis.knocks import Knock, KnockMonitor
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.geometry.poses import pose_facing_up, transform
 from ipsys_log.messages import Marker, Markers, Message, Position, Positions, ReferenceMarker, Rig
 from ipsys_log.simulation.cameras import mount_cameras
@@ -27,7 +28,7 @@ LENGTH_M = 0.2
 KNOCK = np.array([0.0, 0.0015, 0.0, 0.0, 0.0, 0.0])
 AT_S, LAST_S = 4.0, 8.0
 CAMERAS = {
-    one.name: FloorCamera(one.name, one.lens, one.camera_from_world[:3, :3], one.origin_m)
+    one.name: PosedCamera.at_pose(one.name, one.lens, one.camera_from_world)
     for one in mount_cameras(LabSettings(seed=3))
 }
 RIG = Rig("lab", "DICT_4X4_100", LENGTH_M, reference_markers=tuple(map(ReferenceMarker, PLACES)))
@@ -55,7 +56,7 @@ def frames(
     for number in range(round(LAST_S * rate_hz)):
         for offset, (name, camera) in enumerate(CAMERAS.items()):
             time_s = number / rate_hz + 0.011 * offset
-            moved, markers = move_camera(camera, motion(name, time_s)), []
+            moved, markers = camera.move(motion(name, time_s)), []
             for marker_id, (x_m, y_m) in places(time_s).items():
                 points_c = moved.transform(
                     transform(pose_facing_up(x_m, y_m, 0.0, 0.3), marker_corners(LENGTH_M))

@@ -12,11 +12,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ipsys_log.batch import execution
 from ipsys_log.batch.execution import run_batch
 from ipsys_log.batch.tasks import BatchTask
 from ipsys_log.batch.workers import WorkerSettings, open_workers
 from ipsys_log.errors import IpsysError
-from tests.batch.piece_works import replay_pieces
+from tests.batch.piece_works import compute_and_note, replay_pieces
 from tests.batch.works import PATIENCE_S, replay_and_note
 
 
@@ -37,6 +38,7 @@ def main(text: str) -> None:
             task = BatchTask(replay_and_note, {"notes": Path(request["notes"])})
             if request.get("pieces"):
                 task = BatchTask(replay_pieces, divides=True)
+                vars(execution)["compute_alone"] = compute_and_note
             results = [asdict(result) for result in run_batch(workers, task, logs)]
     except IpsysError as error:
         sys.stdout.write(json.dumps({"error": str(error)}))

@@ -8,16 +8,16 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.batch import tasks
 from ipsys_log.batch.log_work import replay_log
-from ipsys_log.batch.tasks import LogResult
+from ipsys_log.batch.tasks import LogResult, compute_alone
 from ipsys_log.log.location import LogLocation
 from ipsys_log.runs import pieces
-from ipsys_log.runs.piece_folder import PieceTask, store_piece
+from ipsys_log.runs.pieces import Piece, PieceResult, PieceRun
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, is_first
 
 NOTES = "IPSYS_TEST_NOTES"
@@ -31,23 +31,22 @@ def replay_pieces(path: LogLocation, **options: Any) -> LogResult:
     return replay_log(path, until=UNTIL, parameters=PARAMETERS, **options)
 
 
-def _store_and_note(task: PieceTask) -> None:
-    """Store a piece. The first piece of one log ends each worker; that of another log waits once."""
+def compute_and_note(run: PieceRun, piece: Piece, software: Mapping[str, str]) -> PieceResult:
+    """Compute a piece. The first piece of one log ends each worker; that of another log waits once."""
     notes = Path(os.environ[NOTES])
-    log = Path(str(task.run.paths[0])).name
-    with (notes / f"{log}-{task.key}").open("a") as file:
+    log, key = Path(str(run.paths[0])).name, f"{piece.camera}-{piece.start_ns}"
+    with (notes / f"{log}-{key}").open("a") as file:
         file.write("x")
     if log == DEADLY:
         with suppress(FileExistsError):  # the first piece that starts
-            (notes / "deadly_piece").symlink_to(task.key)
-        if str((notes / "deadly_piece").readlink()) == task.key:
+            (notes / "deadly_piece").symlink_to(key)
+        if str((notes / "deadly_piece").readlink()) == key:
             os.kill(os.getpid(), signal.SIGKILL)
-    if log == HELD and is_first(notes / "killed", task.key):
+    if log == HELD and is_first(notes / "killed", key):
         (notes / "pid").write_text(str(os.getpid()))
         time.sleep(PATIENCE_S)
-    store_piece(task)
+    return compute_alone(run, piece, software)
 
 
 if NOTES in os.environ:
-    vars(tasks)["store_piece"] = _store_and_note
     pieces._MIN_FRAMES = 1

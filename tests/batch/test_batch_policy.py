@@ -10,36 +10,38 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.batch.execution import MOST_ENDED_WORKERS, run_batch
+from ipsys_log.batch.execution import MOST_ENDED_WORKERS, DaskPieces, run_batch
 from ipsys_log.batch.tasks import (
     BatchTask,
-    LogPieces,
     LogResult,
-    PieceState,
+    OtherSoftwareError,
     VersionError,
+    compute_alone,
     perform,
-    perform_or_divide,
 )
 from ipsys_log.batch.workers import Workers
 from ipsys_log.errors import IpsysError, WriteError
-from ipsys_log.runs.piece_folder import PieceTask
-from ipsys_log.runs.pieces import Piece, PieceRun
+from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
 
 
 class Future:
-    """A future that is done when its scheduler says so."""
+    """A future that is done when its scheduler says so. Its work is on a log, or on a piece of a log."""
 
-    def __init__(self, path: Path, piece: PieceTask | None) -> None:
-        self.path, self.piece = path, piece
-        self.answer: Any = None
+    def __init__(self, work: Path | Piece) -> None:
+        self.work = work
         self.error: Exception | None = None
         self.callback: Callable[[Future], None] = lambda future: None
+
+    @property
+    def name(self) -> str:
+        return self.work.name if isinstance(self.work, Path) else str(self.work.start_ns)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         self.callback = callback
@@ -47,86 +49,53 @@ class Future:
     def result(self) -> Any:
         if self.error is not None:
             raise self.error
-        return self.answer
+        return LogResult(str(self.work), "computed") if isinstance(self.work, Path) else self.work
 
     def release(self) -> None:
         """Do nothing: the scheduler has forgotten the future already."""
 
 
 class Scheduler:
-    """A scheduler whose workers end in the tasks of some logs, with all other tasks that run meanwhile.
+    """A scheduler whose workers end in some tasks, with all other tasks that run meanwhile.
 
-    It repeats a task itself ``retries`` times before it reports the end of a worker. The logs in ``long``
-    have this number of pieces, and the deadly ones among them end their workers in their first piece only.
+    It repeats a task itself ``retries`` times before it reports the end of a worker.
     """
 
-    def __init__(
-        self,
-        deadly: set[str],
-        order: list[int],
-        losses: int = 0,
-        retries: int = 0,
-        long: dict[str, int] | None = None,
-        other_software: bool = False,
-    ) -> None:
+    def __init__(self, deadly: set[str], order: list[int], losses: int = 0, retries: int = 0) -> None:
         self.deadly, self.order, self.losses, self.retries = deadly, order, losses, retries
-        self.long, self.other_software = long or {}, other_software
         self.status, self.most = "running", 0
         self.running: list[Future] = []
         self.starts: Counter[str] = Counter()
-        self.stored: set[tuple[str, int]] = set()
-        self.forgets = False
 
-    def submit(
-        self, work: Any, _task: BatchTask, path: Path, piece: PieceTask | None = None, **_: Any
-    ) -> Future:
-        future = Future(path, piece)
-        if piece is None:
-            future.answer = self._answer(path, work is perform_or_divide)
-        name = path.name if piece is None else f"{path.name}/{piece.key}"
-        self.starts[name] += 1
+    def submit(self, _work: Any, _task: Any, work: Path | Piece, *_: Any, **__: Any) -> Future:
+        future = Future(work)
+        self.starts[future.name] += 1
         self.running.append(future)
         self.most = max(self.most, len(self.running))
         return future
 
-    def _answer(self, path: Path, may_divide: bool) -> LogResult | LogPieces:
-        count = self.long.get(path.name, 0) if may_divide else 0
-        tasks = [n for n in range(count) if (path.name, n) not in self.stored]
-        return (
-            LogPieces(tuple(map(_piece, tasks))) if tasks else LogResult(str(path), "computed", pieces=count)
-        )
+    def cancel(self, futures: list[Future]) -> None:
+        self.running = [future for future in self.running if future not in futures]
 
     def advance(self) -> None:
         """End one task, or all of them if their worker ends."""
         place = self.order.pop() if self.order else 0
         future = self.running[place % len(self.running)]
         ended = [future]
-        is_first = future.piece.key == "0" if future.piece else future.path.name not in self.long
-        if future.path.name in self.deadly and is_first:
+        if future.name in self.deadly:
             ended = [*self.running]
             for one in ended:
                 one.error = distributed.KilledWorker("task", SimpleNamespace(address="here"), self.retries)
         elif self.losses:
             self.losses -= 1
             future.error = distributed.CancelledError("lost")
-        elif future.piece is not None:
-            future.answer = PieceState(other_software=self.other_software)
-            if not (self.other_software or self.forgets):
-                self.stored.add((future.path.name, int(future.piece.key)))
         for one in ended:
             self.running.remove(one)
             one.callback(one)
 
 
-def _piece(number: int) -> PieceTask:
-    run = PieceRun(paths=(), stage="", parameters={}, topics=(), lenses={})
-    return PieceTask(run, Piece("red", number, number + 1), str(number), Path("pieces"), {})
-
-
-def run(
-    scheduler: Scheduler, paths: list[Path], window: int, monkeypatch: pytest.MonkeyPatch
-) -> dict[str, Any]:
-    workers = Workers(scheduler, "tls://here", "", window)
+def _queue_of(scheduler: Scheduler) -> type:
+    """Return a queue whose reader lets the scheduler advance."""
 
     class Queue(list[Future]):
         put = list.append
@@ -136,10 +105,16 @@ def run(
                 scheduler.advance()
             return self.pop(0)
 
+    return Queue
+
+
+def run(
+    scheduler: Scheduler, paths: list[Path], window: int, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, Any]:
+    workers = Workers(scheduler, "tls://here", "", window)
     with monkeypatch.context() as patch:
-        patch.setattr("ipsys_log.batch.execution.SimpleQueue", Queue)
-        task = BatchTask(lambda path: LogResult("", ""), divides=True)
-        results = list(run_batch(workers, task, paths))
+        patch.setattr("ipsys_log.batch.execution.SimpleQueue", _queue_of(scheduler))
+        results = list(run_batch(workers, BatchTask(lambda path: LogResult("", "")), paths))
     assert sorted(result.log for result in results) == sorted(map(str, paths))
     return {Path(result.log).name: result for result in results}
 
@@ -165,52 +140,44 @@ def test_only_logs_that_end_their_workers_fail(
 
 
 @given(
-    counts=st.lists(st.integers(0, 7), min_size=1, max_size=8),
+    count=st.integers(1, 12),
     window=st.integers(1, 6),
-    deadly=st.sets(st.integers(0, 7), max_size=2),
-    order=st.lists(st.integers(0, 5), max_size=60),
-    retries=st.sampled_from([0, 3]),
+    order=st.lists(st.integers(0, 11), max_size=60),
+    losses=st.integers(0, 2),
 )
-def test_deadly_piece_fails_only_its_log(
-    counts: list[int], window: int, deadly: set[int], order: list[int], retries: int
-) -> None:
-    long = {f"{number}.mcap": count for number, count in enumerate(counts) if count}
-    names = {f"{number}.mcap" for number in deadly if number < len(counts)}
-    scheduler = Scheduler(names, order, retries=retries, long=long)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        results = run(
-            scheduler, [Path(f"{number}.mcap") for number in range(len(counts))], window, monkeypatch
-        )
-    assert {name for name, result in results.items() if not result.good} == names
-    assert all("in the piece of red" in results[name].text for name in names & long.keys())
-    for name in long.keys() - names:
-        assert {(name, number) for number in range(long[name])} <= scheduler.stored
-    assert scheduler.most <= window
+def test_pieces_come_in_order(count: int, window: int, order: list[int], losses: int) -> None:
+    scheduler = Scheduler(set(), order, losses)
+    shown: list[tuple[int, int]] = []
+    assert compute(scheduler, count, window, shown) == list(range(count))
+    assert scheduler.most <= 2 * window + 1
+    assert sum(scheduler.starts.values()) == count + losses
+    assert shown == [(number, count) for number in range(1, count + 1)]
 
 
-def test_pieces_of_a_log_run_once_and_on_all_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    scheduler = Scheduler(set(), [2, 0, 1, 2, 2], long={"a.mcap": 9})
-    results = run(scheduler, [Path("a.mcap")], 3, monkeypatch)
-    assert results["a.mcap"].pieces == 9
-    assert scheduler.most == 3
-    assert scheduler.starts == {"a.mcap": 2, **{f"a.mcap/{number}": 1 for number in range(9)}}
+def test_piece_that_ends_its_workers_is_named() -> None:
+    scheduler = Scheduler({"2"}, [])
+    with pytest.raises(IpsysError, match=r"its worker ended 4 times in the piece of red that begins at .*"):
+        compute(scheduler, 5, 1, [])
+    assert (scheduler.starts["2"], scheduler.running) == (4, [])
 
 
-def test_log_is_one_task_if_workers_have_other_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
-    scheduler = Scheduler(set(), [], long={"a.mcap": 9}, other_software=True)
-    results = run(scheduler, [Path("a.mcap")], 3, monkeypatch)
-    assert (results["a.mcap"].state, results["a.mcap"].pieces) == ("computed", 0)
+def test_worker_with_other_libraries_computes_no_piece() -> None:
+    with pytest.raises(OtherSoftwareError, match="different versions: numpy"):
+        compute_alone(_RUN, Piece("red", 0, 1), {"numpy": "0.1"})
 
 
-def test_pieces_that_others_cannot_see_fail_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
-    scheduler = Scheduler(set(), [], long={"a.mcap": 2})
-    scheduler.forgets = True
-    results = run(scheduler, [Path("a.mcap"), Path("b.mcap")], 2, monkeypatch)
-    assert results["b.mcap"].good
-    assert scheduler.starts["a.mcap"] == 4  # three divisions
-    assert results["a.mcap"].text == (
-        "its pieces are not in pieces: all workers must see this folder; use a shared file system"
-    )
+_RUN = PieceRun(paths=(), stage="detect", parameters={"corners": "stock"}, topics=(), lenses={})
+
+
+def compute(scheduler: Scheduler, count: int, window: int, shown: list[tuple[int, int]]) -> list[int]:
+    """Compute pieces of one camera; return the numbers of the results in their order."""
+    none = np.empty(0, np.int64)
+    plan = PiecePlan(_RUN, PieceFrames(("red",), none, none), [Piece("red", n, n + 1) for n in range(count)])
+    workers = Workers(scheduler, "tls://here", "", window)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ipsys_log.batch.execution.SimpleQueue", _queue_of(scheduler))
+        results: Any = DaskPieces(workers, lambda done, total: shown.append((done, total))).compute(plan)
+        return [piece.start_ns for piece in results]
 
 
 def test_log_that_ends_four_workers_alone_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +198,7 @@ def test_tasks_that_the_scheduler_loses_run_again(monkeypatch: pytest.MonkeyPatc
 def test_lost_scheduler_ends_the_batch_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     scheduler = Scheduler(set(), [], losses=1)
     scheduler.status = "closed"
-    with pytest.raises(IpsysError, match=r"tls://here was lost after 0 of 2 logs; .* repeat the command"):
+    with pytest.raises(IpsysError, match=r"tls://here was lost; .* repeat the command"):
         run(scheduler, [Path("a.mcap"), Path("b.mcap")], 1, monkeypatch)
 
 

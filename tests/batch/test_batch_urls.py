@@ -7,6 +7,7 @@ import os
 import pickle
 import shutil
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ import pytest
 
 from ipsys_log import api
 from ipsys_log.batch.log_work import check_log, export_log, replay_log, verify_log
-from ipsys_log.batch.tasks import BatchTask, LogPieces, LogResult, perform, perform_or_divide, perform_piece
+from ipsys_log.batch.tasks import BatchTask, LogResult, compute_alone, perform
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.runs import pieces
+from ipsys_log.runs.pieces import PiecePlan, PieceResult
+from ipsys_log.runs.provenance import fingerprint
 from tests.batch.piece_works import PARAMETERS, UNTIL
 from tests.batch.works import batch
 from tests.changed_logs import rewrite
@@ -136,20 +139,30 @@ def test_derived_log_of_another_object_fails(bucket: Any, derived: Path, tmp_pat
     assert not (tmp_path / "tables").exists()
 
 
+class OneAfterTheOther:
+    """Workers that compute the pieces of a log in this process, as on another machine."""
+
+    divides, first_only = True, False
+
+    def __init__(self, change: Callable[[], object] = lambda: None) -> None:
+        self.change = change
+
+    def prepare(self, _plan: PiecePlan) -> None: ...
+
+    def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
+        for piece in plan.pieces:
+            yield compute_alone(*pickle.loads(pickle.dumps((plan.run, piece, fingerprint()))))
+            self.change()
+
+
 def test_pieces_of_an_object_give_the_bytes_of_the_file(
     bucket: Any, lab_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pieces, "_MIN_FRAMES", 1)
     url = LogUrl(put(bucket, "lab.mcap", lab_log.read_bytes()))
     options = {"until": UNTIL, "parameters": PARAMETERS, "folder": tmp_path}
-    task = BatchTask(replay_log, options, divides=True)
-    divided = perform_or_divide(task, url)
-    assert isinstance(divided, LogPieces)
-    for piece in reversed(pickle.loads(pickle.dumps(divided.tasks))):  # as on another machine
-        assert perform_piece(task, url, piece).failure is None
-    result = perform_or_divide(task, url)
-    assert isinstance(result, LogResult)
-    assert (result.state, result.pieces) == ("computed", len(divided.tasks))
+    result = perform(BatchTask(replay_log, {**options, "workers": OneAfterTheOther()}), url)
+    assert result.state == "computed"
     api.replay(lab_log, output=tmp_path / "alone.mcap", until=UNTIL, parameters=PARAMETERS, jobs=1)
     assert (tmp_path / "lab.derived.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
 
@@ -159,13 +172,10 @@ def test_object_that_changes_between_pieces_fails(
 ) -> None:
     monkeypatch.setattr(pieces, "_MIN_FRAMES", 1)
     url = LogUrl(put(bucket, "lab.mcap", lab_log.read_bytes()))
-    task = BatchTask(replay_log, {"until": UNTIL, "parameters": PARAMETERS, "folder": tmp_path}, divides=True)
-    divided = perform_or_divide(task, url)
-    assert isinstance(divided, LogPieces)
-    put(bucket, "lab.mcap", PAPER_LAB.read_bytes())
-    state = perform_piece(task, url, divided.tasks[0])
-    assert state.failure is not None
-    assert state.failure.text == "changed while it was read: run the command again"
+    workers = OneAfterTheOther(lambda: put(bucket, "lab.mcap", PAPER_LAB.read_bytes()))
+    options = {"until": UNTIL, "parameters": PARAMETERS, "folder": tmp_path, "workers": workers}
+    result = perform(BatchTask(replay_log, options), url)
+    assert "changed while it was read" in result.text
     assert not list(tmp_path.glob("*.mcap"))
 
 

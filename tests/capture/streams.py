@@ -19,8 +19,6 @@ import simplejpeg
 
 from tests.waiting import wait_until
 
-__all__ = ["encode", "ffmpeg", "make_jpegs", "serve", "serve_rtsp"]
-
 # A limit far above any duration on a busy machine.
 _LIMIT_S = 240.0
 # The option of Linux for a buffer above the limit of the system; only root may set it.

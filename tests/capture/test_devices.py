@@ -14,7 +14,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.capture import devices
-from ipsys_log.capture.devices import check_devices, check_sources, open_source
+from ipsys_log.capture.devices import check_sources, open_source
 from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
@@ -114,9 +114,10 @@ def test_two_names_of_one_device_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         IpsysError, match=f"cameras red and white have the same device, {device}; give each its own"
     ):
-        check_devices([red, white])
-    other = RigCamera("black", source=f"usb:{tmp_path / 'video1'}")
-    check_devices([red, other, RigCamera("sim", source="sim:"), RigCamera("none")])
+        check_sources([red, white])
+    other = tmp_path / "video1"
+    other.touch()
+    check_sources([red, RigCamera("black", source=f"usb:{other}")])
 
 
 @pytest.mark.parametrize(

@@ -46,9 +46,9 @@ def status_line(status: LiveStatus) -> tuple[str, str]:
 @contextmanager
 def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = None) -> Iterator[LiveStatus]:
     """Open the cameras as a command does; write nothing."""
-    with open_cameras(prepare_lab(rig, None, None), log, seconds, doing) as (cameras, _, status):
+    with open_cameras(prepare_lab(rig, None, None), log, seconds, doing) as (opened, status):
         yield status
-        cameras.stop()
+        opened.cameras.stop()
         log.touch()
 
 
@@ -128,15 +128,16 @@ def test_recording_is_reported_when_the_first_frame_is_on_the_disk(tmp_path: Pat
     image = CompressedImage(0, "red", bytes(5_000), "jpeg")
     with CameraMonitor(RIG) as monitor:
         status = LiveStatus({}, monitor, log, lambda: now_s[0], None, said.append)
-        status(Message("/rig", 10 * NS_PER_S, 10 * NS_PER_S, RIG))
+        rig = Message("/rig", 10 * NS_PER_S, 10 * NS_PER_S, RIG)
+        status(rig)
         log.write_bytes(bytes(2_000))
         status(Message("/cameras/red/image", 11 * NS_PER_S, 11 * NS_PER_S, image, "red"))
         log.write_bytes(bytes(6_000))
-        status(None)
+        status(rig)
         assert said == []
         log.write_bytes(bytes(7_100))
-        status(None)
-        status(None)
+        status(rig)
+        status(rig)
         assert said == [f"recording into {log}; Ctrl-C to end"]
         # The log has two seconds, whatever the opening of the cameras and the end of the log take.
         status(Message("/cameras/red/image", 12 * NS_PER_S, 12 * NS_PER_S, image, "red"))

@@ -15,7 +15,7 @@ from ipsys_log import pipeline
 from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.first_messages import first_messages
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import check_independent_frames
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
@@ -237,9 +237,9 @@ class Hand:
         self.scene, self.tape = scene, tape
         self._done: set[str] = set()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         self.scene(message)
-        if message is None or not isinstance(message.payload, CompressedImage):
+        if not isinstance(message.payload, CompressedImage):
             return
         views = self.scene.views(None)
         for marker_id in {point.id for view in views for row in view.points for point in row.points}:

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.joint.hypotheses import fit_hypotheses
 from ipsys_log.joint.locate import locate_markers
@@ -24,6 +23,7 @@ from ipsys_log.messages.channels import MODEL
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from tests.conftest import Ipsys
+from tests.geometric.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.floor_cameras import FloorCamera, floor_grid, shift_floor_map
-from ipsys_log.analysis.floor_error import compute_errors, grid_nodes
+from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
+from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
@@ -22,6 +22,7 @@ from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
+from tests.geometric.floor_error import compute_errors, grid_nodes
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.geometric.weeks import (
@@ -98,7 +99,7 @@ def drift(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
 
 def true_shift_m() -> float:
     own = next(camera for camera in lab().cameras if camera.name == KNOCK.camera)
-    camera = FloorCamera(own.name, own.lens, own.camera_from_world[:3, :3], own.origin_m)
+    camera = PosedCamera.at_pose(own.name, own.lens, own.camera_from_world)
     motion = np.array([*KNOCK.turn_rad, *KNOCK.shift_m])
     shifts_m = shift_floor_map(camera, floor_grid(camera, Floor(4.88, 4.88)), motion)
     return float(np.linalg.norm(shifts_m, axis=1).mean())

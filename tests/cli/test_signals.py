@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import compileall
 import os
-import pty
-import select
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from ipsys_log.atomic_files import replacement_of
 from ipsys_log.cli.signals import InterruptError, interruptible, writes_nothing
 from ipsys_log.log.reader import LogReader
-from ipsys_log.player import Player
 from tests.conftest import ROOT, SIGNALS, Ipsys
 from tests.test_record import wait_for
 
@@ -53,17 +49,6 @@ try:
 finally:
     ready = False
     print(f"events {events}", file=sys.stderr)
-"""
-
-# A program that asks a numbered question in a terminal, again after each interrupt.
-ASKS = """
-import readline
-from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt, wake_input
-
-allow_interrupt()
-for number in range(1_000_000):
-    with suppress_interrupt(), wake_input():
-        input(f"question {number}> ")
 """
 
 
@@ -100,91 +85,6 @@ def handlers() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("handlers")
-def test_interrupt_swallowed_by_a_library_comes_again() -> None:
-    """The signal comes while NumPy loads its random numbers: an exception there is lost."""
-
-    @interruptible
-    def command() -> None:
-        with suppress(BaseException):
-            signal.raise_signal(signal.SIGTERM)
-        until = time.monotonic() + LIMIT_S
-        while time.monotonic() < until:
-            time.sleep(0.01)
-
-    with pytest.raises(InterruptError) as caught:
-        command()
-    assert caught.value.exit_code == 128 + signal.SIGTERM
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("simulate", "--width", 320, "--height", 180, "-o", "new.mcap"),
-        ("replay", SAMPLE, "-o", "new.mcap"),
-        ("view", SAMPLE, "--save", "new.rrd"),
-    ],
-    ids=lambda command: command[0],
-)
-def test_interrupt_right_after_the_creation_of_a_file_leaves_no_file(
-    command: tuple[object, ...], ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    open_file = os.open
-    interrupted: list[str | Path] = []
-
-    def open_and_interrupt(path: str | Path, *arguments: int, **options: int) -> int:
-        number = open_file(path, *arguments, **options)
-        if str(path).endswith(".partial") and not interrupted:
-            interrupted.append(path)
-            signal.raise_signal(signal.SIGINT)
-        return number
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(os, "open", open_and_interrupt)
-    assert ipsys(*command).code == 130
-    assert len(interrupted) == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.usefixtures("handlers")
-def test_interrupt_at_the_start_of_a_question_is_never_lost() -> None:
-    """Without `wake_input`, readline misses one of about 1,000 interrupts soon after the question."""
-    child, terminal = pty.fork()
-    if child == 0:
-        os.execv(sys.executable, [sys.executable, "-c", ASKS])
-    try:
-        for number in range(2000):
-            question, told = f"question {number}> ".encode(), b""
-            while question not in told:
-                assert select.select([terminal], [], [], LIMIT_S)[0], (number, told)
-                told += os.read(terminal, 1 << 16)
-            begin_ns = time.perf_counter_ns()
-            while time.perf_counter_ns() - begin_ns < number % 20 * 5_000:
-                pass
-            os.write(terminal, b"\x03")
-    finally:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        os.close(terminal)
-
-
-def test_interrupt_does_not_stop_the_cleanup() -> None:
-    cleaned: list[bool] = []
-
-    @interruptible
-    def command() -> None:
-        try:
-            signal.raise_signal(signal.SIGTERM)
-        finally:
-            time.sleep(1.2)
-            cleaned.append(True)
-
-    with pytest.raises(InterruptError):
-        command()
-    assert cleaned == [True]
-    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -300,16 +200,13 @@ def test_interrupt_of_a_reading_command_promises_no_results() -> None:
     ]
 
 
-def test_player_stopped_twice_says_that_no_file_changed(
-    ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first signal ends the playback in order; the second one interrupts the closing of the streams."""
-
-    def signals(player: Player) -> None:
-        signal.raise_signal(signal.SIGTERM)
-        signal.raise_signal(signal.SIGTERM)
-
-    monkeypatch.setattr(Player, "wait", signals)
-    done = ipsys("stream", SAMPLE, "--topics", "/truth/tracks", "--udp", "127.0.0.1:9", "--start-paused")
-    assert done.code == 128 + signal.SIGTERM
-    assert done.err.splitlines()[-1] == "ipsys: interrupted; no file was changed"
+def test_partial_file_of_an_ended_process_is_removed_at_the_next_start(tmp_path: Path) -> None:
+    """A signal right after the creation of a file can leave it behind."""
+    with start("--version") as ended:
+        ended.communicate(timeout=LIMIT_S)
+    left = [tmp_path / f"a.csv.{number}.partial" for number in (ended.pid, os.getppid())]
+    for file in left:
+        file.touch()
+    with replacement_of(tmp_path / "a.csv") as new:
+        new.write(b"new")
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "a.csv", left[1]]

@@ -20,7 +20,7 @@ from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import example
 from tests.ports import free_port
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, send_all, track, tracks
 from tests.waiting import wait_until
 
 receivers: Any = example("ros2_positions")
@@ -85,7 +85,7 @@ def test_relay_passes_only_what_it_is_told_to() -> None:
         open_ros2("ada", stream.port, port, arrived.append) as send,
         closing(receivers.Ros2Positions(("127.0.0.1", port), "ada")) as robot,
     ):
-        stream.consume(iter([tracks(n, track("ada", 1.0 + n), track("bob", 9.0)) for n in range(3)]))
+        send_all(stream, [tracks(n, track("ada", 1.0 + n), track("bob", 9.0)) for n in range(3)])
         wait_until(lambda: len(arrived) == 3, "three poses arrive", lambda: len(arrived))
         for data in arrived[1:]:
             send(data)

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 from hypothesis import strategies as st
 
-__all__ = ["damaged"]
-
 # Numbers and signs that often cause faults in readers.
 _NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 1 << 31, 1 << 32, 1 << 62, 1 << 63, (1 << 64) - 1)
 _TEXTS = (

@@ -42,8 +42,6 @@ from ipsys_log.rig.file import rig_toml
 from tests.exchange.ros_rows import WRITERS, compressed, info, raw
 from tests.log.bombs import Attack, message
 
-__all__ = ["RIG", "bags", "lens_files", "logs", "mat", "payloads", "pictures", "rig_files", "sheets"]
-
 RIG = Rig(
     "lab",
     "DICT_4X4_100",

@@ -28,7 +28,7 @@ from ipsys_log.images.video import Video
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage, CompressedVideo
 from ipsys_log.rig.file import load_rig
@@ -37,8 +37,6 @@ from ipsys_log.web.app import build_app
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
 from tests.web.test_measuring_page import Recording
-
-__all__ = ["TARGETS", "Target", "attack"]
 
 _MOST_CPU_S = 5.0
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.floor_error import grid_nodes
 from ipsys_log.joint import fit as joint_fit
 from ipsys_log.joint.fit import JointFit, fit_jointly
 from ipsys_log.joint.from_messages import gather_observations
@@ -24,6 +23,7 @@ from ipsys_log.joint.solver import Solution, anchor, solve
 from ipsys_log.joint.start import place_cameras
 from ipsys_log.messages import Markers, Measurement, Rig
 from ipsys_log.simulation.settings import hall_settings
+from tests.geometric.floor_error import grid_nodes
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.points import choose_points
 from tests.geometric.session import simulate_session

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.floor_error import region_shares
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import pose_facing_up, transform
@@ -15,6 +14,7 @@ from ipsys_log.joint.fit import fit_jointly
 from ipsys_log.joint.locate import locate_markers
 from ipsys_log.joint.model import JointModel, build_models
 from ipsys_log.joint.observations import Observations
+from tests.geometric.floor_error import region_shares
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
 
 GRID = [(x, y, 0.1, 0.0) for x in np.arange(1.2, 3.7, 0.3) for y in np.arange(1.6, 3.3, 0.3)]

@@ -37,8 +37,6 @@ from ipsys_log.messages import (
 )
 from ipsys_log.runs.output import write_log
 
-__all__ = ["BOMBS", "Attack"]
-
 MIB = 1 << 20
 CORNERS_PX = np.array([(1.0, 1.0), (9.0, 1.0), (9.0, 9.0), (1.0, 9.0)])
 Rows = list[tuple[int, int]]

@@ -20,7 +20,7 @@ SECTOR = 512
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    kind: str  # create, write, truncate, sync, rename, unlink, sync_directory
+    kind: str  # create, write, truncate, sync, rename, link, unlink, sync_directory
     file: int = 0
     name: str = ""
     target: str = ""
@@ -70,6 +70,11 @@ class Recorder:
         self._names[target.name] = self._names.pop(source.name)
         DISK.rename(source, target)
 
+    def link(self, path: Path, second: Path) -> None:
+        self.operations.append(Operation("link", name=path.name, target=second.name))
+        self._names[second.name] = self._names[path.name]
+        DISK.link(path, second)
+
     def unlink(self, path: Path) -> None:
         self.operations.append(Operation("unlink", name=path.name))
         self._names.pop(path.name)
@@ -98,6 +103,8 @@ class Disk:
             content[:] = bytes(content[: operation.at]).ljust(operation.at, b"\0")
         elif operation.kind == "rename" and operation.name in self.names:
             self.names[operation.target] = self.names.pop(operation.name)
+        elif operation.kind == "link":
+            self.names[operation.target] = self.names[operation.name]
         elif operation.kind == "unlink":
             self.names.pop(operation.name, None)
 
@@ -110,8 +117,13 @@ class Disk:
     def store(self, folder: Path) -> None:
         for old in folder.iterdir():
             old.unlink()
+        stored: dict[int, Path] = {}
         for name, number in self.names.items():
-            (folder / name).write_bytes(self.files[number])
+            if number in stored:
+                (folder / name).hardlink_to(stored[number])
+            else:
+                (folder / name).write_bytes(self.files[number])
+                stored[number] = folder / name
 
 
 def durable(operations: Sequence[Operation]) -> list[bool]:
@@ -126,7 +138,7 @@ def durable(operations: Sequence[Operation]) -> list[bool]:
                 and operations[earlier].file == operation.file
             ):
                 safe[earlier] = True
-            if operation.kind == "sync_directory" and kind in ("create", "rename", "unlink"):
+            if operation.kind == "sync_directory" and kind in ("create", "rename", "link", "unlink"):
                 safe[earlier] = True
     return safe
 

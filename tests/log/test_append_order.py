@@ -15,7 +15,7 @@ import pytest
 from ipsys_log.errors import WriteError
 from ipsys_log.log.journal import DISK, Storage, journal_path
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from tests.conftest import Ipsys
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows

@@ -20,7 +20,7 @@ from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Markers, RawImage
 from tests.conftest import ROOT
@@ -108,7 +108,7 @@ def start_cpu_s() -> float:
 
 # The most processor time above that of a plain log, in starts of the program: 5 s if a start takes 0.2 s.
 STARTS = 25
-COMMANDS = ("info", "runs", "repair", "view", "check", "du", "cat")
+COMMANDS = ("info", "repair", "view", "check", "cat")
 
 
 def line(command: str, path: Path) -> list[object]:
@@ -122,12 +122,11 @@ def test_commands_on_a_small_file_stay_within_bounds(
 ) -> None:
     data = BOMBS[name]()
     assert len(data) <= 1.1 * MIB
+    start_s = start_cpu_s()
     for command in COMMANDS:
         path = tmp_path / f"{command}.mcap"
         path.write_bytes(data)
-        start_s = start_cpu_s()
         cost = run(*line(command, path))
-        start_s = max(start_s, start_cpu_s())
         assert cost.code in (0, 1) or (cost.code, command) == (2, "check"), cost
         assert "Traceback" not in cost.err
         assert cost.cpu_s - plain[command].cpu_s < STARTS * start_s, (command, cost, start_s)

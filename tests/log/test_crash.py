@@ -9,7 +9,7 @@ import pytest
 from ipsys_log.errors import LogError
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import POINT, Row, append, as_row, create, linear_rows, write_rows
 from tests.log.crash import Disk, Operation, Recorder, crashes

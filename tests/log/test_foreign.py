@@ -1,6 +1,5 @@
 """Logs of other software, in every shape of the format: read, appended to, read again."""
 
-import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents, Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, to_bytes
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, as_row, linear_rows, stock_rows
@@ -161,30 +160,6 @@ def test_channels_of_one_topic_that_differ(tmp_path: Path) -> None:
         assert [message.topic for message in reader.messages(["/y"])] == ["/y"]
         with pytest.raises(LogError, match=r"channels of /x differ: One \(jsonschema\) as json, Two"):
             reader.messages()
-
-
-def test_images_in_a_compressed_log_are_read_directly(tmp_path: Path) -> None:
-    """The log has raw blocks of zstd and lz4 frames, messages across blocks, and compressible ones."""
-    chance = random.Random(1)
-    for compression in (CompressionType.ZSTD, CompressionType.LZ4):
-        for soft in (0, 40_000):
-            path = tmp_path / f"{compression}{soft}.mcap"
-            rows: list[Row] = []
-            with path.open("wb") as file:
-                writer = Writer(file, chunk_size=1 << 20, compression=compression)
-                writer.start()
-                image = writer.register_channel("/image", "x", 0)
-                small = writer.register_channel("/small", "x", 0)
-                for number in range(40):
-                    data = chance.randbytes(99_000) + bytes(soft if number % 7 == 5 else 0)
-                    writer.add_message(image, number, data, number)
-                    rows.append(("/small", number, number, chance.randbytes(60 + 2000 * (number % 3))))
-                    writer.add_message(small, number, rows[-1][3], number)
-                writer.finish()  # type: ignore[no-untyped-call]
-            with LogReader(path) as reader:
-                assert [as_row(message) for message in reader.messages(["/small"])] == rows
-                if not soft:
-                    assert reader.bytes_read < path.stat().st_size / 10
 
 
 def test_unknown_compression(tmp_path: Path) -> None:

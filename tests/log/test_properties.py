@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 
 ROWS = st.lists(

@@ -10,7 +10,7 @@ import pytest
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import (
     IMAGE,

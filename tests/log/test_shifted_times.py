@@ -1,4 +1,4 @@
-"""Times within messages are shifted in place: every other byte stays, and damage is reported."""
+"""Times within messages are shifted: all other fields stay, and damage is reported."""
 
 from __future__ import annotations
 
@@ -30,21 +30,19 @@ def image(time_ns: int) -> bytes:
 @given(
     time_ns=st.integers(1, 2**62),
     offset_ns=st.integers(-S, S).filter(bool),
-    before=st.lists(st.sampled_from(NEWER), max_size=3),
-    after=st.lists(st.sampled_from(NEWER), max_size=3),
+    newer=st.lists(st.sampled_from(NEWER), max_size=3),
 )
-def test_only_the_time_changes(time_ns: int, offset_ns: int, before: list[bytes], after: list[bytes]) -> None:
-    first, last, bare = b"".join(before), b"".join(after), image(time_ns)
+def test_only_the_time_changes(time_ns: int, offset_ns: int, newer: list[bytes]) -> None:
+    data = image(time_ns) + b"".join(newer)
     if time_ns + offset_ns <= 0:
         with pytest.raises(LogError, match="cannot be shifted"):
-            shift_times(IMAGE, first + bare + last, offset_ns)
+            shift_times(IMAGE, data, offset_ns)
         return
-    shifted = shift_times(IMAGE, first + bare + last, offset_ns)
-    assert shifted.startswith(first)
-    assert shifted.endswith(last)
+    shifted = shift_times(IMAGE, data, offset_ns)
     payload = decode(IMAGE, shifted)
     assert payload.timestamp == time_ns + offset_ns
     assert payload.data == bytes(40_000)
+    assert shift_times(IMAGE, shifted, -offset_ns) == data
 
 
 def test_message_without_a_time_stays_as_it_is() -> None:

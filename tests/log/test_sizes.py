@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 from tests.log.test_crash import check_recording, record_recording
 from tests.log.test_properties import hash_of

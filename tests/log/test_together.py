@@ -18,7 +18,7 @@ from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import Disk, journal_path, replace_tail
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.summary import load_contents
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows

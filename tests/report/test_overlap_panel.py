@@ -10,7 +10,7 @@ import pytest
 from ipsys_log.analysis.disagreement import CameraPositions, PairDisagreement, compare_cameras
 from ipsys_log.messages import Floor, Rig
 from ipsys_log.report.html_figures import overlap_pictures
-from ipsys_log.report.html_sections import overlap_rows, overlap_tables
+from ipsys_log.report.html_sections import overlap_tables
 from ipsys_log.units import NS_PER_S
 
 
@@ -32,12 +32,13 @@ def pairs(
 
 @pytest.mark.parametrize(
     ("sigma_m", "within", "verdict"),
-    [(0.005, "100 %", "consistent"), (0.001, "0 %", "larger than the covariances explain"), (None, "–", "–")],
+    [(0.005, "100 %", "consistent"), (0.001, "0 %", "larger than the covariances explain"), (None, "-", "-")],
 )
 def test_row_says_whether_covariances_explain_it(sigma_m: float | None, within: str, verdict: str) -> None:
-    (row,) = overlap_rows(pairs(sigma_m))
-    assert (row["cameras"], row["median"], row["p95"]) == ("red and white", "5.0", "5.0")
-    assert (row["within"], row["verdict"]) == (within, verdict)
+    table = overlap_tables(pairs(sigma_m))["table"]
+    assert table is not None
+    (row,) = table.cells
+    assert row == ["red and white", "199", "5.0", "5.0", within, verdict]
 
 
 @pytest.mark.parametrize("rig", [None, Rig("lab", "DICT_4X4_100", 0.2, floor=Floor(4.88, 4.88))])
@@ -52,6 +53,8 @@ def test_panel_has_a_map_and_a_time_course(rig: Rig | None) -> None:
 def test_page_shows_the_pairs_that_differ_most_and_folds_all() -> None:
     many = [pair for n in range(12) for pair in pairs(0.005, ("a", f"b{n}"), n / 1000)]
     tables = overlap_tables(many)
-    assert [row["cameras"] for row in tables["rows"]] == [f"a and b{n}" for n in range(11, 1, -1)]
-    assert [row["cameras"] for row in tables["all"]] == [f"a and b{n}" for n in range(12)]
-    assert overlap_tables(many[:3])["all"] == []
+    assert tables["table"] is not None
+    assert tables["all"] is not None
+    assert [row[0] for row in tables["table"].cells] == [f"a and b{n}" for n in range(11, 1, -1)]
+    assert [row[0] for row in tables["all"].cells] == [f"a and b{n}" for n in range(12)]
+    assert overlap_tables(many[:3])["all"] is None

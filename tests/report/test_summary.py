@@ -22,7 +22,8 @@ from ipsys_log.pipeline import replay
 from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
 from ipsys_log.report.files import cross_validation_csv
 from ipsys_log.report.findings import Findings
-from ipsys_log.report.summary import answer_json, answer_text, models_table
+from ipsys_log.report.summary import answer_json, answer_text
+from ipsys_log.report.tables import models_table
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys

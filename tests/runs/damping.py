@@ -16,8 +16,6 @@ from ipsys_log.messages.channels import TRACKS, Channel
 from ipsys_log.messages.stage import Plan, Stage, StageView
 from ipsys_log.stages import StageEntry, StageParameter
 
-__all__ = ["DAMPED_TRACKS", "ENTRY", "STAGE"]
-
 DAMPED_TRACKS = Channel(name="damped_tracks", topic="/runs/{run}/damped_tracks", payloads=(Tracks,))
 ENTRY = StageEntry(
     name="damp",

@@ -263,7 +263,7 @@ def test_log_of_another_program_keeps_attachments(tmp_path: Path, chunked: bool)
     assert attached == [("notes.txt", "text/plain", b"note " * 100)]
     assert rooms == [{"room": "7"}]
     with Session([part]) as session:
-        (one,) = (c for c in session.cuts[session.readers[0]][0].channels if c.topic == "/a")
+        (one,) = (c for c in session.copies[session.readers[0]][0].channels if c.topic == "/a")
         assert one.kept_hash == session.hash("/a")
 
 

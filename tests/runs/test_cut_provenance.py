@@ -67,11 +67,7 @@ def verified(log: Path) -> tuple[dict[str, bool], list[str]]:
 
 
 def test_runs_of_a_part_name_the_log_they_come_from(part: Path) -> None:
-    found = states(part)
-    assert {stage: found[stage] for stage in ("detect", "camera-frame")} == dict.fromkeys(
-        ("detect", "camera-frame"), "part of run stock, cut from monday.mcap"
-    )
-    assert found["locate"] == found["fuse"] == "part of run rigid, cut from monday.mcap"
+    assert set(states(part).values()) == {"copied from monday.mcap"}
 
 
 def test_part_without_a_camera_is_sound(stock_log: Path, tmp_path: Path) -> None:
@@ -94,58 +90,58 @@ def test_replay_of_a_part_computes_nothing(ipsys: Ipsys, part: Path) -> None:
     assert part.read_bytes() == before
 
 
-def test_verify_repeats_the_results_without_memory(part: Path) -> None:
+def test_verify_compares_copied_runs_by_their_hashes(part: Path) -> None:
     repeated, remarks = verified(part)
-    again = {topic.rpartition("/")[2] for topic, is_repeated in repeated.items() if is_repeated}
-    assert again == {"markers", "annotations", "camera_points", "positions"}
-    assert not repeated["/runs/rigid/tracks"]
-    assert not repeated["/cameras/red/image"]
-    assert [remark.partition(" is not repeated")[0] for remark in remarks] == [
-        "run rigid: fit",
-        "run rigid: evaluate",
-        "run rigid: fuse",
+    assert not any(repeated.values())
+    assert {"/cameras/red/image", "/runs/stock/cameras/red/markers", "/runs/rigid/tracks"} <= repeated.keys()
+    names = [("stock", ("detect", "camera-frame")), ("rigid", ("fit", "evaluate", "locate", "fuse"))]
+    assert remarks == [
+        f"run {run}: {stage} was copied from monday.mcap; its hashes are compared"
+        for run, stages in names
+        for stage in stages
     ]
 
 
+def test_verify_repeats_copied_runs_with_whole_inputs(stock_log: Path, tmp_path: Path) -> None:
+    """Only the images are left out: markers cannot be repeated, all that follows from them can."""
+    small = tmp_path / "small.mcap"
+    cut([stock_log], small, CutOptions(exclude_topics=("/cameras/*/image",)))
+    repeated, remarks = verified(small)
+    assert not repeated["/runs/stock/cameras/red/markers"]
+    assert repeated["/runs/stock/cameras/red/camera_points"]
+    assert repeated["/runs/rigid/tracks"]
+    assert remarks == ["run stock: detect was copied from monday.mcap; its hashes are compared"]
+    assert {state for stage, state in states(small).items() if stage != "detect"} == {"current"}
+
+
 @pytest.mark.parametrize(
-    ("options", "origin"),
+    "options",
     [
-        # The calibrations of other cameras are inputs of detection, and no longer in the log.
-        (CutOptions(cameras=("red",)), "part"),
-        (CutOptions(every=2), "monday"),
-        (CutOptions(robots=("robot_0",)), "monday"),
-        (CutOptions(end="50"), "monday"),
+        CutOptions(cameras=("red",)),
+        CutOptions(every=2),
+        CutOptions(robots=("robot_0",)),
+        CutOptions(end="50"),
     ],
     ids=["camera", "every", "robot", "time"],
 )
-def test_cut_of_a_cut_keeps_the_chain(part: Path, options: CutOptions, origin: str) -> None:
+def test_cut_of_a_cut_keeps_the_chain(part: Path, options: CutOptions) -> None:
     small = part.with_name("small.mcap")
     cut([part], small, options)
-    assert states(small)["detect"] == f"part of run stock, cut from {origin}.mcap"
+    assert states(small)["detect"] == "copied from monday.mcap"
     with Session([small]) as session:
         assert [one.logs for one in session.payloads(session.topics(CUTS))] == [
             ("monday.mcap",),
             ("part.mcap",),
         ]
     repeated, _ = verified(small)
-    assert repeated["/runs/stock/cameras/red/camera_points"]
-
-
-def test_run_without_its_images_is_still_used(part: Path) -> None:
-    """The markers cannot be repeated without the images; the camera points can."""
-    small = part.with_name("small.mcap")
-    cut([part], small, CutOptions(exclude_topics=("/cameras/*/image",)))
-    repeated, remarks = verified(small)
-    assert not repeated["/runs/stock/cameras/red/markers"]
-    assert repeated["/runs/stock/cameras/red/camera_points"]
-    assert any("detect is not repeated: its input /cameras/" in remark for remark in remarks)
+    assert "/runs/stock/cameras/red/camera_points" in repeated
 
 
 def test_left_out_result_is_computed_under_another_name(part: Path) -> None:
     """The part has the record of run stock, and its markers are left out."""
     small = part.with_name("small.mcap")
     cut([part], small, CutOptions(topics=("/cameras/*",)))
-    assert states(small)["detect"] == "part of run stock, cut from monday.mcap"
+    assert states(small)["detect"] == "copied from monday.mcap"
     outcomes = replay([small], REQUEST, "detect")
     assert [(one.run, one.fresh) for one in outcomes] == [("stock_2", True)]
     with Session([small]) as session:
@@ -192,20 +188,12 @@ def test_measurement_added_to_a_part_is_named(part: Path) -> None:
         time_ns = session.end_ns
     added = Measurement(time_ns, "later")
     append_messages(part, [Message("/measurements", time_ns, time_ns, added)])
+    repeated, remarks = verified(part)
+    assert "/measurements" not in repeated
+    assert "/measurements: messages were added after the copy (1); it is not compared" in remarks
     found = states(part)
     assert found["fit"] == "out of date: measurements changed"
-    assert found["detect"] == "part of run stock, cut from monday.mcap"
-
-
-def test_edges_are_compared_with_the_cut_and_not_repeated(replayed_log: Path, tmp_path: Path) -> None:
-    """The method edges follows markers from frame to frame."""
-    part = tmp_path / "part.mcap"
-    cut([replayed_log], part, CutOptions(start="5", end="20"))
-    repeated, remarks = verified(part)
-    assert not repeated["/runs/edges/cameras/red/markers"]
-    assert repeated["/runs/edges/cameras/red/camera_points"]
-    text = "run edges: detect is not repeated: its result depends on messages outside of the part"
-    assert text in remarks
+    assert found["detect"] == "copied from monday.mcap"
 
 
 def test_unknown_run_of_a_part_is_refused(part: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
@@ -152,36 +152,6 @@ def test_shift_back_gives_the_bytes_of_the_log(tmp_path: Path) -> None:
         ("a.mcap", 0, None),
         ("b.mcap", 3_000_000_456, None),
     ]
-
-
-def write_foreign(path: Path, topic: str, times_ns: Sequence[int]) -> None:
-    """Write a log with chunks that this program would not make: of three messages, with lz4."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=300, compression=CompressionType.LZ4)
-        writer.start("other", "test")
-        channel = writer.register_channel(topic, "json", writer.register_schema("S", "jsonschema", b"{}"))
-        for time_ns in times_ns:
-            writer.add_message(channel, time_ns, b"{}" + b" " * 90, time_ns)
-        writer.finish()  # type: ignore[no-untyped-call, unused-ignore]
-
-
-def test_chunks_without_overlap_are_copied_as_they_are(tmp_path: Path) -> None:
-    """Only the chunks in whose time both have messages are written again."""
-    a, b, output = (tmp_path / f"{name}.mcap" for name in ("a", "b", "all"))
-    write_foreign(a, "/a", range(1_000, 1_090))
-    write_foreign(b, "/b", range(1_030, 1_060))
-    merge([a, b], output, [LogOffset(), LogOffset()])
-
-    def chunks(path: Path) -> dict[bytes, tuple[int, int]]:
-        with Session([path]) as session:
-            (reader,) = session.readers
-            refs = reader.contents.chunks
-            return {reader.view.read(ref.offset, ref.length): (ref.start_ns, ref.end_ns) for ref in refs}
-
-    apart = {data for data, (start, end) in chunks(a).items() if end < 1_030 or start > 1_059}
-    assert len(apart) > 15
-    assert chunks(a).keys() & chunks(output).keys() == apart
-    assert stock_rows(output) == sorted(stock_rows(a) + stock_rows(b))
 
 
 def test_attachments_and_metadata_of_all_logs_survive(tmp_path: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
-import pytest
-
 from ipsys_log.stages import ENTRIES
 from tests.conftest import ROOT
 
@@ -58,24 +56,3 @@ def test_no_module_branches_on_the_name_of_a_stage() -> None:
     }
     assert {name: lines for name, lines in found.items() if name not in EXCEPTIONS} == {}
     assert set(found) == set(EXCEPTIONS), "a module of the list of exceptions needs none"
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        'if outcome.stage == "fuse": pass',
-        'if "fit" != stage: pass',
-        'later = ("locate", "fuse")',
-        'rows = {"detect": 1}',
-        'row = rows["camera-frame"]',
-        'row = rows.get("evaluate")',
-        'match stage:\n    case "fit":\n        pass',
-        "name = fuse.STAGE.name",
-    ],
-)
-def test_guard_sees_a_branch_on_the_name_of_a_stage(source: str) -> None:
-    assert branches(source) != []
-
-
-def test_guard_accepts_a_stage_as_the_end_of_a_command() -> None:
-    assert branches('replay(paths, request, "camera-frame")') == []

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import errno
 import multiprocessing.connection
-import os
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
-from multiprocessing.connection import Connection
+from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +16,8 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import Message
 from ipsys_log.pipeline import replay
 from ipsys_log.runs import pieces, workers
-from ipsys_log.runs import replay as stages_in_order
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 from ipsys_log.runs.workers import LocalWorkers
@@ -63,60 +58,57 @@ def test_bytes_are_equal_for_any_number_of_processes(
     assert len({log.read_bytes() for log in logs.values()}) == 1
 
 
-def test_models_are_loaded_only_beside_other_processes(
-    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Imports and detection in threads of one process take longer together than one after the other."""
-    loaded: list[Sequence[str]] = []
-
-    def watched(messages: Iterable[Message], models: Sequence[str]) -> Iterable[Message]:
-        loaded.append(tuple(models))
-        return messages
-
-    monkeypatch.setattr(stages_in_order, "preload", watched)
-    alone = Path(shutil.copy(lab, tmp_path / "alone.mcap"))
-    request = replace(REQUEST, models=("rigid",))
-    replay([alone], request, "fit")
-    assert not loaded
-    replay([lab], request, "fit", jobs=2)
-    assert loaded == [("rigid",)]
-    assert lab.read_bytes() == alone.read_bytes()
-
-
 def _count_workers(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return a list that gets each worker that starts."""
     started: list[Any] = []
     create = workers._Worker.__init__
 
-    def counted(self: Any, numbers: int) -> None:
+    def counted(self: Any) -> None:
         started.append(self)
-        create(self, numbers)
+        create(self)
 
     monkeypatch.setattr(workers._Worker, "__init__", counted)
     return started
 
 
-def test_killed_worker_leaves_the_log_unchanged(
+def _kill_at_begin(monkeypatch: pytest.MonkeyPatch, started: list[Any], places: set[int]) -> None:
+    """Kill the workers that start at some places, when they get their run."""
+    send = workers._Worker.send
+
+    def send_and_kill(self: Any, message: object) -> None:
+        send(self, message)
+        if isinstance(message, tuple) and started.index(self) in places:
+            self.process.kill()
+
+    monkeypatch.setattr(workers._Worker, "send", send_and_kill)
+
+
+def test_pieces_of_a_killed_worker_go_to_another_one(
+    lab_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = [Path(shutil.copy(lab_log, tmp_path / f"{jobs}.mcap")) for jobs in (1, 2)]
+    replay([logs[0]], REQUEST, "detect", jobs=1)
+    started = _count_workers(monkeypatch)
+    _kill_at_begin(monkeypatch, started, {1})
+    replay([logs[1]], REQUEST, "detect", jobs=2)
+    assert [worker.process.poll() for worker in started] == [-9, -9, -9]
+    assert logs[0].read_bytes() == logs[1].read_bytes()
+
+
+def test_piece_that_ends_all_its_workers_leaves_the_log_unchanged(
     lab: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started = _count_workers(monkeypatch)
-    begin = workers._Worker.begin
-
-    def begin_and_kill(self: Any, plan: PiecePlan) -> None:
-        begin(self, plan)
-        if self is started[1]:
-            self.process.kill()
-
-    monkeypatch.setattr(workers._Worker, "begin", begin_and_kill)
     before = lab.read_bytes()
-    done = ipsys("detect", lab, "--jobs", "2")
+    with monkeypatch.context() as patch:
+        _kill_at_begin(patch, started, set(range(99)))
+        done = ipsys("detect", lab, "--jobs", "2")
     assert done.code == 1
-    assert "a worker process has ended by signal 9" in done.err
+    assert "2 worker processes have ended by signal 9 in the piece of " in done.err
     assert "--jobs" in done.err
     assert "Traceback" not in done.err
     assert lab.read_bytes() == before
-    assert [worker.process.poll() for worker in started] == [-9, -9]
-    monkeypatch.setattr(workers._Worker, "begin", begin)
+    assert {worker.process.poll() for worker in started} == {-9}
     assert ipsys("detect", lab, "--jobs", "2").code == 0
 
 
@@ -168,10 +160,10 @@ def test_too_many_workers_for_the_system_are_one_line(monkeypatch: pytest.Monkey
     started: list[workers._Worker] = []
 
     class Limited(workers._Worker):
-        def __init__(self, numbers: int) -> None:
+        def __init__(self) -> None:
             if len(started) == 2:
                 raise OSError(errno.EMFILE, "Too many open files")
-            super().__init__(numbers)
+            super().__init__()
             started.append(self)
 
     monkeypatch.setattr(workers, "_Worker", Limited)
@@ -205,17 +197,18 @@ def test_log_that_is_replaced_is_an_error_of_one_line(lab_log: Path, tmp_path: P
         list(local.compute(_plan(run, Piece("red", 0, 1))))
 
 
-def test_worker_ends_with_the_process_that_started_it(lab_log: Path) -> None:
-    """The end of that process closes all its pipes."""
-    taken, offered = os.pipe()
-    worker = workers._Worker(taken)
-    os.close(taken)
-    worker.begin(_plan(_run(lab_log), Piece("red", 0, 1), Piece("red", 1, 2)))
-    os.write(offered, (1).to_bytes(4, "little"))
-    number, result = worker.receive()
-    assert (number, result.frames) == (1, [])
+def test_worker_ends_with_its_pipe_in_the_middle_of_a_piece(lab_log: Path) -> None:
+    """The end of the process that started it closes the pipe."""
+    worker = workers._Worker()
+    with LogReader(lab_log) as reader:
+        start_ns, end_ns = reader.start_ns or 0, (reader.end_ns or 0) + 1
+    worker.send((_run(lab_log), [Piece("red", 0, 1), Piece("red", start_ns, end_ns)]))
+    worker.send(0)
+    result = worker.receive()
+    assert result is not None
+    assert result.frames == []
+    worker.send(1)
     worker.close()
-    os.close(offered)
     assert worker.process.wait(PATIENCE_S) == 0
 
 
@@ -242,97 +235,58 @@ def test_results_wait_for_at_most_some_pieces(monkeypatch: pytest.MonkeyPatch) -
     with LocalWorkers(2) as local:
         results = local.compute(_plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(100))))
         next(results)
-        offered = os.read(local._numbers[0], 1000)
-        assert len(taken) + len(offered) // 4 == 5
-        os.write(local._numbers[1], offered)
+        assert len(taken) == 5
         assert sum(1 for _ in results) == 99
     assert taken == list(range(100))
 
 
-def test_slow_worker_leaves_all_other_pieces_to_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_worker_leaves_almost_all_pieces_to_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pieces are not distributed in advance: at the end, one worker would wait for the other."""
     taken: list[int] = []
     _pretend(monkeypatch, taken, slow=0)
-    plan = _plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(5)))
+    plan = _plan(_run(Path("log.mcap")), *(Piece("red", n, n + 1) for n in range(1, 6)))
     with LocalWorkers(2) as local:
-        places: list[Any] = list(local.compute(plan))
-    assert places == [1, 1, 1, 1, 1]
+        results = local.compute(plan)
+        places: list[Any] = [next(results) for _ in range(5)]
+    assert places == [0, 1, 1, 1, 1]
 
 
-def test_worker_computes_while_its_result_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The result is larger than the pipe: without a thread of its own, its sending stops the worker."""
-    computed = threading.Event()
-
-    def answers(_run: Any, _pieces: Any, numbers: int) -> Iterator[Any]:
-        yield bytes(1 << 24)
-        computed.set()
-        os.read(numbers, 4)
-
-    with _served(monkeypatch, answers) as ours:
-        assert computed.wait(PATIENCE_S)
-        assert len(ours.recv()) == 1 << 24
-
-
-def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_that_cannot_be_sent_is_an_error() -> None:
     """The process that waits for the last result of a worker must get an answer."""
-
-    def answers(_run: Any, _pieces: Any, numbers: int) -> Iterator[Any]:
-        yield threading.Lock()
-        os.read(numbers, 4)
-
-    with _served(monkeypatch, answers) as ours:
-        assert ours.poll(PATIENCE_S)
-        failure = ours.recv()
-        assert "cannot pickle" in str(failure.error)
-        assert "Traceback" in failure.trace
-
-
-@contextmanager
-def _served(
-    monkeypatch: pytest.MonkeyPatch, answers: Callable[[Any, Any, int], Iterator[Any]]
-) -> Iterator[Connection]:
-    """Serve answers in a thread; yield the end of the pipe that has no place for a large one."""
-    monkeypatch.setattr(workers, "_answers", answers)
     ours, theirs = multiprocessing.Pipe()
-    taken, offered = os.pipe()
-
-    def serve() -> None:
-        with suppress(EOFError, ConnectionError):
-            workers._serve(theirs, theirs, taken)
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        ours.send(("the run", "its pieces"))
-        yield ours
-    finally:
-        ours.close()
-        os.close(offered)
-        thread.join()
-        theirs.close()
-        os.close(taken)
+    workers._send(theirs, threading.Lock())  # type: ignore[arg-type]
+    assert ours.poll(PATIENCE_S)
+    failure = ours.recv()
+    assert "cannot pickle" in str(failure.error)
+    assert "Traceback" in failure.trace
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, taken: list[int], slow: int | None = None) -> None:
-    """Replace the processes by objects that take a piece when their result is wanted.
+    """Replace the processes by objects that have a result when it is wanted: the place of the worker.
 
-    The result of a piece is the place of its worker. A ``slow`` worker has no result.
+    A ``slow`` worker has its result only if no other one has a piece.
     """
     started: list[Any] = []
 
     class Pretended:
-        def __init__(self, numbers: int) -> None:
-            self.numbers, self.receiver = numbers, self
+        def __init__(self) -> None:
+            self.pieces: deque[int] = deque()
+            self.receiver = self
             started.append(self)
 
-        def begin(self, _plan: PiecePlan) -> None: ...
+        def send(self, message: object) -> None:
+            if isinstance(message, int):
+                taken.append(message)
 
         def receive(self) -> Any:
-            taken.append(int.from_bytes(os.read(self.numbers, 4), "little"))
-            return taken[-1], started.index(self)
+            return started.index(self)
 
         def stop(self) -> None: ...
 
+    def ready(_receivers: object) -> list[Any]:
+        busy = [worker for worker in started if worker.pieces]
+        fast = [worker for worker in busy if started.index(worker) != slow]
+        return (fast or busy)[:1]
+
     monkeypatch.setattr(workers, "_Worker", Pretended)
-    ready = [worker for worker in (0, 1) if worker != slow][:1]
-    monkeypatch.setattr(workers, "wait", lambda receivers: [receivers[n] for n in ready])
+    monkeypatch.setattr(workers, "wait", ready)

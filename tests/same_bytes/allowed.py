@@ -8,8 +8,6 @@ from pathlib import Path
 
 from tests.same_bytes.differences import Difference
 
-__all__ = ["AllowList", "AllowListError"]
-
 
 class AllowListError(Exception):
     """An unreadable line of an allow file."""

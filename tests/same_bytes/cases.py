@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-__all__ = ["CASES", "MODELS", "Case", "Step", "case_names"]
-
 MODELS = (
     *("rigid", "poly", "ann", "kriging", "kriging-regression"),
     *("rigid+poly", "rigid+ann", "rigid+kriging", "rigid+kriging-regression", "rayplane", "best"),

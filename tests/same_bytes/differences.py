@@ -21,17 +21,6 @@ from mcap.records import Channel, Schema
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
 
-__all__ = [
-    "Difference",
-    "JsonDifferences",
-    "compare_files",
-    "compare_json",
-    "compare_logs",
-    "decode",
-    "first_field",
-    "read_log",
-]
-
 # places that are not topics
 ORDER, SCHEMAS, BYTES, EXIT_CODE = "order", "schemas", "bytes", "exit-code"
 _LONGEST_VALUE = 60

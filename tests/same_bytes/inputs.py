@@ -22,8 +22,6 @@ from mcap.writer import Writer
 from tests.same_bytes.cases import Case, ipsys
 from tests.same_bytes.differences import Log, decode, read_log
 
-__all__ = ["MADE", "Inputs", "MissingInputError", "UnmadeInputError"]
-
 _LAB = "--width 960 --height 540 --markers 8 --stations 20 --frames-per-station 2 --rate-hz 5 --drive-s 1"
 _START = "--rig live.toml --calibration lab.mcap"
 # The inputs and the command for each file that the old commit makes.

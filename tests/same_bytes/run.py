@@ -48,8 +48,6 @@ from tests.same_bytes.differences import (
 )
 from tests.same_bytes.inputs import Inputs, MissingInputError, UnmadeInputError
 
-__all__ = ["CaseResult", "compare_case", "main", "report_lines"]
-
 ROOT = Path(__file__).resolve().parent.parent.parent
 DRIVER = Path(__file__).resolve().parent / "driver.py"
 _LINES_PER_CASE, _WIDTH = 10, 80

@@ -30,8 +30,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["install"]
-
 _START_NS, _SINCE_BOOT_NS = 1_700_000_000_000_000_000, 1_000_000_000_000
 _LOOKS, _LOOK_S = 3, 0.003
 _LONGEST_S = 60.0

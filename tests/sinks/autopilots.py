@@ -8,8 +8,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common
 
-__all__ = ["Reading", "ardupilot", "px4"]
-
 # The places of the variances of x, y, z and of roll, pitch, yaw in an upper triangle by rows.
 _ALONG, _ABOUT = (0, 6, 11), (15, 18, 20)
 _PX4_VISUAL = (

@@ -8,8 +8,6 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["exposed", "open_sockets"]
-
 
 def open_sockets(pid: int) -> list[tuple[str, str, int]]:
     """Return protocol, local address and port of each bound socket of a process."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from ipsys_log.capture.frames import Clock
 from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
 from ipsys_log.runs.output import write_log
+from ipsys_log.sinks.sink import InlineSink
 from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
@@ -53,6 +54,11 @@ def write_tracks(path: Path, count: int = 50, first: int = 0, rig: Rig = RIG) ->
 
     write_log(path, messages())
     return path
+
+
+def send_all(stream: InlineSink, messages: Iterable[Message]) -> None:
+    for message in messages:
+        stream.send(message)
 
 
 def in_order(recorded: Sequence[Tracks]) -> list[Track]:

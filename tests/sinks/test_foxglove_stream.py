@@ -35,7 +35,7 @@ from ipsys_log.sinks.streams.foxglove_messages import SUBPROTOCOLS, Subscription
 from ipsys_log.sinks.streams.poses import NewSession
 from tests.node_packages import install
 from tests.sinks.open_sockets import exposed, open_sockets
-from tests.sinks.streaming import RIG, START_NS, STEP_NS, TOPIC, tracks
+from tests.sinks.streaming import RIG, START_NS, STEP_NS, TOPIC, send_all, tracks
 from tests.waiting import wait_until
 
 SECRET = "the-secret"
@@ -103,7 +103,7 @@ def test_client_of_foxglove_gets_poses(node_home: Path, subprotocol: str) -> Non
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as client:
             wait_until(lambda: stream.client_count, "a client is connected")
             wait_for_subscription(stream)
-            stream.consume(iter([tracks(n) for n in range(1, 5)]))
+            send_all(stream, [tracks(n) for n in range(1, 5)])
             text, _ = client.communicate(timeout=_LIMIT_S)
     rows = [json.loads(line) for line in text.splitlines()]
     (info,) = [row["info"] for row in rows if "info" in row]
@@ -120,12 +120,12 @@ def test_client_of_foxglove_gets_poses(node_home: Path, subprotocol: str) -> Non
 def test_messages_have_the_form_of_the_sdk() -> None:
     """The server of foxglove-sdk sends the same fields for a channel of the same schema."""
     with streaming() as (stream, _):
-        stream.consume(iter([tracks(0)]))
+        send_all(stream, [tracks(0)])
         with opened(stream) as client:
             ours = [json.loads(client.recv(_LIMIT_S)) for _ in range(2)]
             client.send('{"op":"subscribe","subscriptions":[{"id":9,"channelId":1}]}')
             wait_for_subscription(stream)
-            stream.consume(iter([tracks(1)]))
+            send_all(stream, [tracks(1)])
             data = client.recv(_LIMIT_S)
     theirs = messages_of_sdk(data[13:])
     assert ours[0].keys() <= theirs[0].keys()
@@ -160,7 +160,7 @@ def test_later_client_gets_the_rig_and_images_only_if_asked() -> None:
     image = Message("/cameras/red/image", START_NS, START_NS, CompressedImage(START_NS, "red", b"x", "jpeg"))
     with streaming() as (stream, _):
         assert not isinstance(image.payload, stream.payloads)
-        stream.consume(iter([rig, None]))
+        send_all(stream, [rig])
         with opened(stream) as client:
             subscribed(client, 2)
             data = client.recv(_LIMIT_S)
@@ -177,7 +177,7 @@ def test_session_of_a_replay_begins_at_its_time() -> None:
     with streaming(is_replayed=True) as (stream, _), opened(stream) as client:
         subscribed(client)
         wait_until(lambda: stream.client_count, "a client is connected")
-        stream.consume(iter([tracks(0), begin]))
+        send_all(stream, [tracks(0), begin])
         times = [client.recv(_LIMIT_S) for _ in range(2)]
     assert times == [struct.pack("<BQ", 2, START_NS), struct.pack("<BQ", 2, START_NS - 5)]
 
@@ -230,7 +230,7 @@ def test_connections_of_foxglove_and_of_programs_are_accepted() -> None:
 
 def test_client_that_publishes_or_sends_garbage_is_disconnected() -> None:
     with streaming() as (stream, _):
-        stream.consume(iter([tracks(0)]))
+        send_all(stream, [tracks(0)])
         for data in (
             b"\x01",
             "{",
@@ -247,7 +247,7 @@ def test_client_that_publishes_or_sends_garbage_is_disconnected() -> None:
             client.send('{"op":"setParameters","parameters":[]}')
             client.send('{"op":"advertise","channels":[{"id":1,"topic":"/cmd"}]}')
             wait_for_subscription(stream)
-            stream.consume(iter([tracks(1)]))
+            send_all(stream, [tracks(1)])
             assert isinstance(client.recv(_LIMIT_S), bytes)
 
 
@@ -297,11 +297,11 @@ def test_messages_without_a_subscriber_are_not_serialised(monkeypatch: pytest.Mo
     monkeypatch.setattr(foxglove_stream, "encode", encode)
     with streaming() as (stream, _), opened(stream) as client:
         wait_until(lambda: stream.client_count, "a client is connected")
-        stream.consume(iter([tracks(0)] * 3))
+        send_all(stream, [tracks(0)] * 3)
         assert serialised == []
         subscribed(client, 1)
         wait_for_subscription(stream)
-        stream.consume(iter([tracks(1)]))
+        send_all(stream, [tracks(1)])
         assert isinstance(client.recv(_LIMIT_S), bytes)
     assert serialised == ["Tracks"]
 
@@ -335,7 +335,7 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
         # At its end, a stalled client waits for an answer that it cannot read.
         stalled = stack.enter_context(opened(stream, close_timeout=0.1))
         good = stack.enter_context(opened(stream))
-        stream.consume(iter([long]))  # announces its topic
+        send_all(stream, [long])  # announces its topic
         stalled.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         for client in (stalled, good):
             client.recv(_LIMIT_S)
@@ -347,7 +347,7 @@ def test_stalled_client_loses_messages_and_others_do_not() -> None:
         )
         received = 0
         while not events:
-            stream.consume(iter([long]))
+            send_all(stream, [long])
             received += isinstance(good.recv(_LIMIT_S), bytes)
             assert received < 100
     assert events[0][0] == "sink_dropped"

@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from ipsys_log import pipeline
-from ipsys_log.capture.first_messages import first_messages
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Tracks
@@ -149,7 +149,7 @@ def recording(lab: Path, calibration: Path, target: Path) -> Iterator[tuple[Clie
         )
         with attached:
             request = Request(model_from=calibration)
-            pipeline.live(attached, first, target, request, consumers=[clock.watch], sinks=streams)
+            pipeline.live(attached, first, target, request, sinks=[clock.watch, *streams])
         yield clients, events
 
 

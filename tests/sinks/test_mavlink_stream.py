@@ -20,7 +20,7 @@ from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from tests.sinks.autopilots import ardupilot, px4
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, send_all, track, tracks
 
 _LIMIT_S = 240.0
 NOW_NS = START_NS + 7
@@ -75,7 +75,7 @@ def streaming(
 def test_pose_arrives_in_the_axes_of_the_autopilot(autopilot: Autopilot) -> None:
     """The robot is 1 m east and 2 m north, 0.1 m up, faces east, and drives to the east."""
     with streaming(autopilot) as (stream, _):
-        stream.consume(iter([tracks(n, track("ada", 1 + 0.02 * (n - 3), 0.0)) for n in range(4)]))
+        send_all(stream, [tracks(n, track("ada", 1 + 0.02 * (n - 3), 0.0)) for n in range(4)])
         *_, last = [autopilot.next("ODOMETRY") for _ in range(4)]
     assert last.time_usec == (START_NS + 3 * STEP_NS) // 1000
     assert (last.frame_id, last.child_frame_id) == (
@@ -97,7 +97,7 @@ def test_direction_of_north_is_a_setting(
     autopilot: Autopilot, north_rad: float, expected: list[float] | None
 ) -> None:
     with streaming(autopilot, "/vision", north_rad) as (stream, _):
-        stream.consume(iter([tracks(0, track("ada", 1.0, 0.3))]))
+        send_all(stream, [tracks(0, track("ada", 1.0, 0.3))])
         message = autopilot.next("VISION_POSITION_ESTIMATE")
     if expected is not None:
         assert [message.x, message.y] == pytest.approx(expected, abs=1e-6)
@@ -108,7 +108,7 @@ def test_direction_of_north_is_a_setting(
 
 def test_turn_to_the_left_is_a_negative_yaw_rate(autopilot: Autopilot) -> None:
     with streaming(autopilot) as (stream, _):
-        stream.consume(iter([tracks(n, track("ada", 1.0, 0.04 * n)) for n in range(4)]))
+        send_all(stream, [tracks(n, track("ada", 1.0, 0.04 * n)) for n in range(4)])
         *_, last = [autopilot.next("ODOMETRY") for _ in range(4)]
     assert last.yawspeed == pytest.approx(-1.0, abs=1e-5)
 
@@ -117,7 +117,7 @@ def test_covariance_is_turned_and_unknown_begins_with_nan(autopilot: Autopilot) 
     known = replace(track("ada", 1.0), covariance_m2=np.diag([1e-4, 4e-4, 9e-4]), heading_sigma_rad=0.02)
     unknown = replace(track("ada", 1.0), covariance_m2=None)
     with streaming(autopilot) as (stream, _):
-        stream.consume(iter([tracks(0, known), tracks(1, unknown)]))
+        send_all(stream, [tracks(0, known), tracks(1, unknown)])
         first, second = [autopilot.next("ODOMETRY").pose_covariance for _ in range(2)]
     # The upper triangle by rows: x, y and z are at 0, 6 and 11; x is north, the y of the lab.
     assert [first[n] for n in (0, 6, 11)] == pytest.approx([4e-4, 1e-4, 9e-4])
@@ -143,7 +143,7 @@ def test_both_autopilots_use_position_and_yaw(autopilot: Autopilot, message: str
     sent = TRACKS[name]
     assert sent.heading_rad is not None
     with streaming(autopilot, "" if message == "ODOMETRY" else "/vision") as (stream, _):
-        stream.consume(iter([tracks(0, sent)]))
+        send_all(stream, [tracks(0, sent)])
         received = autopilot.next(message)
     for reading in (px4(received), ardupilot(received)):
         assert reading.internal_errors == 0
@@ -173,7 +173,7 @@ def test_each_field_of_a_message_is_in_the_documents(name: str) -> None:
 def test_covariance_of_the_velocity_is_along_the_robot(autopilot: Autopilot) -> None:
     """The robot faces along y, which is north: its velocity along x is to the right."""
     with streaming(autopilot) as (stream, _):
-        stream.consume(iter([tracks(0, moving_track("ada", np.pi / 2))]))
+        send_all(stream, [tracks(0, moving_track("ada", np.pi / 2))])
         last = autopilot.next("ODOMETRY")
     assert [last.vx, last.vy] == pytest.approx([0.0, 0.5], abs=1e-6)
     # The diagonal of the upper triangle by rows.
@@ -186,7 +186,7 @@ def test_covariance_of_the_velocity_is_along_the_robot(autopilot: Autopilot) -> 
 def test_new_session_raises_the_reset_counter(autopilot: Autopilot) -> None:
     with streaming(autopilot) as (stream, _):
         restart = Message("", 0, 0, NewSession(301))
-        stream.consume(iter([tracks(5, track("ada", 1.0)), restart, tracks(0, track("ada", 2.0))]))
+        send_all(stream, [tracks(5, track("ada", 1.0)), restart, tracks(0, track("ada", 2.0))])
         counters = [autopilot.next("ODOMETRY").reset_counter for _ in range(2)]
     assert counters == [300 % 256, 301 % 256]
 
@@ -200,7 +200,7 @@ def test_only_good_poses_of_the_robot_are_sent(autopilot: Autopilot) -> None:
         tracks(3, track("ada", 5.0)),
     ]
     with streaming(autopilot) as (stream, _):
-        stream.consume(iter(rows))
+        send_all(stream, rows)
         assert autopilot.next("ODOMETRY").y == 5.0
 
 
@@ -218,7 +218,7 @@ def test_time_is_answered_and_garbage_is_not(autopilot: Autopilot) -> None:
         answer = autopilot.next("TIMESYNC")
         assert (answer.tc1, answer.ts1) == (NOW_NS, 123456789)
         assert autopilot.link.recv_match(type="COMMAND_ACK", blocking=False) is None
-        stream.consume(iter([tracks(0, track("ada", 1.0))]))
+        send_all(stream, [tracks(0, track("ada", 1.0))])
         assert autopilot.next("ODOMETRY").y == 1.0
     assert events == []
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.sinks.rerun import recording
-from ipsys_log.sinks.rerun.recording import check_screen, show_in_viewer, viewer_command
+from ipsys_log.sinks.rerun import viewer
+from ipsys_log.sinks.rerun.viewer import check_screen, show_in_viewer, viewer_command
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
-    monkeypatch.setattr(recording, "viewer_command", lambda: [sys.executable, "-c", program])
+    monkeypatch.setattr(viewer, "viewer_command", lambda: [sys.executable, "-c", program])
 
 
 def pieces(data: bytes, count: int) -> Callable[[Callable[[bytes], object]], None]:

@@ -26,7 +26,7 @@ from ipsys_log.sinks.streams.ros2_types import type_hash
 from ipsys_log.units import NS_PER_S
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, send_all, track, tracks
 from tests.sinks.zenoh_listener import ZenohListener, open_node
 from tests.waiting import wait_until
 
@@ -116,7 +116,7 @@ def test_poses_arrive_with_stamps_frames_and_covariance() -> None:
     log = [tracks(n, replace(track("ada", 1.0, pi / 2 + 0.02 * n), y_m=0.02 * n)) for n in range(4)]
     topics = ("/tf", "/ada/pose", "/ada/odom")
     with streaming() as (stream, events), listening(stream, *topics) as listener:
-        stream.consume(iter(log))
+        send_all(stream, log)
         transforms, poses = listener.messages("/tf", 4), listener.messages("/ada/pose", 4)
         odometry = listener.messages("/ada/odom", 2)
         attached = listener.attachments("/tf")
@@ -150,7 +150,7 @@ def test_odometry_has_the_variances_along_the_robot() -> None:
     """The robot faces along y: its velocity along x is to the right."""
     topics = ("/ada/pose", "/ada/odom")
     with streaming() as (stream, _), listening(stream, *topics) as listener:
-        stream.consume(iter([tracks(0, moving_track("ada", pi / 2))]))
+        send_all(stream, [tracks(0, moving_track("ada", pi / 2))])
         (pose,), (odometry,) = listener.messages("/ada/pose"), listener.messages("/ada/odom")
     twist = odometry.twist
     assert [twist.twist.linear.x, twist.twist.linear.y] == pytest.approx([0.0, -0.5])
@@ -186,14 +186,14 @@ def test_node_and_publishers_are_in_the_graph() -> None:
 def test_stale_and_extrapolated_poses_are_withheld_and_diagnosed() -> None:
     outside = tracks(1, track("bob", 1.0, inside=False))
     with streaming() as (stream, _), listening(stream, "/tf", "/diagnostics") as listener:
-        stream.consume(iter([tracks(0, track("ada", 1.0)), outside]))
+        send_all(stream, [tracks(0, track("ada", 1.0)), outside])
         transforms, first = listener.messages("/tf"), listener.messages("/diagnostics")[-1]
     assert [row.child_frame_id for message in transforms for row in message.transforms] == ["ada"]
     assert [(status.name, status.level) for status in first.status] == [("ipsys: ada", 0), ("ipsys: bob", 1)]
     values = {value.key: value.value for value in first.status[0].values}
     assert values == {"session": "7", "age_s": "0.000", "cameras": "red", "sigma_m": "0.0100"}
     with streaming(age_s=0.6) as (stream, _), listening(stream, "/tf", "/diagnostics") as listener:
-        stream.consume(iter([tracks(0, track("ada", 1.0))]))
+        send_all(stream, [tracks(0, track("ada", 1.0))])
         status = listener.messages("/diagnostics")[-1].status
         assert "/tf" not in listener.topics()
     assert [(row.level, row.message) for row in status] == [
@@ -204,7 +204,7 @@ def test_stale_and_extrapolated_poses_are_withheld_and_diagnosed() -> None:
 
 def test_clock_belongs_to_replays_only() -> None:
     with streaming(is_replayed=True) as (stream, _), listening(stream, "/clock") as listener:
-        stream.consume(iter([Message("", 0, 0, NewSession(8))]))
+        send_all(stream, [Message("", 0, 0, NewSession(8))])
         clock = listener.messages("/clock")[-1].clock
         assert int(clock.sec) * NS_PER_S + int(clock.nanosec) == START_NS
     with streaming() as (stream, _), listening(stream, "/clock", "/diagnostics") as listener:
@@ -254,7 +254,7 @@ def test_second_stream_uses_the_router_that_answers() -> None:
 
         def arrives() -> bool:
             """Send a pose: the router tells the stream of a subscriber at any time."""
-            stream.consume(iter([tracks(next(numbers), track("ada", 1.0))]))
+            send_all(stream, [tracks(next(numbers), track("ada", 1.0))])
             return bool(listener.samples)
 
         wait_until(arrives, "a pose arrives")

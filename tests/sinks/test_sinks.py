@@ -1,4 +1,4 @@
-"""Sinks: a slow sink loses images first, a failing sink ends no recording, and offline none loses data."""
+"""Sinks: a slow sink loses images first, a failing sink ends no recording, an inline sink has no thread."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ import pytest
 
 from ipsys_log import pipeline
 from ipsys_log.capture.devices import OPENERS, open_source
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig, RigCamera, Tracks
 from ipsys_log.messages.channels import EVENTS
-from ipsys_log.sinks.player import play
-from ipsys_log.sinks.sink import Consumers, LiveQueue, LiveSinks, Sink, send_all
+from ipsys_log.sinks.sink import ALL, FanOut, LiveQueue, Sink
 from tests.stages.drawing import jpeg
 
 _LIMIT_S = 120.0
@@ -27,6 +26,8 @@ _LIMIT_S = 120.0
 
 class Collected:
     """A sink in the form of a new sink: it keeps the messages. ``fault`` is raised at the n-th one."""
+
+    payloads = ALL
 
     def __init__(self, name: str = "collected", fault_at: int | None = None) -> None:
         self.name = name
@@ -42,7 +43,7 @@ class Collected:
                 raise ZeroDivisionError("a fault\nin the sink")
 
 
-class Prompt:
+class Inline:
     """A sink that never waits; it keeps the messages and their thread, and may raise at the n-th message."""
 
     name = "prompt"
@@ -51,11 +52,7 @@ class Prompt:
     def __init__(self, fault_at: int | None = None) -> None:
         self.messages: list[Message] = []
         self.threads: set[int] = set()
-        self.has_ended = False
         self._fault_at = fault_at
-
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        send_all(self, messages)
 
     def send(self, message: Message) -> None:
         self.messages.append(message)
@@ -63,14 +60,12 @@ class Prompt:
         if len(self.messages) == self._fault_at:
             raise ZeroDivisionError("a fault")
 
-    def finish(self) -> None:
-        self.has_ended = True
-
 
 class Stuck:
     """A sink that accepts one message only, until it is released."""
 
     name = "stuck"
+    payloads = ALL
 
     def __init__(self) -> None:
         self.released = threading.Event()
@@ -117,32 +112,29 @@ def test_waiting_messages_are_bounded() -> None:
     assert (len(waiting), waiting.dropped["tracks"]) == (200, 800)
 
 
-def test_prompt_sink_gets_messages_before_the_call_returns() -> None:
+def test_inline_sink_gets_messages_before_the_call_returns() -> None:
     """A queue and a thread would delay positions on their way to robots."""
-    stuck, prompt = Stuck(), Prompt()
+    stuck, prompt = Stuck(), Inline()
     shown: list[int] = []
-    with Consumers([lambda _: shown.append(len(prompt.messages))], lambda *_: None, [stuck, prompt]) as show:
+    with FanOut([lambda _: shown.append(len(prompt.messages)), stuck, prompt], lambda *_: None) as show:
         for number in range(300):
             show(tracks(number))
             show(image(number))
         assert [message.log_time_ns for message in prompt.messages] == list(range(300))
         assert prompt.threads == {threading.get_ident()}
         assert shown[0] == 1  # streams come before displays
-        assert not prompt.has_ended
         stuck.released.set()
-    assert prompt.has_ended
 
 
-def test_failing_prompt_sink_does_not_affect_the_others() -> None:
+def test_failing_inline_sink_does_not_affect_the_others() -> None:
     events: list[str] = []
-    broken, good, collected = Prompt(fault_at=3), Prompt(), Collected()
-    sinks = LiveSinks([broken, good, collected], lambda kind, text: events.append(f"{kind}: {text}"))
+    broken, good, collected = Inline(fault_at=3), Inline(), Collected()
+    sinks = FanOut([broken, good, collected], lambda kind, text: events.append(f"{kind}: {text}"))
     with sinks as show:
         for number in range(10):
             show(tracks(number))
     assert events == ["sink_stopped: prompt stopped (a fault); the recording continues"]
     assert [len(sink.messages) for sink in (broken, good, collected)] == [3, 10, 10]
-    assert (broken.has_ended, good.has_ended) == (False, True)
     with pytest.raises(ZeroDivisionError):
         sinks.check()
 
@@ -225,38 +217,3 @@ def test_drops_of_a_sink_are_events_in_the_log(tmp_path: Path, monkeypatch: pyte
     assert texts[:2] == [
         f"stuck: {count} dropped (the sink is too slow)" for count in ("1 message", "10 messages")
     ]
-
-
-def test_player_drops_nothing_and_keeps_the_order() -> None:
-    sinks = [Collected("a"), Collected("b")]
-    paced: list[Message] = []
-    messages = [image(number) for number in range(1000)]
-    play(messages, sinks, paced.append)
-    assert sinks[0].messages == sinks[1].messages == paced == messages
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_error_of_a_sink_fails_the_player(count: int) -> None:
-    sinks = [Collected("bad", fault_at=3), *(Collected(str(n)) for n in range(1, count))]
-    with pytest.raises(ZeroDivisionError):
-        play((image(number) for number in range(1000)), sinks)
-
-
-def test_sink_that_ends_early_does_not_hang_the_player() -> None:
-    class Brief(Collected):
-        def consume(self, messages: Iterator[Message | None]) -> None:
-            next(messages)
-
-    other = Collected("other")
-    play([image(number) for number in range(1000)], [Brief("brief"), other])
-    assert len(other.messages) == 1000
-
-
-def test_error_in_the_log_ends_the_player() -> None:
-    def broken() -> Iterator[Message]:
-        yield image(0)
-        raise OSError("the disk")
-
-    sinks = [Collected("a"), Collected("b")]
-    with pytest.raises(OSError, match="the disk"):
-        play(broken(), sinks)

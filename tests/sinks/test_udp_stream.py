@@ -19,12 +19,21 @@ import pytest
 import ipsys_log as ipsys
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.sinks.sink import LiveSinks
+from ipsys_log.sinks.sink import FanOut
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.udp import UdpStream, encode_pose
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, track, tracks, write_tracks
+from tests.sinks.streaming import (
+    START_NS,
+    STEP_NS,
+    TOPIC,
+    moving_track,
+    send_all,
+    track,
+    tracks,
+    write_tracks,
+)
 
 KEY = b"0123456789abcdef"
 Receive = Callable[[socket.socket, bytes], Iterator[Any]]
@@ -194,7 +203,7 @@ def test_multicast_stays_on_this_machine_without_a_host() -> None:
         target = f"239.255.0.1:{group.getsockname()[1]}"
         stream = UdpStream(target, None, source(), lambda kind, text: None)
         assert stream.describe() == f"UDP {target}: only this machine"
-        stream.consume(iter([tracks(0, track("ada", 1.0))]))
+        send_all(stream, [tracks(0, track("ada", 1.0))])
         stream.close()
         assert json.loads(group.recv(2048))["x_m"] == 1.0
 
@@ -207,7 +216,7 @@ def test_lost_datagrams_are_counted_and_reported(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(socket, "socket", Full)
     events: list[tuple[str, str]] = []
     stream = UdpStream("127.0.0.1:9", None, source(), lambda kind, text: events.append((kind, text)))
-    stream.consume(iter([tracks(n, track("ada", 1.0)) for n in range(25)]))
+    send_all(stream, [tracks(n, track("ada", 1.0)) for n in range(25)])
     stream.close()
     assert {kind for kind, _ in events} == {"sink_dropped"}
     assert [text.split("(")[0] for _, text in events] == [
@@ -228,7 +237,7 @@ def test_sink_that_is_too_slow_reports_its_drops() -> None:
 
     events: list[str] = []
     slow = Slow()
-    with LiveSinks([slow], lambda kind, text: events.append(f"{kind}: {text}")) as sinks:
+    with FanOut([slow], lambda kind, text: events.append(f"{kind}: {text}")) as sinks:
         for number in range(215):
             sinks(tracks(number))  # not wanted, so not counted
             sinks(Message("/text", number, number, "text"))

@@ -22,7 +22,7 @@ from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.sinks.streams.vrpn import VrpnStream
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, send_all, track, tracks
 from tests.waiting import wait_until
 
 _LIMIT_S = 240.0
@@ -101,7 +101,7 @@ def connected(server: VrpnStream, cookie: bytes = COOKIE) -> Iterator[Reader]:
 
 
 def send(server: VrpnStream, *messages: Message) -> None:
-    server.consume(iter(messages))
+    send_all(server, messages)
 
 
 def taken(reader: Reader, count: int) -> list[Report]:
@@ -120,7 +120,7 @@ def test_client_of_motioncapture_gets_the_poses() -> None:
                 number += 1
                 yield tracks(number, track("ada", 1.25, 0.5), track("bob", 3.0, -2.0))
 
-        thread = threading.Thread(target=lambda: served.server.consume(play()), daemon=True)
+        thread = threading.Thread(target=lambda: send_all(served.server, play()), daemon=True)
         thread.start()
         program = [sys.executable, "-m", "tests.sinks.vrpn_listener", f"127.0.0.1:{served.server.port}", "6"]
         try:

@@ -19,7 +19,7 @@ from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import journal_path
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.repair import repair
+from ipsys_log.log.recovery import repair
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.messages import (
     CameraCalibration,

@@ -22,8 +22,6 @@ from tests.stages.drawing import (
     strewn,
 )
 
-__all__ = ["LIGHTS", "Light", "lit_frame", "marker_in_glare", "shadow", "spots", "streak"]
-
 # Corners in sides of the square, clockwise from the top left.
 _CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 

@@ -46,7 +46,6 @@ from tests.stages.drawing import (
     tiles,
     vignette,
 )
-from tests.tiers import first_fast
 
 LAB = LabSettings(stations=0)
 CAMERAS = dict(zip(LAB.cameras, mount_cameras(LAB), strict=True))
@@ -85,24 +84,19 @@ def check(score: Score, rms_px: float, max_px: float, found: float) -> None:
     assert score.found >= found, score
 
 
-@pytest.mark.parametrize(
-    ("count", "camera", "starts_s"),
-    first_fast(1, [(1, "red", (0,)), (3, "red", (1, 6)), (8, "black", (2, 9))]),
-)
-def test_corners_along_a_drive(count: int, camera: str, starts_s: Sequence[float]) -> None:
-    check(filmed(replace(LAB, markers=count), camera, starts_s, 4), 0.06, 0.5, 0.995)
+def test_corners_along_a_drive() -> None:
+    check(filmed(replace(LAB, markers=1), "red", [0.0], 4), 0.06, 0.5, 0.995)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("count", [1, 3, 8])
+@pytest.mark.parametrize(("count", "camera"), [(1, "white"), (3, "red"), (8, "black")])
 def test_corners_along_the_whole_drive(count: int, camera: str) -> None:
     starts_s = np.arange(0, 15, 1.5).tolist()
     check(filmed(replace(LAB, markers=count), camera, starts_s, 10), 0.06, 0.5, 0.995)
 
 
 @pytest.mark.parametrize(
-    "starts_s", [(2.0,), pytest.param(np.arange(0, 15, 1.0).tolist(), marks=pytest.mark.slow)]
+    "starts_s", [(2.0,), pytest.param(np.arange(0, 15, 3.0).tolist(), marks=pytest.mark.slow)]
 )
 def test_a_gamma_does_not_move_corners(starts_s: Sequence[float]) -> None:
     """Gamma makes black too small by the same distance for all markers: the offset corrects this."""
@@ -248,7 +242,7 @@ def scored(row: Row, frames: int, per_frame: int) -> Score:
     return strew(row.lens, row.look, frames, per_frame, row.quality, row.change, length_m=row.length_m)
 
 
-@pytest.mark.parametrize("name", first_fast(10, ROWS))
+@pytest.mark.parametrize("name", [*ROWS][:10])
 def test_corners_of_another_renderer(name: str) -> None:
     # One frame gives less information than many.
     row = ROWS[name]
@@ -263,9 +257,8 @@ def test_corners_of_another_renderer_over_many_frames(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gamma", "rms_px", "found"), [(1.0, 0.06, 0.98), (2.2, 0.07, 0.96)])
-def test_random_poses_out_to_the_edge_of_the_image(gamma: float, rms_px: float, found: float) -> None:
-    check(strew(FISHEYE, Look(gamma=gamma), 60, 8), rms_px, 0.5, found)
+def test_random_poses_out_to_the_edge_of_the_image() -> None:
+    check(strew(FISHEYE, Look(), 60, 8), 0.06, 0.5, 0.98)
 
 
 def test_marker_in_shadow_is_found_within_a_second() -> None:
@@ -305,7 +298,6 @@ def test_glare_on_a_marker_gives_no_wrong_one() -> None:
 @pytest.mark.parametrize(
     ("look", "frames"),
     [
-        (Look(), 3),
         (Look(), 50),
         (Look(noise=6.0), 30),
         (Look(black=60, white=110, floor=90), 30),

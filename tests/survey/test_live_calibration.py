@@ -30,7 +30,6 @@ def lines_of(
         live(message)
         if live._fitting is not None:
             live._fitting.result()
-    live(None)
     live.close()
     return lines, live
 

@@ -49,7 +49,7 @@ _AIM = """(async () => {
 
 
 class Phone:
-    """One page in one browser; ``console`` has the messages of the browser, ``process`` is its process."""
+    """One page in one browser; ``console`` has the messages of the page, ``process`` is the browser."""
 
     def __init__(self, read: int, write: int, process: int) -> None:
         self._read, self._write, self.process = read, write, process
@@ -57,6 +57,7 @@ class Phone:
         self._number = 0
         self._answers: dict[int, dict[str, Any]] = {}
         self._session: str | None = None
+        self._context: dict[str, str] = {}
         self.console: list[str] = []
         self._tapped_s = 0.0
 
@@ -93,7 +94,8 @@ class Phone:
             self._rest += data
         one, _, self._rest = self._rest.partition(b"\0")
         answer: dict[str, Any] = json.loads(one)
-        if answer.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown"):
+        is_report = answer.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown")
+        if is_report and answer.get("sessionId") == self._session:  # not those of a page of an earlier test
             self.console.append(json.dumps(answer["params"]))
         if "id" in answer:
             self._answers[answer["id"]] = answer
@@ -101,7 +103,7 @@ class Phone:
     def open(self, url: str, size_px: tuple[int, int] = (_WIDTH, _HEIGHT), scheme: str = "light") -> None:
         """Open a page in a window of this size, in a colour scheme that the user prefers."""
         self._session = None
-        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        target = self.send("Target.createTarget", url="about:blank", **self._context)["targetId"]
         self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         width, height = size_px
         is_phone = size_px == (_WIDTH, _HEIGHT)
@@ -117,6 +119,19 @@ class Phone:
             self.send(f"{domain}.enable")
         self.send("Page.navigate", url=url)
         self.wait("location.href !== 'about:blank' && document.readyState === 'complete'")
+
+    @contextmanager
+    def separate(self) -> Iterator[None]:
+        """Begin without cookies and messages; close all pages and forget the cookies at the end."""
+        self._session = None
+        self._context = {"browserContextId": self.send("Target.createBrowserContext")["browserContextId"]}
+        self.console.clear()
+        try:
+            yield
+        finally:
+            self._session = None
+            self.send("Target.disposeBrowserContext", **self._context)
+            self._context = {}
 
     def reload(self) -> None:
         """Load the page again, and wait until its document is complete."""

@@ -8,8 +8,6 @@ from PIL import Image
 
 from tests.web.phone import Phone
 
-__all__ = ["save_screen"]
-
 _COLOURS = 256
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from tests.conftest import Unmeasured
 from tests.waiting import wait_until
 from tests.web.axe import serious_faults
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_dashboard_browser import press
 from tests.web.test_dashboard_state import LENS, Stream, pairs_of_a_level_camera
 from tests.web.test_measuring_page import Recording, says
@@ -29,12 +28,6 @@ pytestmark = pytest.mark.slow
 
 PHONE, DESKTOP = (390, 844), (1280, 900)
 STEPS = ("rig", "cameras", "intrinsics", "alignment", "points", "accuracy", "live")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
-    with phone(tmp_path_factory.mktemp("accessibility")) as one:
-        yield one
 
 
 def check(browser: Phone, place: object) -> None:

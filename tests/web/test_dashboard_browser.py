@@ -16,17 +16,11 @@ from tests.web.phone import Phone, phone
 from tests.web.test_dashboard_state import LENS, Stream, pairs_of_a_level_camera
 from tests.web.test_measuring_page import FETCHED, says
 
-# A browser for each test.
+# A browser.
 pytestmark = pytest.mark.slow
 
 PHONE, DESKTOP, WALL = (390, 844), (1280, 900), (2560, 1440)
 COUNT = "document.querySelectorAll({!r}).length"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
-    with phone(tmp_path_factory.mktemp("dashboard")) as one:
-        yield one
 
 
 @contextmanager

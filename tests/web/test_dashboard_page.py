@@ -363,10 +363,8 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
         dashboard = Dashboard(setting, operator)
         frames = 0
 
-        def act(message: Message | None) -> None:
+        def act(message: Message) -> None:
             nonlocal frames
-            if message is None:
-                return
             shown.append(message)
             frames += message.topic.endswith("/image")
             if frames == 20 and operator.seat.number == 0:
@@ -380,8 +378,7 @@ def watched(lab_log: Path, calibration: Path, tmp_path: Path) -> Watched:
             pages.start()
             assert pages.connected.wait(WAIT_LIMIT_S)
             request = Request(model_from=calibration)
-            consumers = [clock.watch, act]
-            pipeline.live(attached, settings, log, request, None, consumers, sinks=[dashboard])
+            pipeline.live(attached, settings, log, request, None, [clock.watch, act, dashboard])
             pages.join(WAIT_LIMIT_S)
             assert not pages.is_alive()
     return Watched(log, pages, shown)
@@ -408,5 +405,5 @@ def test_ten_pages_do_not_change_a_recording(watched: Watched, lab_log: Path) ->
 
 
 def test_without_a_plan_there_is_no_page(tmp_path: Path) -> None:
-    with serve_dashboard(None, None, tmp_path, "poly", ()) as dashboards:  # type: ignore[arg-type]
+    with serve_dashboard(None, None, None, tmp_path, "poly", ()) as dashboards:  # type: ignore[arg-type]
         assert dashboards == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,12 @@ from ipsys_log.messages import CameraModel, Model, RigMarker
 from ipsys_log.simulation.settings import grid_names
 from tests.web.contrast import low_contrasts
 from tests.web.dashboards import RIG, LiveLab, event, frame, markers, page_of, robot, tracks
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_dashboard_browser import COUNT, DESKTOP, PHONE, WALL, opened
 from tests.web.test_dashboard_state import LENS, pairs_of_a_level_camera
 from tests.web.test_measuring_page import says
 
-# A browser for each test.
+# A browser.
 pytestmark = pytest.mark.slow
 
 NAMES = grid_names(6, 4)
@@ -27,12 +26,6 @@ BLURRED = FrameCheck((0,), (), 120.0, 1.0, ("the image is blurred: add light",))
 ROWS = (
     "[...document.querySelectorAll('{} tbody tr')].map(row => [...row.children].map(cell => cell.innerText))"
 )
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
-    with phone(tmp_path_factory.mktemp("hall")) as one:
-        yield one
 
 
 def lab_of(folder: Path, names: tuple[str, ...]) -> LiveLab:
@@ -65,7 +58,7 @@ def tops(browser: Phone, *selectors: str) -> Any:
     return browser.run(f"{[*selectors]}.map(one => document.querySelector(one).getBoundingClientRect().top)")
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP, WALL], ids=["phone", "desktop", "wall"])
+@pytest.mark.parametrize("size", [PHONE, WALL], ids=["phone", "wall"])
 def test_hall_fits_every_screen_in_both_schemes(browser: Phone, hall: LiveLab, size: tuple[int, int]) -> None:
     with page_of(hall.dashboard) as page, opened(browser, page.url, size):
         browser.wait(f"{COUNT.format('figure image')} === 24")

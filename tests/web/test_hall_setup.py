@@ -14,11 +14,11 @@ from ipsys_log.simulation.settings import grid_names
 from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.web.contrast import low_contrasts
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_dashboard_browser import COUNT, DESKTOP, PHONE, WALL
 from tests.web.test_setup_browser import leave, unexpected
 
-# A browser for each test.
+# A browser.
 pytestmark = pytest.mark.slow
 
 NAMES = grid_names(6, 4)
@@ -28,12 +28,6 @@ marker_length_m = 0.2
 """
 CAMERA = '[[cameras]]\nname = "{}"\nsource = "rtsp://192.168.1.{}/stream1"\n'
 State = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
-    with phone(tmp_path_factory.mktemp("hall_setup")) as one:
-        yield one
 
 
 def aligned(name: str, level: bool) -> State:
@@ -86,7 +80,7 @@ def box(browser: Phone, selector: str) -> list[float]:
     return [float(value) for value in found]
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP, WALL], ids=["phone", "desktop", "wall"])
+@pytest.mark.parametrize("size", [PHONE, WALL], ids=["phone", "wall"])
 def test_setup_of_a_hall_fits_every_screen(browser: Phone, tmp_path: Path, size: tuple[int, int]) -> None:
     with serving(tmp_path, NAMES, with_results) as url:
         for step in ("cameras", "intrinsics", "alignment"):

@@ -15,7 +15,7 @@ from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.web.server import serve
 from tests.conftest import Unmeasured
 from tests.web.contrast import low_contrasts
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_measuring_page import Recording, save, says, texts_at
 
 PHONE, DESKTOP = (390, 844), (1280, 800)
@@ -37,12 +37,6 @@ BOXES = """(() => {
   return [boxes("input:not([type=radio]), fieldset span, select"), boxes("#notice, #save"), boxes("#save")[0],
     document.scrollingElement.scrollWidth, innerWidth, innerHeight];
 })()"""  # noqa: E501
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
-    with phone(tmp_path_factory.mktemp("layout")) as one:
-        yield one
 
 
 def meet(one: list[float], other: list[float]) -> bool:

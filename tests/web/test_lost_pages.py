@@ -210,32 +210,3 @@ def test_page_goes_on_when_the_command_is_started_again(browser: Phone, folder: 
         says(browser, "#folder", "hall")
         says(browser, "#operation", "This device operates")
         leave(browser)
-
-
-def test_two_pages_show_the_same_and_one_operates(browser: Phone, folder: Path, tmp_path: Path) -> None:
-    with setup_page(folder) as page, phone(tmp_path / "second") as other:
-        for one in (browser, other):
-            one.open(page.parts.geturl(), DESKTOP)
-            says(one, "#state", "0 of 7")
-            says(one, "#operation", "No device operates")
-        browser.tap("#simulate")
-        says(browser, "#operation", "This device operates")
-        says(other, "#state", "3 of 7")
-        says(other, "#folder", "simulated_lab")
-        says(other, "#operation", "Another device operates")
-        other.wait("document.querySelector('#save').disabled")
-        other.run("location.hash = 'alignment'")
-        other.wait("document.querySelector('#align').disabled")
-        other.tap("#take")
-        says(other, "#operation", "This device operates")
-        says(browser, "#operation", "Another device operates")
-        other.tap("#align")
-        # The first page sees the job, and has no button to stop it.
-        says(browser, "#job-text", "the alignment")
-        browser.wait("!document.querySelector('#stop').checkVisibility()")
-        says(other, "#state", "4 of 7")
-        says(browser, "#state", "4 of 7")
-        other.tap("#take")
-        for one in (browser, other):
-            says(one, "#operation", "No device operates")
-            leave(one)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,15 +31,14 @@ from ipsys_log.web.server import serve
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import as_typed, foreign_read
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 
 FETCHED = "performance.getEntriesByType('resource').map(one => one.name)"
 
 
 @pytest.fixture
-def hand(tmp_path: Path) -> Iterator[Phone]:
-    with phone(tmp_path / "phone") as one:
-        yield one
+def hand(browser: Phone) -> Phone:
+    return browser
 
 
 def fill(hand: Phone, a: str, b: str, side: str, height: str) -> None:

@@ -23,7 +23,7 @@ from tests.capture.test_rtsp import CODECS, HAS_SERVER, served
 from tests.playing import WAIT_LIMIT_S
 from tests.ports import free_port
 from tests.waiting import wait_until
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_measuring_page import says
 from tests.web.test_setup_browser import JOB_ENDED, Visitor, opened
 from tests.web.test_setup_page import Client
@@ -78,13 +78,9 @@ def type_address(browser: Phone, address: str, user: str = "", password: str = "
 
 @needs_server
 def test_password_of_a_network_camera_is_only_in_the_rig_file(
-    video: Path, folder: Path, tmp_path: Path
+    video: Path, folder: Path, browser: Phone
 ) -> None:
-    with (
-        served(video, "tcp", "digest") as address,
-        phone(tmp_path) as browser,
-        opened(browser, folder, (1280, 900)) as url,
-    ):
+    with served(video, "tcp", "digest") as address, opened(browser, folder, (1280, 900)) as url:
         browser.wait("document.querySelector('#step-cameras')")
         browser.run("location.hash = 'cameras'")
         browser.wait("document.querySelector('#add-camera')")

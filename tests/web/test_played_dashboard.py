@@ -24,7 +24,7 @@ from tests.conftest import Ipsys
 from tests.sinks.streaming import write_tracks
 from tests.test_bad_input import refused
 from tests.web.dashboards import page_of
-from tests.web.phone import phone
+from tests.web.phone import Phone
 from tests.web.test_access import Caller
 from tests.web.test_dashboard_page import Reader, post
 from tests.web.test_measuring_page import says
@@ -146,8 +146,8 @@ def test_command_serves_a_log_without_a_stream(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_browser_shows_rate_and_pause(recorded: Path, tmp_path: Path) -> None:
-    with shown(recorded, rate=0.5, loop=True) as (player, url), phone(tmp_path) as browser:
+def test_browser_shows_rate_and_pause(recorded: Path, browser: Phone) -> None:
+    with shown(recorded, rate=0.5, loop=True) as (player, url):
         browser.open(url, (1280, 900))
         says(browser, "h1", "Playback")
         says(browser, "#state", "paused")

@@ -15,12 +15,12 @@ from ipsys_log.web.first_day.app import SetupApp
 from ipsys_log.web.server import serve_app
 from tests.cli.test_simulated_day import errors_m
 from tests.web.contrast import low_contrasts
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_dashboard_browser import press
 from tests.web.test_measuring_page import FETCHED, says
 from tests.web.test_setup_page import Client
 
-# A browser for each test.
+# A browser.
 pytestmark = pytest.mark.slow
 
 PHONE, DESKTOP, WALL = (390, 844), (1280, 900), (2560, 1440)
@@ -99,12 +99,6 @@ def folder(tmp_path: Path) -> Path:
     path = tmp_path / "a_long_name_of_a_folder_for_a_lab"
     path.mkdir()
     return path
-
-
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Phone]:
-    with phone(tmp_path) as one:
-        yield one
 
 
 def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: Path) -> None:

@@ -146,9 +146,9 @@ class Node:
         if self._channel is not None:
             self._channel.close()
 
-    def __call__(self, message: Message | None) -> None:
+    def __call__(self, message: Message) -> None:
         """Take a recorded message; send it if it is a frame, or its markers."""
-        if message is None or not isinstance(message.payload, self._sent):
+        if not isinstance(message.payload, self._sent):
             return
         frame = _recorded(self._count, message.payload)
         with self._changed:

@@ -19,7 +19,6 @@ from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, Sourc
 from ipsys_log.capture.nodes.centre import Centre, describe_no_answer, is_of_node
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.errors import IpsysError
-from ipsys_log.interrupts import undivided
 from ipsys_log.messages import RigCamera
 from ipsys_log.piped_process import PipedProcess, parent_pipe
 from ipsys_log.units import NS_PER_S
@@ -179,8 +178,7 @@ class Receiver:
 
     def _start(self) -> None:
         try:
-            with undivided():
-                self._process = PipedProcess(serve)
+            self._process = PipedProcess(serve)
             self._process.sender.send(self._setup)
             fault = self._process.receiver.recv()
         except (EOFError, OSError) as error:

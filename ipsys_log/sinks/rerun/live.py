@@ -11,8 +11,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Event, Markers, Message, Positions, Rig, Tracks, image_topic
 from ipsys_log.messages.channels import IMAGES
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.recording import check_screen, show_in_viewer
 from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout, symbol_scale
+from ipsys_log.sinks.rerun.viewer import check_screen, show_in_viewer
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.units import NS_PER_S
 
@@ -22,7 +22,7 @@ _FADE_NS = NS_PER_S
 
 
 class LiveView:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that shows a recording in a Rerun viewer.
+    """A :class:`~ipsys_log.sinks.sink.QueuedSink` that shows a recording in a Rerun viewer.
 
     Parameters
     ----------

@@ -1,117 +1,41 @@
-"""The Rerun recording of a log: images with markers, floor, positions and tracks; and its viewer."""
+"""The Rerun recording of a log: images with markers, floor, positions and tracks, and time series."""
 
 from __future__ import annotations
 
-import os
-import re
-import signal
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
+import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
+from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
 from ipsys_log.analysis.pairs import locate_measurements
 from ipsys_log.errors import IpsysError
-from ipsys_log.interrupts import undivided
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Message
-from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.sinks.player import play
+from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC
+from ipsys_log.messages.channels import LATENCY, MEASUREMENTS
+from ipsys_log.sinks.colours import camera_colours, robot_colour
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.scene import Plot, draw_legend, draw_places, draw_rig, layout, symbol_scale
-from ipsys_log.sinks.rerun.series import DISAGREEMENT, LATENCY_MS, Series, draw_series, read_series
+from ipsys_log.sinks.rerun.scene import (
+    TIMELINES,
+    Plot,
+    draw_legend,
+    draw_places,
+    draw_rig,
+    layout,
+    symbol_scale,
+)
+from ipsys_log.sinks.rerun.viewer import show_in_viewer
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 
-_INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open it on a machine with a screen"
+# The entities above the series; each has its own plot.
+DISAGREEMENT = "series/disagreement"
+LATENCY_MS = "series/latency"
 
-
-def viewer_command(port: int | None = None) -> list[str]:
-    """Return the command of the viewer; it shows the recording from its standard input.
-
-    The viewer also accepts connections, by default on all interfaces; this command limits it to this machine.
-    With a fixed port, an open viewer would get the recording, even if it listens on all interfaces. So the
-    command selects a free port, unless a port is given.
-    """
-    return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port or "auto"), "-"]
-
-
-def check_screen(environment: Mapping[str, str]) -> None:
-    """Check that a window can be opened.
-
-    Raises
-    ------
-    IpsysError
-        There is no display.
-    """
-    displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
-    if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
-        raise IpsysError(f"the viewer needs a screen, but this machine has none; {_INSTEAD}")
-
-
-def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
-    """Open a viewer, feed it, and wait until its window is closed.
-
-    Parameters
-    ----------
-    feed : called with a function that takes the bytes of a recording, piece by piece.
-
-    Raises
-    ------
-    IpsysError
-        No window can be opened.
-    """
-    check_screen(os.environ)
-    environment = {"RUST_LOG": "error", **os.environ}
-    with (
-        tempfile.TemporaryFile() as complaints,
-        subprocess.Popen(
-            viewer_command(), stdin=subprocess.PIPE, stderr=complaints, env=environment
-        ) as viewer,
-    ):
-        assert viewer.stdin is not None
-        try:
-            feed(viewer.stdin.write)
-            viewer.stdin.close()
-        except BrokenPipeError:
-            # The window was closed before the end, or it never opened: the exit code shows the case.
-            _abandon(viewer.stdin)
-        except BaseException:
-            stop_viewer(viewer)
-            _abandon(viewer.stdin)
-            raise
-        if viewer.wait() != 0:
-            raise IpsysError(f"the viewer cannot be shown ({last_line(complaints)}); {_INSTEAD}")
-
-
-def stop_viewer(viewer: subprocess.Popen[bytes]) -> None:
-    """End the viewer; its process is Python, which passes on an interrupt but not a termination."""
-    if sys.platform == "win32":
-        viewer.terminate()
-    else:
-        viewer.send_signal(signal.SIGINT)
-
-
-def _abandon(pipe: IO[bytes]) -> None:
-    """Close a pipe without a reader, with the data left in it."""
-    try:
-        pipe.close()
-    except BrokenPipeError:
-        return
-
-
-def last_line(complaints: IO[bytes]) -> str:
-    """Return the last line of an error output, without colours."""
-    complaints.seek(0)
-    text = re.sub(r"\x1b\[[0-9;]*m", "", complaints.read().decode(errors="replace"))
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "no reason given"
-
-
+_MM_PER_M = 1e3
+_NS_PER_MS = 1e6
 # Frames stay longer than positions: between two calibration points the log may have a gap.
 _FRAME_FACTOR = 10
 # Titles of the plots, with their units.
@@ -148,12 +72,12 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
         show_in_viewer(lambda write: _stream(session, shown, write))
         return shown
     partial = save.with_name(save.name + ".partial")
-    with ExitStack() as stack:
-        with undivided():
-            partial.touch()  # errors of the path are raised by this call, not by Rerun
-            stack.callback(partial.unlink, missing_ok=True)
+    try:
+        partial.touch()  # errors of the path are raised by this call, not by Rerun
         _save(session, shown, partial)
         partial.replace(save)
+    finally:
+        partial.unlink(missing_ok=True)
     return shown
 
 
@@ -205,7 +129,11 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
         recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
     fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)
     sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs, symbol_scale(rig))
-    play(session.messages([*shown.frames, *shown.moving, *shown.events]), [_Batches(sink, sent)])
+    for number, message in enumerate(session.messages([*shown.frames, *shown.moving, *shown.events])):
+        sink(message)
+        if number % _BATCH == 0:
+            sink.flush()
+            sent()
     sink.close()
     sent()
 
@@ -222,19 +150,71 @@ def _sizes_px(session: Session, cameras: Sequence[str]) -> dict[str, tuple[int, 
     return {camera: (lens.width, lens.height) for camera, lens in lenses.items() if lens is not None}
 
 
-class _Batches:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that draws messages and sends them in batches."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """One series of a plot: the entity, its name in the legend, its colour, and its points.
 
-    name = "the recording"
+    Attributes
+    ----------
+    times_ns : by timeline, (n,) instants in ns.
+    values : (n,), in the unit of the plot.
+    """
 
-    def __init__(self, sink: RerunSink, sent: Callable[[], object]) -> None:
-        self._sink, self._sent = sink, sent
+    entity: str
+    name: str
+    colour: tuple[int, int, int]
+    times_ns: Mapping[str, NDArray[np.int64]]
+    values: NDArray[np.float64]
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Draw the messages until they end."""
-        for number, message in enumerate(messages):
-            if message is not None:
-                self._sink(message)
-            if number % _BATCH == 0:
-                self._sink.flush()
-                self._sent()
+    def is_below(self, entity: str) -> bool:
+        """Return whether the series belongs to the plot of an entity."""
+        return self.entity.startswith(f"{entity}/")
+
+
+def read_series(session: Session, runs: Sequence[str]) -> list[Series]:
+    """Return the latencies of a log, and the disagreement of cameras in some runs.
+
+    Raises
+    ------
+    LogError
+        A message cannot be read.
+    """
+    disagreements = [_disagreements(session, run, several=len(runs) > 1) for run in runs]
+    return [*_latencies(session), *(series for of_run in disagreements for series in of_run)]
+
+
+def draw_series(recording: rr.RecordingStream, series: Sequence[Series]) -> None:
+    """Draw each series as points: between two points, a robot may have been unseen."""
+    for one in series:
+        look = rr.SeriesPoints(colors=[one.colour], names=[one.name], markers=["circle"], marker_sizes=[2.0])
+        recording.log(one.entity, look, static=True)
+        timelines = [
+            rr.TimeColumn(timeline, timestamp=times_ns.astype("datetime64[ns]"))
+            for timeline, times_ns in one.times_ns.items()
+        ]
+        columns = rr.Scalars.columns(scalars=one.values)
+        rr.send_columns(one.entity, timelines, columns, recording=recording)
+
+
+def _disagreements(session: Session, run: str, several: bool) -> Iterator[Series]:
+    """Yield the distances of the positions of each pair of cameras, at the instants of the first camera."""
+    for number, pair in enumerate(read_disagreement(session, run, reference_ids(session))):
+        name = " - ".join(pair.cameras) + (f" ({run})" if several else "")
+        entity = f"{DISAGREEMENT}/{run}/{'_and_'.join(pair.cameras)}"
+        times_ns = {TIMELINES[0]: pair.times_ns}
+        yield Series(entity, name, robot_colour(number), times_ns, _MM_PER_M * pair.lengths_m)
+
+
+def _latencies(session: Session) -> Iterator[Series]:
+    """Yield the time from the arrival of a frame to its published position, for each camera."""
+    messages = list(session.messages(session.topics(LATENCY)))
+    colours = camera_colours(message.payload.camera for message in messages)
+    for camera, colour in colours.items():
+        own = [message for message in messages if message.payload.camera == camera]
+        stamps = ([m.publish_time_ns for m in own], [m.log_time_ns for m in own])
+        times_ns = {
+            timeline: np.array(column, dtype=np.int64)
+            for timeline, column in zip(TIMELINES, stamps, strict=True)
+        }
+        delays_ns = np.array([m.payload.published - m.payload.received for m in own], dtype=np.float64)
+        yield Series(f"{LATENCY_MS}/{camera}", camera, colour, times_ns, delays_ns / _NS_PER_MS)

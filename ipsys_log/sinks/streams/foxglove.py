@@ -11,7 +11,7 @@ import hmac
 import http
 import logging
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -24,7 +24,7 @@ from websockets.typing import Subprotocol
 from ipsys_log.log.codec import PAYLOADS, encode
 from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo, Tracks
 from ipsys_log.messages.channels import IMAGES
-from ipsys_log.sinks.sink import DropReport, Warn, send_all
+from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, is_own_host, listen
 from ipsys_log.sinks.streams.foxglove_messages import (
     SUBPROTOCOLS,
@@ -57,7 +57,7 @@ _MOST_WITH_IMAGES_BYTES, _MOST_WAITING_BYTES = 2 << 20, 4 << 20
 
 
 class FoxgloveStream:
-    """A :class:`~ipsys_log.sinks.sink.PromptSink` that sends messages to Foxglove. It carries out no command.
+    """A :class:`~ipsys_log.sinks.sink.InlineSink` that sends messages to Foxglove. It carries out no command.
 
     A connection needs the secret in its address, a Host of this machine, and the Origin of Foxglove or none.
 
@@ -128,14 +128,6 @@ class FoxgloveStream:
         """The number of messages that the stream lost."""
         return self._drops.count
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Send the messages until they end."""
-        send_all(self, messages)
-
-    def finish(self) -> None:
-        """Report the lost messages."""
-        self._drops.finish()
-
     def send(self, message: Message) -> None:
         """Send a message to the clients that have subscribed to its topic."""
         payload, time_ns = message.payload, message.publish_time_ns
@@ -153,6 +145,7 @@ class FoxgloveStream:
 
     def close(self) -> None:
         """Disconnect the clients and close the socket."""
+        self._drops.finish()
         self._call(self._ended.set)
         self._thread.join()
         self._listening.close()

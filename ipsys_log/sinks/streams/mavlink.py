@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import select
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn, send_all
+from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.mavlink_messages import encode_odometry, encode_vision
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
@@ -52,7 +52,7 @@ def parse_endpoint(text: str) -> Endpoint:
 
 
 class MavlinkStream:
-    """A :class:`~ipsys_log.sinks.sink.PromptSink` that sends the pose of a robot to its autopilot.
+    """A :class:`~ipsys_log.sinks.sink.InlineSink` that sends the pose of a robot to its autopilot.
 
     It answers requests of the autopilot for the time (TIMESYNC), and ignores every other message. Stale poses
     and poses outside the calibrated volume are withheld.
@@ -110,14 +110,6 @@ class MavlinkStream:
         """The number of messages that the stream lost."""
         return self._drops.count
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Send the poses of the messages until they end."""
-        send_all(self, messages)
-
-    def finish(self) -> None:
-        """Report the lost messages."""
-        self._drops.finish()
-
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
@@ -127,6 +119,7 @@ class MavlinkStream:
 
     def close(self) -> None:
         """Close the socket."""
+        self._drops.finish()
         self._ended.set()
         for thread in self._threads:
             thread.join()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import zenoh
@@ -12,7 +12,7 @@ import zenoh
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn, send_all
+from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
@@ -29,7 +29,7 @@ _TICK_S, _TICKS_PER_DIAGNOSIS = 0.05, 20
 
 
 class Ros2Stream:
-    """A :class:`~ipsys_log.sinks.sink.PromptSink` that publishes poses to nodes of ROS 2 with ``rmw_zenoh``.
+    """A :class:`~ipsys_log.sinks.sink.InlineSink` that publishes poses to nodes of ROS 2 with ``rmw_zenoh``.
 
     If a Zenoh router answers on the port, the stream is its client. Else the stream is the router. Stale
     poses, poses outside the calibrated volume and poses without heading are withheld.
@@ -96,16 +96,9 @@ class Ros2Stream:
         """The number of messages that the stream lost."""
         return self._drops.count
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Send the poses of the messages until they end."""
-        send_all(self, messages)
-
-    def finish(self) -> None:
-        """Report the lost messages."""
-        self._drops.finish()
-
     def close(self) -> None:
         """Close the session: a program that ends without this can hang."""
+        self._drops.finish()
         self._ended.set()
         self._thread.join()
         self._close_session()

@@ -22,7 +22,7 @@ from ipsys_log.sinks.streams.ros2_types import encode, make, make_header, make_t
 from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from ipsys_log.analysis.floor_cameras import FloorCamera
+    from ipsys_log.geometry.posed_camera import PosedCamera
 
 MAP = "map"
 TF, CLOCK = "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock"
@@ -60,7 +60,7 @@ def encode_transforms(poses: Iterable[tuple[StreamPose, float]]) -> bytes:
     return encode(make("tf2_msgs/TFMessage", rows), TF)
 
 
-def encode_static(heights_m: Mapping[str, float], time_ns: int, cameras: Iterable[FloorCamera] = ()) -> bytes:
+def encode_static(heights_m: Mapping[str, float], time_ns: int, cameras: Iterable[PosedCamera] = ()) -> bytes:
     """Return the message of ``/tf_static``: a topic that keeps only its last message.
 
     Parameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, fields
 from itertools import chain
 from math import pi
@@ -12,9 +12,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
 
+from ipsys_log.capture.lab import OpenLab
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigStream
-from ipsys_log.sinks.sink import PromptSink, Warn
+from ipsys_log.messages.channels import TRACKS
+from ipsys_log.sinks.sink import InlineSink, Warn
 from ipsys_log.sinks.streams.poses import STALE_S, PoseSource, first_session
 from ipsys_log.sinks.streams.udp import UdpStream, read_key
 from ipsys_log.sinks.streams.vrpn import PORT, VrpnStream
@@ -24,7 +26,7 @@ PORTS = {"vrpn": PORT, "ros2": 7447, "foxglove": 8765}
 _SECRET_BYTES = 12
 
 
-class Stream(PromptSink, Protocol):
+class Stream(InlineSink, Protocol):
     """A sink with open sockets that never waits; one with connections also has a ``client_count``."""
 
     @property
@@ -138,6 +140,20 @@ def open_streams(
         ):
             streams.append(stack.enter_context(closing(other)))
         yield streams
+
+
+def open_live_streams(
+    settings: StreamSettings, lab: OpenLab, run: str
+) -> AbstractContextManager[list[Stream]]:
+    """Open streams of the tracks of a run, for the robots of an open lab."""
+    cameras = lab.cameras
+    return open_streams(
+        settings,
+        {TRACKS.topic_of(run)},
+        cameras.clock.now_ns,
+        cameras.add_event,
+        heights_m=lab.rig.robot_heights_m(),
+    )
 
 
 def _autopilots(

@@ -6,14 +6,13 @@ import hashlib
 import hmac
 import json
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.messages.message import Mat33
-from ipsys_log.sinks.sink import DropReport, Warn, send_all
+from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 
@@ -95,7 +94,7 @@ def read_key(path: Path) -> bytes:
 
 
 class UdpStream:
-    """A :class:`~ipsys_log.sinks.sink.PromptSink` that sends each pose in a datagram. It never receives.
+    """A :class:`~ipsys_log.sinks.sink.InlineSink` that sends each pose in a datagram. It never receives.
 
     Datagrams for which the system has no room are dropped and counted.
 
@@ -141,14 +140,6 @@ class UdpStream:
         """The number of messages that the stream lost."""
         return self._drops.count
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Send the poses of the messages until they end."""
-        send_all(self, messages)
-
-    def finish(self) -> None:
-        """Report the lost messages."""
-        self._drops.finish()
-
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
@@ -156,6 +147,7 @@ class UdpStream:
 
     def close(self) -> None:
         """Close the socket."""
+        self._drops.finish()
         self._socket.close()
 
     def _send(self, datagram: bytes) -> None:

@@ -6,13 +6,13 @@ import errno
 import selectors
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn, send_all
+from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, refuse_bind
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.vrpn_client import Client
@@ -31,7 +31,7 @@ _MOST_REFUSALS = 10  # events; others could fill the log
 
 
 class VrpnStream:
-    """A :class:`~ipsys_log.sinks.sink.PromptSink` that is a VRPN server, on TCP and UDP.
+    """A :class:`~ipsys_log.sinks.sink.InlineSink` that is a VRPN server, on TCP and UDP.
 
     A client connects by TCP. Or it asks by UDP for a connection to one of its ports; the server connects only
     to the address that sent this datagram. Positions are sent by TCP. Stale positions and positions outside
@@ -89,14 +89,6 @@ class VrpnStream:
         """The number of messages that the stream lost."""
         return self._drops.count
 
-    def consume(self, messages: Iterator[Message | None]) -> None:
-        """Send the poses of the messages until they end."""
-        send_all(self, messages)
-
-    def finish(self) -> None:
-        """Report the lost messages."""
-        self._drops.finish()
-
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
@@ -104,6 +96,7 @@ class VrpnStream:
 
     def close(self) -> None:
         """Disconnect the clients and close the sockets."""
+        self._drops.finish()
         self._ended.set()
         self._wake_thread()
         self._thread.join()

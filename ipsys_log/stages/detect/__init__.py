@@ -39,7 +39,6 @@ from ipsys_log.messages.channels import (
     MARKERS,
     RIG,
     RUN_EVENTS,
-    Channel,
 )
 from ipsys_log.messages.stage import Pieces, Plan, Resets, Stage, StageView
 from ipsys_log.stages.detect.adjustment import MarkerFit
@@ -370,10 +369,7 @@ def _make_step(corners: str, resets: Resets) -> Detect:
 
 
 def _resets(options: Mapping[str, str]) -> Resets:
-    """Return the resets with the period of a recorded run, or with the usual period.
-
-    ``shift_ns`` is the time that merges have added to the log times since the run.
-    """
+    """Return the resets with the period of a recorded run, or with the usual period."""
     text = options.get("reset_s", str(_RESET_PERIOD_S))
     period_s = int(text) if text.isascii() and text.isdigit() and len(text) <= len("86400") else 0
     if not 0 < period_s <= _LONGEST_PERIOD_S:
@@ -381,13 +377,13 @@ def _resets(options: Mapping[str, str]) -> Resets:
             f"the record of a run has the parameter reset_s = {text!r}, which is no period from 1 to "
             f"{_LONGEST_PERIOD_S} s; run 'ipsys replay' to compute a new run"
         )
-    return Resets(period_s * NS_PER_S, int(options.get("shift_ns", "0")))
+    return Resets(period_s * NS_PER_S)
 
 
 def _pieces(parameters: Mapping[str, str]) -> Pieces:
     """Return how the frames of a camera between two resets are processed alone."""
-    resets, interim = _resets(parameters), (OtherSize, OtherPrints, LensInUse, SeenSquares)
-    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports, interim)
+    resets = _resets(parameters)
+    return Pieces(resets, lambda: FrameDetector(parameters["corners"], resets), Reports)
 
 
 def _why_stock(camera: str) -> str:
@@ -403,25 +399,6 @@ def _rig_part(rig: Rig, _method: str) -> object:
     return rig.dictionary, ids, {shutter for shutter in shutters if any(shutter[1:])}
 
 
-def _stateless(parameters: Mapping[str, str], view: StageView) -> Collection[Channel]:
-    """Return the channels without memory: edges follows markers, video needs its keyframes."""
-    if parameters.get("corners") != STOCK or "as_live" in parameters or _has_video(view):
-        return ()
-    return MARKERS, ANNOTATIONS
-
-
-def _has_video(view: StageView) -> bool:
-    """Return whether the first frame of a camera is a frame of a video."""
-    waiting = set(view.cameras)
-    for message in view.messages(IMAGES):
-        waiting.discard(str(message.camera))
-        if isinstance(message.payload, CompressedVideo):
-            return True
-        if not waiting:
-            break
-    return False
-
-
 STAGE = Stage(
     name="detect",
     versions={"detect": 3, EDGES: 2, STOCK: 2},
@@ -431,6 +408,5 @@ STAGE = Stage(
     rig_part=_rig_part,
     method=lambda parameters, view: parameters.get("corners", ""),
     in_threads=True,
-    stateless=_stateless,
     pieces=_pieces,
 )

@@ -5,33 +5,31 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ipsys_log.capture.lab import OpenLab
 from ipsys_log.capture.live_check import FrameCheck
-from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.messages import CameraCalibration, Message, Model, Rig
+from ipsys_log.messages import Model
 from ipsys_log.player import Player
 from ipsys_log.sinks.played_topics import PlayedScene
-from ipsys_log.sinks.sink import Sink
+from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting, PlayedLog
 from ipsys_log.web.operator_seat import OperatorSeat
 
 
 def dashboard_of_recording(
-    cameras: LiveCameras,
-    settings: Sequence[Message],
+    opened: OpenLab,
     checks: Mapping[str, FrameCheck],
     log: Path,
     model: Model,
     run: str,
-    streams: Sequence[Sink],
+    streams: Sequence[Stream],
     seat: OperatorSeat | None = None,
 ) -> Dashboard:
     """Return the dashboard of a live recording, with an operator.
 
     Parameters
     ----------
-    cameras : the open cameras.
-    settings : the first messages of the log: the rig and the intrinsics.
+    opened : the open cameras.
     checks : last checks of the cameras, by name.
     log, model, run : the log that is written, the fitted model, and the run of its tracks.
     streams : the streams of positions.
@@ -42,14 +40,10 @@ def dashboard_of_recording(
     IpsysError
         The model or the intrinsics of a camera are not valid.
     """
-    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
-    lenses = {
-        str(message.camera): message.payload
-        for message in settings
-        if isinstance(message.payload, CameraCalibration)
-    }
-    now_ns = cameras.clock.now_ns
-    setting = DashboardSetting(rig, lenses, model, run, cameras.states, checks, log, now_ns, streams)
+    cameras, now_ns = opened.cameras, opened.cameras.clock.now_ns
+    setting = DashboardSetting(
+        opened.rig, opened.lenses, model, run, cameras.states, checks, log, now_ns, streams
+    )
     return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say, seat))
 
 

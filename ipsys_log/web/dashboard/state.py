@@ -30,8 +30,8 @@ from ipsys_log.messages import (
 )
 from ipsys_log.player import Player
 from ipsys_log.sinks.played_topics import PlayedScene
-from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.poses import NewSession
+from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.units import NS_PER_S
 from ipsys_log.web.dashboard.floor import describe_floor
 from ipsys_log.web.dashboard.operator import Operator
@@ -75,12 +75,12 @@ class DashboardSetting:
     checks: Mapping[str, FrameCheck]
     log: Path
     now_ns: Callable[[], int]
-    streams: Sequence[Sink] = ()
+    streams: Sequence[Stream] = ()
     played: PlayedLog | None = None
 
 
 class Dashboard:
-    """A :class:`~ipsys_log.sinks.sink.Sink` that keeps the newest state of a recording or a playback.
+    """A :class:`~ipsys_log.sinks.sink.QueuedSink` that keeps the newest state of a recording or a playback.
 
     The thread of the sink changes the state, and the thread of the page reads it.
 

@@ -15,7 +15,7 @@ from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.messages import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
 from ipsys_log.messages.events import OPERATOR_KINDS
 from ipsys_log.plain_text import plain_text
-from ipsys_log.sinks.sink import Sink
+from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.units import NS_PER_S
 
 _NS_PER_MS = 1_000_000
@@ -131,7 +131,7 @@ def describe_recording(log: Path, took_ns: int) -> dict[str, Any]:
     return recording
 
 
-def describe_streams(streams: Iterable[Sink]) -> list[dict[str, Any]]:
+def describe_streams(streams: Iterable[Stream]) -> list[dict[str, Any]]:
     """Return a row for each stream: its clients if it knows them, and its dropped messages."""
     rows = []
     for stream in streams:

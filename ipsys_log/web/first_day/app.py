@@ -99,16 +99,8 @@ class SetupApp:
 
     @contextmanager
     def _show_dashboard(self, view: LiveRecording) -> Iterator[Dashboard]:
-        lab = view.lab
         dashboard = dashboard_of_recording(
-            lab.cameras,
-            lab.settings,
-            lab.monitor.checks,
-            view.log,
-            view.model,
-            view.run,
-            view.streams,
-            self._seat,
+            view.opened, view.monitor.checks, view.log, view.model, view.run, view.streams, self._seat
         )
         with self._dashboard.show(build_dashboard(dashboard, setup="../#live")):
             yield dashboard

@@ -22,8 +22,6 @@ from ipsys_log.runs.output import write_message
 from tests.ports import free_port
 from tests.waiting import wait_until
 
-__all__ = ["Feed", "Received", "ShiftedClock", "make_certificates", "receiving", "sending"]
-
 # A limit for an event on a busy machine.
 PATIENCE_S = 300.0
 GUIDE = Path(__file__).resolve().parents[3] / "docs" / "nodes.md"

@@ -13,8 +13,8 @@ import pytest
 
 from ipsys_log import __version__, pipeline
 from ipsys_log.capture.devices import source_opener
-from ipsys_log.capture.first_messages import first_messages
 from ipsys_log.capture.frames import Clock, Open, Say
+from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node

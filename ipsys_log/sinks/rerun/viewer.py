@@ -1,23 +1,109 @@
-"""The Rerun viewer of the installed package on a page, for browsers of this machine."""
+"""The process of the Rerun viewer: in a window, or on a page for browsers of this machine."""
 
 from __future__ import annotations
 
 import os
+import re
+import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from typing import IO
 
 import rerun as rr
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.sinks.rerun.recording import last_line, stop_viewer, viewer_command
 
+_INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open it on a machine with a screen"
 _LOOPBACK = "127.0.0.1"
 _TURN_S, _TURNS = 0.1, 600
 _END_S = 5.0
+
+
+def viewer_command(port: int | None = None) -> list[str]:
+    """Return the command of the viewer; it shows the recording from its standard input.
+
+    The viewer also accepts connections, by default on all interfaces; this command limits it to this machine.
+    With a fixed port, an open viewer would get the recording, even if it listens on all interfaces. So the
+    command selects a free port, unless a port is given.
+    """
+    return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port or "auto"), "-"]
+
+
+def check_screen(environment: Mapping[str, str]) -> None:
+    """Check that a window can be opened.
+
+    Raises
+    ------
+    IpsysError
+        There is no display.
+    """
+    displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+    if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
+        raise IpsysError(f"the viewer needs a screen, but this machine has none; {_INSTEAD}")
+
+
+def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
+    """Open a viewer, feed it, and wait until its window is closed.
+
+    Parameters
+    ----------
+    feed : called with a function that takes the bytes of a recording, piece by piece.
+
+    Raises
+    ------
+    IpsysError
+        No window can be opened.
+    """
+    check_screen(os.environ)
+    environment = {"RUST_LOG": "error", **os.environ}
+    with (
+        tempfile.TemporaryFile() as complaints,
+        subprocess.Popen(
+            viewer_command(), stdin=subprocess.PIPE, stderr=complaints, env=environment
+        ) as viewer,
+    ):
+        assert viewer.stdin is not None
+        try:
+            feed(viewer.stdin.write)
+            viewer.stdin.close()
+        except BrokenPipeError:
+            # The window was closed before the end, or it never opened: the exit code shows the case.
+            _abandon(viewer.stdin)
+        except BaseException:
+            stop_viewer(viewer)
+            _abandon(viewer.stdin)
+            raise
+        if viewer.wait() != 0:
+            raise IpsysError(f"the viewer cannot be shown ({last_line(complaints)}); {_INSTEAD}")
+
+
+def stop_viewer(viewer: subprocess.Popen[bytes]) -> None:
+    """End the viewer; its process is Python, which passes on an interrupt but not a termination."""
+    if sys.platform == "win32":
+        viewer.terminate()
+    else:
+        viewer.send_signal(signal.SIGINT)
+
+
+def _abandon(pipe: IO[bytes]) -> None:
+    """Close a pipe without a reader, with the data left in it."""
+    try:
+        pipe.close()
+    except BrokenPipeError:
+        return
+
+
+def last_line(complaints: IO[bytes]) -> str:
+    """Return the last line of an error output, without colours."""
+    complaints.seek(0)
+    text = re.sub(r"\x1b\[[0-9;]*m", "", complaints.read().decode(errors="replace"))
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else "no reason given"
 
 
 class ViewerPage:

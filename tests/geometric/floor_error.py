@@ -13,6 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
+from ipsys_log.analysis.expected_error import WHOLE_PRINT
+from ipsys_log.analysis.floor_grid import GRID_M, WALL_M
 from ipsys_log.arrays import Array, Mask
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import in_image, project, undistort
@@ -25,11 +27,6 @@ from ipsys_log.models.table import AppliedModel
 # squares, (n, 4, 3) in world m.
 Placement = Callable[[Array, float], Array]
 
-# Step of the grid, and its least distance from the walls.
-GRID_M = 0.1
-WALL_M = 0.3
-# A marker counts as visible if a square of this multiple of its side is wholly in the image.
-WHOLE_PRINT = 1.4
 # Squared Mahalanobis distances in two dimensions that hold 68 and 95 %.
 _SQUARE_68, _SQUARE_95 = -2 * np.log(1 - 0.68), -2 * np.log(1 - 0.95)
 _FREEDOM = 2
@@ -289,7 +286,7 @@ def locate_with_model(
         camera: str,
         corners_px: Array,
         heights_m: Array,
-        covariances_px2: Array | None = None,  # noqa: ARG001 - these models estimate the noise in their fit
+        covariances_px2: Array | None = None,
     ) -> tuple[Array, Array | None]:
         if camera not in applied:
             return np.full((len(corners_px), 3), np.nan), None

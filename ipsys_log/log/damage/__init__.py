@@ -1,1 +1,0 @@
-"""Damaged logs: their survey, and the messages that can be saved."""

@@ -1,0 +1,377 @@
+"""Search for records in damaged bytes, without trusting any length.
+
+Bytes prove themselves as a record: its fields are consistent, and another plausible record follows. A chunk
+proves itself if its records can be unpacked and parsed. A chunk without its head is found by the start of its
+compressed data.
+"""
+
+import re
+import struct
+import zlib
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, field
+
+import lz4.frame
+import zstandard
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.errors import LogError, UnreadError
+from ipsys_log.log.bounds import LARGEST_DEFINITION, BoundError
+from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.chunks import check_definition, parse_chunk_contents, unpack
+from ipsys_log.log.records import (
+    ENTRY,
+    FOOTER,
+    HEADER,
+    INDEX_HEAD,
+    MAGIC,
+    MESSAGE,
+    RecordAt,
+    parse_chunk_head,
+    parse_exact,
+    parse_message_index,
+    walk,
+)
+
+PRIVATE = 0x80  # every reader skips unknown types from this value on
+_BLOCK = 1 << 20
+_PIECE = 256  # compressed bytes at a time: the output of the pieces before an error is kept
+_LARGEST_FRAME = 256 << 20  # bytes of records
+_LARGEST_RATIO = 200  # no recorded data compress better
+_ANY_RATIO = 16 << 20  # bytes of records: the ratio counts only above this
+_LONGEST_ATTACHMENT_HEAD = 1 << 16  # bytes
+_DAY_NS = 86_400 * 1_000_000_000
+_SEARCH_BYTES = 64 << 20  # limit of the search without result in a small log
+_STEP_BYTES = 256  # the cost of the check of a small record, as bytes of that limit
+_ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
+_HEAD_BEFORE_FRAME = {_ZSTD: 53, _LZ4: 52}  # bytes from the start of a chunk to its data
+_CRC_IN_HEAD = 33  # bytes from the start of a chunk to its CRC
+_MESSAGE_HEAD = re.compile(rb"(?=\x05.{3}\0{5})", re.DOTALL)
+# Compressed records, the head of a chunk, DataEnd, or the head of another record of less than 16 MiB.
+_CANDIDATE = re.compile(
+    rb"(?=\x28\xb5\x2f\xfd|\x04\x22\x4d\x18|\x06.{36}(?:\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)"
+    rb"|\x0f\x04\0{7}|[\x03\x04\x05\x07\x09\x0c].{3}\0{5})",
+    re.DOTALL,
+)
+_OVERLAP = 64  # bytes: longer than each candidate
+_DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA))
+_IN_CHUNK = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE))
+IN_DATA = _DEFINITIONS | {
+    Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.DATA_END
+}  # fmt: skip
+_IN_SUMMARY = frozenset(
+    (
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.STATISTICS,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.SUMMARY_OFFSET,
+    )
+)
+
+
+@dataclass(slots=True)
+class RecordSearch:
+    """A search in one log.
+
+    `channels` are the known channel ids, `span_ns` is the time range of the known messages. `frame_at` is the
+    offset of the last compressed data that were found without the head of their chunk. `budget` limits the
+    bytes that are searched without result.
+    """
+
+    view: LogBytes
+    channels: Container[int]
+    span_ns: tuple[int, int] | None = None
+    frame_at: int = -1
+    budget: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.budget = _SEARCH_BYTES + 4 * self.view.size
+
+    def find(self, start: int, end: int | None = None) -> int | None:
+        """Return the offset of the next bytes that prove themselves, None if there are none."""
+        view = self.view
+        end = view.size if end is None else end
+        for base in range(start, end, _BLOCK):
+            block = view.read(base, min(_BLOCK + _OVERLAP, view.size - base))
+            for match in _CANDIDATE.finditer(block):
+                offset = base + match.start()
+                if match.start() >= _BLOCK or offset >= end or self.budget < 0:
+                    break
+                if self._proves_itself(offset):
+                    return offset
+        return None
+
+    def inner_record(self, record: RecordAt, is_near_damage: bool = False) -> int | None:
+        """Return the offset of the first of other records within this one, if its length is wrong.
+
+        The length is right if a plausible record follows; near damage, this may be chance. Records within
+        this one prove the contrary if they lead to its end or beyond: a stray copy of a sector ends before.
+        """
+        stop = record.offset + record.length
+        head = MESSAGE if record.opcode == Opcode.MESSAGE else HEADER
+        is_right = self._follows(stop) and not is_near_damage
+        inner = None if is_right else self.find(record.offset + head.size, stop)
+        position = inner or stop
+        while position < stop:
+            if not self._follows(position):
+                return None
+            position += HEADER.size + HEADER.unpack(self.view.read(position, HEADER.size))[1]
+        return inner if self._follows(position) else None
+
+    def _follows(self, stop: int) -> bool:
+        """Return whether the log ends at `stop`, or the head of a plausible record is there."""
+        view = self.view
+        if stop + HEADER.size > view.size:
+            return stop == view.size
+        opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
+        is_known = opcode in IN_DATA or opcode >= PRIVATE
+        return is_known and int(length) <= view.size - stop - HEADER.size
+
+    def _proves_itself(self, offset: int) -> bool:
+        budget = self.budget
+        self.budget -= _STEP_BYTES
+        try:
+            is_proved = self._is_frame(offset) or self._is_record(offset)
+        except (BoundError, UnreadError):
+            raise
+        except LogError:
+            return False
+        if is_proved:
+            self.budget = budget
+        return is_proved
+
+    def _is_frame(self, offset: int) -> bool:
+        """Return whether the compressed records of a chunk begin at `offset`."""
+        if self.view.read(offset, min(len(_ZSTD), self.view.size - offset)) not in (_ZSTD, _LZ4):
+            return False
+        data, end, _ = self.read_frame(offset)
+        self.budget -= len(data) + end - offset
+        if data:
+            self.frame_at = offset
+        return bool(data)
+
+    def _is_record(self, offset: int) -> bool:
+        """Return whether a whole record begins at `offset`, judged by its content and the next record."""
+        view = self.view
+        record = next(walk(view, offset, view.size))
+        if record.opcode == Opcode.CHUNK:
+            head = parse_chunk_head(view, offset)[1]
+            self.budget -= head.data_size
+            data = unpack(view, offset, head, is_crc_checked=False) if self.budget >= 0 else b""
+            return bool(parse_chunk_contents(view, offset, data).entries)
+        if record.opcode == Opcode.DATA_END:
+            return self.end_of_log(offset + record.length) is not None
+        if record.opcode in _DEFINITIONS:
+            self.parse_definition(record)
+            return True
+        follows = self._follows(offset + record.length)
+        if record.opcode == Opcode.MESSAGE and record.length >= MESSAGE.size:
+            _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(offset, MESSAGE.size))
+            return follows or self._fits(channel, time_ns)
+        if record.opcode == Opcode.ATTACHMENT:
+            stored, crc = attachment_crcs(view, record)
+            return stored == crc if stored else follows
+        return follows and record.opcode == Opcode.MESSAGE_INDEX and bool(index_rows(view, record))
+
+    def _fits(self, channel: int, time_ns: int) -> bool:
+        """Return whether a message has a known channel, and about the time of the known messages."""
+        span = self.span_ns
+        is_near = span is not None and span[0] - _DAY_NS < time_ns < span[1] + _DAY_NS
+        return is_near and channel in self.channels
+
+    def parse_definition(self, record: RecordAt) -> mcap.Schema | mcap.Channel | None:
+        """Parse a Schema or Channel record; check a Metadata record, too.
+
+        Raises
+        ------
+        LogError
+            A length or an id in the record is wrong.
+        """
+        if record.opcode not in _DEFINITIONS:
+            return None
+        if record.length > LARGEST_DEFINITION:
+            if self._follows(record.offset + record.length):
+                check_definition(self.view, record)
+            raise self.view.fault(record.offset, f"a definition claims {record.length} bytes")
+        parsed = parse_exact(self.view, record, self.view.read(record.offset, record.length))
+        if isinstance(parsed, mcap.Schema) and parsed.id == 0:
+            raise self.view.fault(record.offset, "a schema has the id 0")
+        return parsed if isinstance(parsed, mcap.Schema | mcap.Channel) else None
+
+    def end_of_log(self, start: int) -> int | None:
+        """Return the end of the log whose summary begins at `start`; None if there is no such log."""
+        view = self.view
+        try:
+            for record in walk(view, start, view.size):
+                if record.opcode == Opcode.FOOTER and record.length == FOOTER.size:
+                    summary = FOOTER.unpack(view.read(record.offset, FOOTER.size))[2]
+                    stop = record.offset + record.length + len(MAGIC)
+                    is_end = view.read(stop - len(MAGIC), min(len(MAGIC), view.size - stop + 8)) == MAGIC
+                    # A stray copy has another offset of its summary.
+                    return stop if is_end and (summary in (0, start) or stop == view.size) else None
+                if record.opcode not in _IN_SUMMARY and record.opcode < PRIVATE:
+                    return None
+        except UnreadError:
+            raise
+        except LogError:
+            pass
+        return None
+
+    def read_frame(self, offset: int) -> tuple[bytes, int, bool]:
+        """Return the plausible records in compressed data, the end of the data, and whether these are all."""
+        claimed = self._claimed_end(offset)
+        data, end, is_whole = _decompress(self.view, offset, claimed or self.view.size, self.budget)
+        if not is_whole and claimed is not None:
+            end = claimed
+        pieces, position = [], 0
+        while position + HEADER.size <= len(data):
+            stop = self._end_in(offset, data, position)
+            if stop is None:
+                is_whole = False
+                position = self._next_message_in(data, position + 1)
+            else:
+                pieces.append(data[position:stop])
+                position = stop
+        return b"".join(pieces), end, is_whole and position == len(data)
+
+    def frame_crc(self, offset: int) -> int:
+        """Return the CRC in the head of the chunk whose compressed data begin at `offset`."""
+        crc_at = offset - _HEAD_BEFORE_FRAME[self.view.read(offset, len(_ZSTD))] + _CRC_IN_HEAD
+        return int.from_bytes(self.view.read(crc_at, 4), "little") if crc_at > 0 else 0
+
+    def _claimed_end(self, offset: int) -> int | None:
+        """Return the end of the chunk with compressed data at `offset`, if its head is whole, else None."""
+        head_at = offset - _HEAD_BEFORE_FRAME[self.view.read(offset, len(_ZSTD))]
+        try:
+            record, head = parse_chunk_head(self.view, head_at)
+        except LogError:
+            return None
+        stop = record.offset + record.length
+        return stop if head.data_offset == offset and self._follows(stop) else None
+
+    def _end_in(self, offset: int, data: bytearray, position: int) -> int | None:
+        """Return the end of the record at `position` in the data of the chunk at `offset`, if plausible."""
+        opcode, length = HEADER.unpack_from(data, position)
+        record = RecordAt(opcode, offset, HEADER.size + length)
+        stop = position + record.length
+        is_short = opcode == Opcode.MESSAGE and record.length < MESSAGE.size
+        if stop > len(data) or is_short or (opcode not in _IN_CHUNK and opcode < PRIVATE):
+            return None
+        if opcode in _DEFINITIONS:
+            try:
+                parse_exact(self.view, record, bytes(data[position:stop]))
+            except LogError:
+                return None
+        return stop
+
+    def _next_message_in(self, data: bytearray, start: int) -> int:
+        """Return the position of the next plausible message in the data of a chunk."""
+        for match in _MESSAGE_HEAD.finditer(data, start):
+            position = match.start()
+            if position + MESSAGE.size <= len(data):
+                _, length, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
+                if MESSAGE.size <= HEADER.size + length <= len(data) - position and self._fits(
+                    channel, time_ns
+                ):
+                    return position
+        return len(data)
+
+
+def _decompress(view: LogBytes, offset: int, stop: int, most: int) -> tuple[bytearray, int, bool]:
+    """Decompress data up to their end, an error, the offset `stop`, or a limit of decompressed bytes.
+
+    Returns
+    -------
+    The bytes, the offset of the end of the compressed data, and whether all was decompressed.
+    """
+    is_zstd = view.read(offset, len(_ZSTD)) == _ZSTD
+    decoder = zstandard.ZstdDecompressor().decompressobj() if is_zstd else lz4.frame.LZ4FrameDecompressor()
+    data, position = bytearray(), offset
+    try:
+        while position < stop:
+            block = view.read(position, min(_BLOCK, stop - position))
+            for start in range(0, len(block), _PIECE):
+                piece = block[start : start + _PIECE]
+                position += len(piece)
+                data += decoder.decompress(piece)
+                limit = min(_LARGEST_FRAME, most, max(_ANY_RATIO, _LARGEST_RATIO * (position - offset)))
+                if len(data) > limit:
+                    return data, position, False
+                if decoder.eof:
+                    return data, position - len(decoder.unused_data or b""), True
+    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
+        pass
+    return data, position, False
+
+
+def index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, int]]]:
+    """Return the channel of a MessageIndex record, and the log times and offsets of its messages."""
+    if record.length >= INDEX_HEAD.size:
+        _, length, channel, size = INDEX_HEAD.unpack(view.read(record.offset, INDEX_HEAD.size))
+        if length == size + 6 and size % ENTRY.size == 0:
+            body = view.read(record.offset, record.length)
+            rows = parse_message_index(view, body, 0, channel, record.offset)
+            return channel, list(ENTRY.iter_unpack(rows))
+    raise view.fault(record.offset, "a MessageIndex record has another length than its entries")
+
+
+def read_indexes(
+    view: LogBytes, entries: Mapping[int, list[tuple[int, int]]], start: int
+) -> tuple[int, dict[int, int], bool]:
+    """Read the message indexes of a chunk with these entries, from `start` on.
+
+    Returns
+    -------
+    Their end, the offset of each by channel id, and whether they have all entries of the chunk.
+    """
+    offsets: dict[int, int] = {}
+    seen: set[int] = set()
+    end, is_right = start, True
+    try:
+        for record in walk(view, start, view.size):
+            if record.opcode != Opcode.MESSAGE_INDEX:
+                break
+            channel, rows = index_rows(view, record)
+            expected = entries.get(channel, [])
+            is_right &= channel not in seen and (rows == expected or sorted(rows) == sorted(expected))
+            seen.add(channel)
+            if rows:
+                offsets[channel] = record.offset
+            end = record.offset + record.length
+    except (BoundError, UnreadError):
+        raise
+    except LogError:
+        pass  # the next record is damaged
+    return end, offsets, is_right and seen >= entries.keys()
+
+
+def attachment_crcs(view: LogBytes, record: RecordAt) -> tuple[int, int]:
+    """Return the stated CRC of an attachment (0: none), and its computed CRC.
+
+    Raises
+    ------
+    LogError
+        The record has wrong lengths.
+    """
+    head = view.read(record.offset, min(record.length, _LONGEST_ATTACHMENT_HEAD))
+    try:
+        (name,) = struct.unpack_from("<I", head, HEADER.size + 16)
+        (media_type,) = struct.unpack_from("<I", head, HEADER.size + 20 + name)
+        (size,) = struct.unpack_from("<Q", head, HEADER.size + 24 + name + media_type)
+    except struct.error:
+        raise view.fault(record.offset, "the Attachment record is not valid") from None
+    if record.length < HEADER.size + 36 + name + media_type + size:
+        raise view.fault(record.offset, "the Attachment record claims lengths that it does not have")
+    stored = int.from_bytes(view.read(record.offset + record.length - 4, 4), "little")
+    return stored, crc_of(view, record.length - HEADER.size - 4, record.offset + HEADER.size) if stored else 0
+
+
+def crc_of(view: LogBytes, length: int, start: int = 0, crc: int = 0) -> int:
+    """Return the CRC-32 of a byte range of the file, continued from `crc`."""
+    for offset in range(start, start + length, _BLOCK):
+        crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)
+    return crc

@@ -14,7 +14,7 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import check_independent_frames
 from ipsys_log.capture.multiplexer import LiveCameras

@@ -156,7 +156,7 @@ def test_fewer_large_frames_are_kept_but_all_events(log: Noted) -> None:
 
 def test_recent_frames_of_a_video_cannot_be_kept() -> None:
     with pytest.raises(
-        IpsysError, match="camera white sends h264, but ipsys measure can keep short parts only of MJPEG"
+        IpsysError, match="camera white sends h264, but --points-only can keep short parts only of MJPEG"
     ):
         check_independent_frames({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
 

@@ -136,11 +136,11 @@ def _evaluated(model: str) -> Callable[[Trial], Outcome]:
         text = trial.ipsys("evaluate", "lab.mcap", "--model", model, "--json")
         answer, _ = json.JSONDecoder().raw_decode(text, text.index("{"))
         stated, errors = answer["answer"], answer["models"][model]["pooled"]["cross_validation"]
-        true_cm = errors["truth"]["3d"]["mean_cm"]
-        low_cm, high_cm = (
-            stated.get(f"remaining_{end}_cm", errors["3d"][f"mean_{end}_cm"]) for end in ("low", "high")
+        true_m = errors["truth"]["3d"]["mean_m"]
+        low_m, high_m = (
+            stated.get(f"remaining_{end}_m", errors["3d"][f"mean_{end}_m"]) for end in ("low", "high")
         )
-        return Outcome(bool(low_cm <= true_cm <= high_cm), 10 * true_cm)
+        return Outcome(bool(low_m <= true_m <= high_m), 1000 * true_m)
 
     return try_once
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rendered_labs import rendered_lab
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.poses import transform
@@ -21,7 +22,6 @@ from ipsys_log.joint.observations import Observations
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Measurement, Message, Pair, Rig
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
-from ipsys_log.stages.fit import fit_model
 from tests.geometric.corner_noise import (
     WHITE_SHARE,
     corner_covariances,

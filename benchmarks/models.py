@@ -21,8 +21,10 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.calibration_points import measured
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.analysis.cross_validation import Study, cross_validate, gather_points, labelled_subsets
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings
+from ipsys_log.analysis.point_evaluation import evaluate_model
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session
@@ -31,8 +33,6 @@ from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.view import LogView
-from ipsys_log.stages.evaluate import evaluate_model
-from ipsys_log.stages.fit import fit_model
 
 # Best was selected with other folds.
 FIRST_SEED = 1000

@@ -15,14 +15,14 @@ from geometric_labs import Scene, Session, fit_session, make_session
 from numpy.typing import NDArray
 from rendered_sessions import rendered_session
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.joint.locate_step import LocateCorners
 from ipsys_log.joint.payload import JOINT, joint_payload
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Rig
+from ipsys_log.models.locate_step import LocatePoints
 from ipsys_log.simulation.pace import Pace, Stops, draw_pace
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
-from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate
 from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
@@ -222,11 +222,11 @@ def _located(messages: list[Message], model: Model) -> Iterator[Message]:
         return
     points = _through(CameraFrame(), messages, (Rig, CameraCalibration, Markers), CameraPoints)
     rig = [message for message in messages if isinstance(message.payload, Rig)]
-    yield from _through(Locate(model), [*rig, *points], (Rig, CameraPoints), Positions)
+    yield from _through(LocatePoints(model), [*rig, *points], (Rig, CameraPoints), Positions)
 
 
 def _through(
-    step: CameraFrame | Locate | LocateCorners,
+    step: CameraFrame | LocatePoints | LocateCorners,
     messages: list[Message],
     reads: tuple[type, ...],
     writes: type,

@@ -22,6 +22,7 @@ LIBRARIES = {
     "rerun": Library("Rerun", ("view",)),
     "matplotlib": Library("Matplotlib", ("report",)),
     "jinja2": Library("Jinja2", ("report",)),
+    "av": Library("PyAV", ("video",)),
     "starlette": Library("Starlette", ("web",)),
     "uvicorn": Library("Uvicorn", ("web",)),
     "h11": Library("h11", ("web",)),

@@ -98,14 +98,14 @@ Write = Callable[[Session, Runs, Path, ExportOptions, Progress], tuple[int, str]
 class ExportFormat:
     """A format: the suffix of its files (None: a folder), its channel (None: that of the table), its writer.
 
-    ``text`` names the format in errors, and ``library`` the optional module that it needs.
+    ``text`` names the format in errors, and ``libraries`` the optional modules that it needs.
     """
 
     text: str
     suffix: str | None
     channel: Channel | None
     write: Write
-    library: str | None = None
+    libraries: tuple[str, ...] = ()
 
     def check(self, path: Path, options: ExportOptions, runs: Runs) -> None:
         """Check that the options fit the format.
@@ -115,8 +115,8 @@ class ExportFormat:
         IpsysError
             The format has no tables or robots, or has one run; its library is missing.
         """
-        if self.library is not None:
-            check_installed(f"{self.text} needs", self.library)
+        for library in self.libraries:
+            check_installed(f"{self.text} needs", library)
         if self.channel is None:
             return
         if options.table != TRACKS.name:
@@ -133,8 +133,8 @@ EXPORT_FORMATS = {
     "parquet": ExportFormat("a Parquet file", ".parquet", None, _write_table),
     "tum": ExportFormat("a TUM trajectory", ".tum", None, _write_table),
     "kitti": ExportFormat("a KITTI trajectory", ".kitti", None, _write_table),
-    "ros2": ExportFormat("a ROS 2 bag", ".mcap", TRACKS, _write_bag, "rosbags"),
-    "mp4": ExportFormat("a video", ".mp4", TRACKS, _write_video, "matplotlib"),
+    "ros2": ExportFormat("a ROS 2 bag", ".mcap", TRACKS, _write_bag, ("rosbags",)),
+    "mp4": ExportFormat("a video", ".mp4", TRACKS, _write_video, ("av", "matplotlib")),
     "coco": ExportFormat("a COCO data set", None, MARKERS, _write_data_set),
 }
 

@@ -141,7 +141,6 @@ def record(
     with FanOut(sinks, source.add_event) as show, open_recording(target, settings, overwrite) as log:
         for arrived in write_each(source, log):
             show(arrived)
-    _report_rename(log, source.say)
     log.check_disk()
     show.check()
     return log.counts
@@ -189,7 +188,6 @@ def measure(
     ):
         for message in _through(plan.stages, chain(settings, frames)):
             _show_all(show, *frames.take_events(), message)
-    _report_rename(log, cameras.say)
     log.check_disk()
     show.check()
     return log.counts
@@ -245,23 +243,19 @@ def live(
             for message in arriving:
                 _show_all(show, *events(), message)
         _show_all(show, *events())
-    _report_rename(log, cameras.say)
     log.check_file()
-    path = log.path
-    if path is None:
-        raise IpsysError(f"{target}: its runs have no records yet; find the log, and run: ipsys repair LOG")
     if fault is not None:
         raise IpsysError(
-            f"{fault}; {path} has all frames; to process them: ipsys replay {shell_words(path)}"
+            f"{fault}; {target} has all frames; to process them: ipsys replay {shell_words(target)}"
         ) from fault
     try:
-        outcomes = sign(path, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
+        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:
         log.check_disk()
     if frames.skipped:
         cameras.say(
             f"{frames.skipped.total()} frames skipped: processing could not keep up. All are recorded. To "
-            f"process all: ipsys replay {shell_words(path)}; --as-live excludes the skipped frames"
+            f"process all: ipsys replay {shell_words(target)}; --as-live excludes the skipped frames"
         )
     show.check()
     return outcomes
@@ -328,13 +322,6 @@ def _contradictions(say: Callable[[str], None]) -> Sink:
             say(message.payload.text)
 
     return print_text
-
-
-def _report_rename(log: Recording, say: Callable[[str], None]) -> None:
-    """Report the present name of a log that another program has renamed."""
-    text = log.describe_rename()
-    if text is not None:
-        say(text)
 
 
 def _route_of(message: Message) -> Route | None:

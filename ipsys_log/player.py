@@ -19,16 +19,16 @@ from ipsys_log.messages import Message, Rig
 from ipsys_log.rig.file import check_robots
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
-from ipsys_log.sinks.played_topics import (
+from ipsys_log.sinks.selection import (
     PlayedScene,
     PlayedTopics,
     choose_topics,
     dashboard_topics,
     read_first,
     read_scene,
+    rig_in_force,
     viewed_topics,
 )
-from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.sinks.sink import FanOut, Sink
 from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
 from ipsys_log.tracker import LiveTracks, Tracker

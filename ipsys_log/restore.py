@@ -7,13 +7,14 @@ from pathlib import Path
 
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import CAMERA_POINTS, EVENTS, MARKERS, MODEL
+from ipsys_log.messages.events import skipped_frames
 from ipsys_log.messages.stage import Stage
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.graph import is_of_model, stages_until, writer_of
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome, newest_run
 from ipsys_log.stages.camera_frame import METHODS, PERIMETER, points_run
-from ipsys_log.stages.detect import CORNERS, skipped_frames
+from ipsys_log.stages.detect import CORNERS
 
 # The names of the runs of camera points, each with its corner method and its camera-point method.
 _POINTS = [(points_run(corners, method), corners, method) for corners in CORNERS for method in METHODS]

@@ -6,9 +6,11 @@ import ast
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
-from importlib.metadata import packages_distributions
+from collections.abc import Iterable, Iterator
+from importlib.metadata import distribution, packages_distributions
 from pathlib import Path
+
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parent.parent
 # The dashboard of Dask, and the certificates of its local workers.
@@ -73,3 +75,21 @@ def test_every_declared_dependency_is_imported() -> None:
 def test_every_dependency_has_a_lower_bound() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert [text for text in project["dependencies"] if ">=" not in text] == []
+
+
+def test_base_installation_stays_below_500_mb() -> None:
+    """The size is that of ``du -m``: blocks of the installed files, with byte code."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    waiting, sizes = [Requirement(text) for text in project["dependencies"]], {}
+    while waiting:
+        wanted = waiting.pop()
+        if normalize(wanted.name) not in sizes and (wanted.marker is None or wanted.marker.evaluate()):
+            found = distribution(wanted.name)
+            sizes[normalize(wanted.name)] = _size_mb(Path(str(file.locate())) for file in found.files or [])
+            waiting += [Requirement(text) for text in found.requires or []]
+    assert "av" not in sizes
+    assert sum(sizes.values()) + _size_mb((ROOT / "ipsys_log").rglob("*")) < 500, sizes
+
+
+def _size_mb(files: Iterable[Path]) -> float:
+    return sum(512 * file.stat().st_blocks for file in files if file.is_file()) / (1 << 20)

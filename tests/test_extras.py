@@ -76,9 +76,10 @@ def run_without(
 def folder(tmp_path: Path, detected_log: Path, calibration: Path) -> Path:
     """A folder with a rig of simulated cameras, a recording with markers, and the model of another log."""
     (tmp_path / "lab.toml").write_text(RIG + "".join(CAMERA.format(name) for name in ("red", "white")))
-    (tmp_path / "nodes.toml").write_text(
-        RIG + CAMERA.format("red").replace("sim:red?stations=0", "zenoh:red")
-    )
+    for name, source in (("nodes", "zenoh:red"), ("network", "http://10.0.0.2/video")):
+        rig = RIG + CAMERA.format("red").replace("sim:red?stations=0", source)
+        (tmp_path / f"{name}.toml").write_text(rig)
+    (tmp_path / "red.mp4").touch()
     shutil.copy(detected_log, tmp_path / "lab.mcap")
     shutil.copy(calibration, tmp_path / "model.mcap")
     return tmp_path
@@ -122,7 +123,10 @@ REFUSED = {
     "live --web --model-from model.mcap -o x.mcap": "--web needs Starlette and Uvicorn: pip install "
     "'ipsys_log[web]'",
     "export lab.mcap -o x.mcap": "a ROS 2 bag needs rosbags: pip install 'ipsys_log[ros2]'",
-    "export lab.mcap -o x.mp4": "a video needs Matplotlib: pip install 'ipsys_log[report]'",
+    "export lab.mcap -o x.mp4": "a video needs PyAV: pip install 'ipsys_log[video]'",
+    "record --rig network.toml -o x.mcap": "camera red: the source http://10.0.0.2/video needs PyAV: pip "
+    "install 'ipsys_log[video]'",
+    "import videos red=red.mp4 -o x.mcap": "red.mp4: a video needs PyAV: pip install 'ipsys_log[video]'",
     "import ros lab.bag -o x.mcap": "import ros needs rosbags: pip install 'ipsys_log[ros2]'",
     "setup new_lab": "setup needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",

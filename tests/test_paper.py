@@ -28,9 +28,9 @@ def test_tables_i_and_ii_to_every_printed_digit(ipsys: Ipsys, data: Path, tmp_pa
     compared = 0
     for row in published(data):
         errors = models[METHODS[row["method"]]]["cameras"][row["camera"]][row["dimensions"].lower()]
-        assert errors["n"] == 10
-        for figure in ("mean_cm", "min_cm", "max_cm", "std_cm"):
-            assert f"{errors[figure]:.3f}" == row[figure], (row, figure)
+        assert errors["count"] == 10
+        for figure in ("mean", "min", "max", "std"):
+            assert f"{100 * errors[f'{figure}_m']:.3f}" == row[f"{figure}_cm"], (row, figure)
             compared += 1
     assert compared == 72
 
@@ -50,13 +50,13 @@ def test_all_models_are_studied_by_one_command(ipsys: Ipsys, data: Path, tmp_pat
     ours = dict(zip(dict.fromkeys(row["method"] for row in rows), models, strict=False))
     for method, limit in (("KI", 0.08), ("RT+KI", 0.08)):
         for row in (row for row in rows if row["method"] == method):
-            mean_cm = models[ours[method]]["cameras"][row["camera"]]["3d"]["mean_cm"]
-            assert mean_cm == pytest.approx(float(row["mean_cm"]), rel=limit)
+            mean_m = models[ours[method]]["cameras"][row["camera"]]["3d"]["mean_m"]
+            assert 100 * mean_m == pytest.approx(float(row["mean_cm"]), rel=limit)
     for method in ("ANN", "RT+ANN", "KR", "RT+KR"):
         of_paper = sum(float(row["mean_cm"]) for row in rows if row["method"] == method) / 3
-        assert models[ours[method]]["pooled"]["3d"]["mean_cm"] <= of_paper
-    assert models["rayplane"]["pooled"]["2d"]["mean_cm"] <= 0.75
-    assert models["rayplane"]["pooled"]["cross_validation"]["2d"]["mean_cm"] <= 1.05
+        assert models[ours[method]]["pooled"]["3d"]["mean_m"] <= of_paper / 100
+    assert models["rayplane"]["pooled"]["2d"]["mean_m"] <= 0.0075
+    assert models["rayplane"]["pooled"]["cross_validation"]["2d"]["mean_m"] <= 0.0105
     report = ipsys("report", log, "--html", tmp_path / "report.html")
     assert report.code == 0
     assert (tmp_path / "report.html").stat().st_size > 100_000
@@ -79,10 +79,10 @@ def test_the_published_training_subsets(ipsys: Ipsys, data: Path, tmp_path: Path
     log = tmp_path / "imsel.mcap"
     ipsys("import", "imsel", data / "imsel", "-o", log)
     done = ipsys("evaluate", log, "--model", "rigid", "--train", f"train_{subset}", "--json")
-    mean_cm = json.loads(done.out)["models"]["rigid"]["cameras"]["red"]["3d"]["mean_cm"]
+    mean_m = json.loads(done.out)["models"]["rigid"]["cameras"]["red"]["3d"]["mean_m"]
     # Figure 10 has no numbers; the rigid transformation is below 5 cm there for every subset.
-    assert 0 < mean_cm < 5
-    runs = json.loads(ipsys("runs", log, "--json").out)
+    assert 0 < mean_m < 0.05
+    runs = json.loads(ipsys("runs", log, "--json").out)["rows"]
     assert runs[1]["parameters"]["train"] == f"train_{subset}"
 
 

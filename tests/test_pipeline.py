@@ -242,7 +242,7 @@ def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path:
         stages = stages_of(ipsys, "replay", lab, "--calibration", f"red={path}")
         # Edge fits need intrinsics.
         assert (stages["detect"][1], stages["camera-frame"][1]) == (fresh, fresh)
-    runs = json.loads(ipsys("runs", lab, "--json").out)
+    runs = json.loads(ipsys("runs", lab, "--json").out)["rows"]
     assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
 
 
@@ -362,17 +362,17 @@ def test_an_unlabelled_log_is_split_by_a_recorded_seed(ipsys: Ipsys, lab: Path, 
         held_out.setdefault(seed, []).append(json.loads(done.out)["models"]["rigid"]["cameras"])
     assert held_out[0][0] == held_out[0][1]
     assert held_out[0][0] != held_out[1][0]
-    runs = json.loads(ipsys("runs", plain, "--json").out)
+    runs = json.loads(ipsys("runs", plain, "--json").out)["rows"]
     assert {run["parameters"]["seed"] for run in runs if run["stage"] == "fit"} == {"0", "1"}
 
 
 def test_errors_against_the_truth_and_against_the_tape(ipsys: Ipsys, detected_lab: Path) -> None:
     model = json.loads(ipsys("replay", detected_lab, "--model", "rigid", "--json").out)["models"]["rigid"]
     for errors in model["cameras"].values():
-        assert 0 < errors["truth"]["3d"]["mean_cm"] < 4
-        assert 0 < errors["3d"]["mean_cm"] < 4
+        assert 0 < errors["truth"]["3d"]["mean_m"] < 0.04
+        assert 0 < errors["3d"]["mean_m"] < 0.04
         assert errors["truth"] != {key: errors[key] for key in ("3d", "2d")}
-    assert 0 < model["tracks"]["truth"]["3d"]["mean_cm"] < 4
+    assert 0 < model["tracks"]["truth"]["3d"]["mean_m"] < 0.04
 
 
 def test_log_that_is_replaced_between_stages_gets_nothing(

@@ -25,9 +25,9 @@ def test_a_sample_log_gives_centimetres(ipsys: Ipsys, tmp_path: Path, name: str)
     assert set(model["cameras"]) == {"red", "white", "black"}
     for errors in model["cameras"].values():
         # The tape has a standard deviation of 3 mm; the ground truth is exact.
-        assert errors["truth"]["3d"]["mean_cm"] < 1.0
-        assert errors["3d"]["mean_cm"] < 1.5
-    assert model["tracks"]["truth"]["3d"]["mean_cm"] < 0.6
+        assert errors["truth"]["3d"]["mean_m"] < 0.01
+        assert errors["3d"]["mean_m"] < 0.015
+    assert model["tracks"]["truth"]["3d"]["mean_m"] < 0.006
 
 
 def test_the_samples_are_small() -> None:

@@ -86,7 +86,7 @@ def test_equal_heights_give_a_2d_model(ipsys: Ipsys, tmp_path: Path) -> None:
     for name in ("poly", "best"):
         validated = json.loads(done.out)["models"][name]["cameras"]["red"]["cross_validation"]
         assert "3d" not in validated
-        assert validated["2d"]["mean_cm"] < 1.5
+        assert validated["2d"]["mean_m"] < 0.015
     assert ipsys("locate", log, "--model", "best").code == 0
     with Session([log]) as session:
         for payload in session.payloads(session.topics(POSITIONS, "best")):
@@ -110,14 +110,16 @@ def test_model_with_known_heights_needs_them_in_the_rig(ipsys: Ipsys, tmp_path: 
 
 
 def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
+    from ipsys_log.analysis.camera_models import fit_model
     from ipsys_log.messages import CameraPoint, CameraPoints
-    from ipsys_log.stages.fit import fit_model
-    from ipsys_log.stages.locate import Locate
+    from ipsys_log.models.locate_step import LocatePoints
 
     rng = np.random.default_rng(0)
     world, camera = labs.places(rng, 40), labs.camera(rng)
     tape, covariances = labs.measure(world, rng)
-    locate = Locate(fit_model("best", {"red": labs.pairs(camera.see(world, rng), tape, covariances)}, 0))
+    locate = LocatePoints(
+        fit_model("best", {"red": labs.pairs(camera.see(world, rng), tape, covariances)}, 0)
+    )
 
     def inside(*place_m: float) -> bool | None:
         (seen,) = camera.see(np.array([place_m]), rng)
@@ -181,7 +183,7 @@ def test_imported_run_is_not_repeatable_and_later_ones_are(ipsys: Ipsys, data: P
     log = tmp_path / "imsel.mcap"
     ipsys("import", "imsel", data / "imsel", "-o", log)
     assert ipsys("replay", log, "--model", "rigid").code == 0
-    rows = json.loads(ipsys("runs", log, "--json").out)
+    rows = json.loads(ipsys("runs", log, "--json").out)["rows"]
     states = {(row["run"], row["stage"]): row["state"] for row in rows}
     assert states.pop(("imsel", "import")) == "not repeatable"
     assert set(states.values()) == {"current"}
@@ -200,4 +202,4 @@ def test_wrong_point_of_the_authors_ranks_first(ipsys: Ipsys, data: Path, tmp_pa
     done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
     for found in json.loads(done.out)["models"].values():
         assert found["suspects"][0]["measurement"] == "white_11"
-        assert 8 <= np.linalg.norm(found["suspects"][0]["residual_cm"]) <= 14
+        assert 0.08 <= np.linalg.norm(found["suspects"][0]["residual_m"]) <= 0.14

@@ -19,15 +19,21 @@ from ipsys_log.messages import CameraCalibration
 
 # In the paper, a camera is parallel to the floor if the spread of Zc is below this value.
 LEVEL_M = 0.05
-# Relative error of a depth by the lens, for any number of frames; and the flatness of a floor.
-_USUAL_DEPTH, _FLAT_M = 0.002, 0.015
+# Relative error of a depth by the lens, for any number of frames.
+_USUAL_DEPTH = 0.002
+# The flatness of a floor: markers within this distance of the plane lie on it.
+_FLAT_M = 0.015
 # A slope with a larger sigma is unknown.
 _LOOSE = math.radians(1.0)
+# Markers farther from the plane, in sigmas of their depths, do not lie on it.
 _FAR = 4.0
-# Least number of markers to identify one outside the plane; largest number of triples of markers. If there
-# are more triples, the code draws a random subset.
-_LEAST_TO_NAME, _MOST_TRIPLES = 5, 2000
-_SLENDER, _LEAST_AREA_M2 = 0.05, 1e-4
+# Least number of markers to identify one outside the plane: of four, each three fit a plane exactly.
+_LEAST_TO_NAME = 5
+# Of more triples of markers, a random subset is tried.
+_MOST_TRIPLES = 2000
+# Triples of a smaller area do not determine a plane: a share of the largest one, and m^2.
+_SLENDER = 0.05
+_LEAST_AREA_M2 = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from ipsys_log.analysis.pairs import (
     build_pairs,
@@ -12,13 +12,9 @@ from ipsys_log.analysis.pairs import (
     withdrawals,
 )
 from ipsys_log.analysis.tape import RiggedMeasurement
-from ipsys_log.messages import Measurement, Pair, Rig
-from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG
+from ipsys_log.messages import Measurement, Pair
+from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import StageView
-from ipsys_log.models.table import reads_corners
-
-# The channels that a joint calibration reads.
-JOINT_READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
 
 
 def measured(view: StageView) -> list[RiggedMeasurement]:
@@ -29,6 +25,12 @@ def measured(view: StageView) -> list[RiggedMeasurement]:
 def find_pairs(view: StageView, points: list[RiggedMeasurement]) -> dict[str, list[Pair]]:
     """Return the observations of the calibration points by camera."""
     return build_pairs(gather_sightings(view.messages(CAMERA_POINTS)), points)
+
+
+def training_pairs(view: StageView, train: Collection[str]) -> dict[str, list[Pair]]:
+    """Return the observations of some calibration points by camera."""
+    pairs = find_pairs(view, measured(view))
+    return {camera: [pair for pair in seen if pair.measurement in train] for camera, seen in pairs.items()}
 
 
 def has_measurements(view: StageView) -> bool:
@@ -57,15 +59,3 @@ def split_parameters(view: StageView, options: Mapping[str, str]) -> dict[str, s
     """Return the parameters of the split: the label, or the seed if nothing is labelled."""
     labelled = any(m.splits for m in view.payloads(MEASUREMENTS))
     return {"train": options.get("train", "train")} if labelled else {"seed": options.get("seed", "0")}
-
-
-def measured_part(rig: Rig, model: str) -> object:
-    """Return the part of the rig on which the fit of a model, and its evaluation, depend."""
-    points = (rig.reference_points, {m.id for m in rig.markers})
-    if not reads_corners(model):
-        return points
-    markers = {
-        (m.id, rig.length_of(m.id), rig.height_of(m.id), rig.height_sigma_of(m.id)) for m in rig.markers
-    }
-    cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
-    return points, markers, cameras, (rig.tape_sigma_m, rig.tape_scale_sigma, rig.ab_sigma_m)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ipsys_log.analysis.drift import LEAST_SHIFT_M, Baseline, Motion, build_baseline, estimate_motion
+from ipsys_log.analysis.drift import LEAST_SHIFT_M, DriftBaseline, Motion, build_baseline, estimate_motion
 from ipsys_log.analysis.floor_cameras import floor_grid
 from ipsys_log.analysis.reference_markers import Window, average_windows
 from ipsys_log.arrays import Array
@@ -19,8 +19,10 @@ from ipsys_log.messages import Floor
 _AVERAGED = 5
 # A marker that moves on the floor by less than this share of the least shift is not examined further.
 _EXAMINED = 0.5
-# Two cameras see the same motion of a marker within this distance, or this share of it.
-_SAME_M, _SAME_SHARE = 0.0007, 0.3
+# Two cameras see the same motion of a marker within this distance,
+_SAME_M = 0.0007
+# or this share of the motion.
+_SAME_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +73,7 @@ class CameraState:
 class LabDrift:
     """The result over all logs, in order of time."""
 
-    baselines: dict[str, Baseline] = field(default_factory=dict)
+    baselines: dict[str, DriftBaseline] = field(default_factory=dict)
     moves: list[Move] = field(default_factory=list)
     marker_moves: list[MarkerMove] = field(default_factory=list)
     states: list[CameraState] = field(default_factory=list)
@@ -109,7 +111,7 @@ def find_drift(
 class _Segment:
     """A time without a move of a camera: its baseline, the windows of the baseline, and the last window."""
 
-    baseline: Baseline
+    baseline: DriftBaseline
     windows: list[Window]
     start_ns: int
     last: tuple[Window, str]
@@ -144,7 +146,7 @@ class _Search:
         for camera in sorted(self._segments):
             self._note_state(camera, log)
 
-    def _baseline(self, camera: str, windows: Sequence[Window]) -> Baseline:
+    def _baseline(self, camera: str, windows: Sequence[Window]) -> DriftBaseline:
         return build_baseline(
             self._cameras[camera], self._floor_m[camera], average_windows(windows, camera), self._lengths_m
         )
@@ -246,8 +248,8 @@ class _Search:
             self.drift.states.append(CameraState(camera, log.name, own[-1].end_ns, motion))
 
 
-def _without(baseline: Baseline, marker_id: int) -> Baseline:
-    return Baseline(
+def _without(baseline: DriftBaseline, marker_id: int) -> DriftBaseline:
+    return DriftBaseline(
         baseline.camera,
         baseline.floor_m,
         {one: mean for one, mean in baseline.corners.items() if one != marker_id},
@@ -255,7 +257,7 @@ def _without(baseline: Baseline, marker_id: int) -> Baseline:
     )
 
 
-def _shift_m(baseline: Baseline, window: Window, camera: str, marker_id: int) -> Array | None:
+def _shift_m(baseline: DriftBaseline, window: Window, camera: str, marker_id: int) -> Array | None:
     """Return the motion (3,) of a marker in the world, in m, if the camera has not moved.
 
     The marker keeps its depth. None if the marker is not in the window, or outside of the lens model.

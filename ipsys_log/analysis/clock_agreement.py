@@ -50,7 +50,7 @@ class ClockContradiction:
         )
 
 
-def find_contradictions(model: Model, estimates: Iterable[ClockEstimate]) -> list[ClockContradiction]:
+def find_contradicted_clocks(model: Model, estimates: Iterable[ClockEstimate]) -> list[ClockContradiction]:
     """Compare the clocks of a joint model with the estimates of the nodes in the log of its fit.
 
     Parameters

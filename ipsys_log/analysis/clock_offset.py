@@ -27,26 +27,43 @@ _LEAST_EXTENT_PX = 10.0
 _MOST_PAIRS = 24
 # The degrees of the map between two images: the first one with enough instants counts.
 _DEGREES = (5, 4, 3, 2)
-# A map needs this many instants for each coefficient; of more instants than the most, only every n-th counts.
-_INSTANTS_PER_TERM, _MOST_INSTANTS = 3, 4000
+# A map needs this many instants for each coefficient: with fewer, it follows the noise.
+_INSTANTS_PER_TERM = 3
+# Of more instants in a path, only every n-th counts: this bounds the time of a fit.
+_MOST_INSTANTS = 4000
 # A marker moves if its speed is at least this share of its 90th percentile.
 _MOVING_SHARE = 0.1
-# The search has steps of at most 0.25 s. The refinement covers more than its error on both sides. It also
-# covers clocks that differ by less than 3 s: the usual case, also with a small common field of view.
-_REFINED_S, _GRID_STEP_S, _NEAR_STEPS = 0.3, 0.025, 10
+# The search has steps of at most 0.25 s. The refinement covers more than its error on both sides.
+_REFINED_S = 0.3
+# Step of the grid in which the refinement looks for low points.
+_GRID_STEP_S = 0.025
+# The refinement also covers clocks that differ by so many times its reach, 3 s: the usual case, also with a
+# small common field of view.
+_NEAR_STEPS = 10
 # Low points of the grid with a misfit of at most this multiple of the lowest one are refined.
 _LOW_MISFIT = 3.0
-# Residuals of the maps above this share of the spread of the positions are those of unrelated paths. Another
-# offset is a rival of the best one if the ratio of their misfits is less than this.
-_LARGEST_MISFIT, _RIVAL_MISFIT, _MOST_FITS = 0.02, 2.0, 12
+# Residuals of the maps above this share of the spread of the positions are those of unrelated paths
+# (test_paths_of_another_session_do_not_agree).
+_LARGEST_MISFIT = 0.02
+# Another offset is a rival of the best one if the ratio of their misfits is less than this
+# (test_path_that_repeats_itself_gives_no_offset).
+_RIVAL_MISFIT = 2.0
+# So many of the best fits are examined: each takes a jackknife.
+_MOST_FITS = 12
 # An offset with a large sigma is a rival, too, if its fit has at least this share of the instants of the best
 # one. Paths that overlap for a short time agree at many offsets.
 _RIVAL_SHARE = 0.5
 # The positions between two frames are interpolated: the error of the offset is about 0.015 frame intervals at
-# 10 Hz, with robots that stop and go. With a larger sigma, a robot at 0.5 m/s would be more than 1 cm off.
-_INTERVAL_SHARE, _LARGEST_SIGMA_S = 0.02, 0.02
-# The number of parts of the common time for the jackknife, and the largest change of the offset by a part.
-_PARTS, _LARGEST_CHANGE_S, _LEAST_VARIANCE_S2 = 10, 0.1, 1e-14
+# 10 Hz, with robots that stop and go (test_errors_of_adjacent_cameras_agree_with_their_sigmas).
+_INTERVAL_SHARE = 0.02
+# With a larger sigma, a robot at 0.5 m/s would be more than 1 cm off.
+_LARGEST_SIGMA_S = 0.02
+# The jackknife leaves out one of so many parts of the common time.
+_PARTS = 10
+# The refinement without a part looks for the offset this near: a larger change counts as undetermined.
+_LARGEST_CHANGE_S = 0.1
+# With a smaller variance, the minimum is where instants come and go, and not where the paths agree.
+_LEAST_VARIANCE_S2 = 1e-14
 
 
 class MarkerPath(NamedTuple):

@@ -17,8 +17,10 @@ from ipsys_log.geometry.lenses import in_image
 from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.messages import Floor
 
-# Distance between tested points of the floor, and their largest number along a side.
-_STEP_M, _MOST = 0.01, 800
+# Distance between tested points of the floor; larger on a large floor,
+_STEP_M = 0.01
+# which has at most so many along a side.
+_MOST = 800
 # Tangent of the largest angle of a field of view: 79 degrees from the optical axis.
 _GRAZED = 5.0
 # Margin of the tested area around the foot points of cameras, without a known floor.

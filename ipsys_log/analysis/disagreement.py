@@ -108,7 +108,7 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class DisagreementInterval:
     """A time interval: its middle, the number of differences, and their lengths, in m."""
 
     time_ns: int
@@ -232,7 +232,7 @@ def divide_floor(pairs: Sequence[PairDisagreement], size_m: float = 0.25) -> lis
     return cells
 
 
-def divide_time(pair: PairDisagreement, most: int = 60) -> list[Interval]:
+def divide_time(pair: PairDisagreement, most: int = 60) -> list[DisagreementInterval]:
     """Return at most so many intervals with at least three differences, each of at least a second."""
     first_ns, last_ns = int(pair.times_ns[0]), int(pair.times_ns[-1]) + 1
     step_ns = max(NS_PER_S, -(-(last_ns - first_ns) // most))
@@ -243,5 +243,5 @@ def divide_time(pair: PairDisagreement, most: int = 60) -> list[Interval]:
         if len(own) >= _FEWEST:
             middle_ns = first_ns + number * step_ns + step_ns // 2
             median_m, p95_m = np.percentile(own, [50, 95]).tolist()
-            intervals.append(Interval(middle_ns, len(own), median_m, p95_m))
+            intervals.append(DisagreementInterval(middle_ns, len(own), median_m, p95_m))
     return intervals

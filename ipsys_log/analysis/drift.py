@@ -31,9 +31,14 @@ from ipsys_log.joint.observations import lens_model_of
 # A shift of the floor map below this mean is not reported: slow changes of light and temperature reach half
 # of it, and the smallest motion to find is 2 mm.
 LEAST_SHIFT_M = 0.0012
-# Standard deviations of a corner: noise of a frame; slow changes of each corner; slow changes that all
-# corners of a marker share (light); and those that all markers of a camera share (temperature).
-_FRAME_PX, _CORNER_PX, _MARKER_PX, _CAMERA_PX = 0.02, 0.03, 0.05, 0.06
+# Standard deviations of a corner: noise of a frame;
+_FRAME_PX = 0.02
+# slow changes of each corner;
+_CORNER_PX = 0.03
+# slow changes that all corners of a marker share, by light;
+_MARKER_PX = 0.05
+# and those that all markers of a camera share, by temperature.
+_CAMERA_PX = 0.06
 # Errors of the intrinsics and of the baseline poses change a displacement by this share.
 _DISPLACEMENT_SHARE = 0.01
 # Prior scales that are tried, in m on the floor. The least keeps the uncertainty of a still camera honest.
@@ -49,9 +54,10 @@ _SMALL = 1e-6
 _SURE = 8.0
 # Residuals of consistent markers exceed their expectation by less than this many standard deviations.
 _CONSISTENT = 8.0
-# Markers for the split into turn and shift, and their least spread: the second singular value of the
-# directions to them.
-_SPLIT_MARKERS, _SPLIT_SPREAD = 3, 0.15
+# Markers for the split into turn and shift (test_few_markers_do_not_separate_turn_and_shift),
+_SPLIT_MARKERS = 3
+# and their least spread: the second singular value of the directions to them.
+_SPLIT_SPREAD = 0.15
 _POSE_PX = 0.05
 # The second pose of a marker is only taken if the corners clearly prefer it.
 _OTHER_POSE_CHI2 = 20.0
@@ -66,7 +72,7 @@ class MeanCorners:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Baseline:
+class DriftBaseline:
     """The reference markers of a camera before a motion.
 
     Attributes
@@ -116,7 +122,7 @@ class Motion:
 
 def build_baseline(
     camera: PosedCamera, floor_m: Array, corners: Mapping[int, MeanCorners], lengths_m: Mapping[int, float]
-) -> Baseline:
+) -> DriftBaseline:
     """Return the baseline of a camera; a marker outside of the field of view of its lens model is left out.
 
     Parameters
@@ -140,10 +146,10 @@ def build_baseline(
         turn, centre_m = poses.rotations[0, other], poses.centres_m[0, other]
         points_c[marker_id] = marker_corners(length_m) @ turn.T + centre_m
     kept = {marker_id: corners[marker_id] for marker_id in points_c}
-    return Baseline(camera, floor_m, kept, points_c)
+    return DriftBaseline(camera, floor_m, kept, points_c)
 
 
-def estimate_motion(baseline: Baseline, corners: Mapping[int, MeanCorners]) -> Motion | None:
+def estimate_motion(baseline: DriftBaseline, corners: Mapping[int, MeanCorners]) -> Motion | None:
     """Estimate the motion of a camera; None without a common marker.
 
     A marker that contradicts at least two others is left out.
@@ -192,7 +198,7 @@ class _Fit:
         return self.chi2 <= self.rows + _CONSISTENT * float(np.sqrt(2 * self.rows))
 
 
-def _fit(baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[int]) -> _Fit:
+def _fit(baseline: DriftBaseline, corners: Mapping[int, MeanCorners], markers: list[int]) -> _Fit:
     """Fit a motion to the displacements of markers: Gauss-Newton with the prior of largest evidence."""
     moved_px = np.concatenate([corners[m].corners_px - baseline.corners[m].corners_px for m in markers])
     spread = np.linalg.cholesky(_covariance(baseline, corners, markers, moved_px))
@@ -214,7 +220,7 @@ def _fit(baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[i
 
 
 def _covariance(
-    baseline: Baseline, corners: Mapping[int, MeanCorners], markers: list[int], moved_px: Array
+    baseline: DriftBaseline, corners: Mapping[int, MeanCorners], markers: list[int], moved_px: Array
 ) -> Array:
     """Return the covariance (8 k, 8 k) of the displacements of k markers, in px^2."""
     shared = np.tile(np.eye(2), (4, 4))
@@ -260,7 +266,7 @@ def _best_scale(rows: Array, aims: Array) -> tuple[float, float]:
     return float(_SCALES_M[best]), float(doubled[best])
 
 
-def _mean_shift(baseline: Baseline, fit: _Fit) -> tuple[float, float]:
+def _mean_shift(baseline: DriftBaseline, fit: _Fit) -> tuple[float, float]:
     """Return the mean length of the shift of the floor map and its standard deviation, in m.
 
     Without a motion, the length has no slope: then the standard deviation is that of an axis of the mean.
@@ -282,7 +288,7 @@ def _mean_shift(baseline: Baseline, fit: _Fit) -> tuple[float, float]:
     return float(lengths_m.mean()), float(np.sqrt(max(of_length, of_axis)))
 
 
-def _why_no_split(baseline: Baseline, markers: list[int]) -> str | None:
+def _why_no_split(baseline: DriftBaseline, markers: list[int]) -> str | None:
     if len(markers) < _SPLIT_MARKERS:
         return (
             f"turn and shift cannot be separated with {len(markers)} reference "

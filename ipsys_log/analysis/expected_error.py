@@ -48,7 +48,7 @@ class ExpectedErrors:
     seen: Mask
     errors_m: Array
     model: JointModel
-    view: MarkerView
+    view: VisibleMarkers
     length_m: float
 
     def modes_m(self, rows: slice = _ALL) -> Array:
@@ -113,7 +113,7 @@ def camera_modes(
     return view.seen, _modes_at(model, view, length_m, _ALL)
 
 
-def _modes_at(model: JointModel, view: MarkerView, length_m: float, rows: slice) -> Array:
+def _modes_at(model: JointModel, view: VisibleMarkers, length_m: float, rows: slice) -> Array:
     """Return the modes (r, 2, m) of some of the seen markers."""
     corners_px, heights_m = view.corners_px[rows], view.heights_m[rows]
     count = len(corners_px)
@@ -125,7 +125,7 @@ def _modes_at(model: JointModel, view: MarkerView, length_m: float, rows: slice)
     return located.modes_m[:, :2]
 
 
-class MarkerView(NamedTuple):
+class VisibleMarkers(NamedTuple):
     """Markers on the floor as a camera sees them: a mask (p,), and the n seen ones.
 
     ``corners_px`` (n, 4, 2) are exact, ``centres_m`` (n, 3) and ``turns`` (n, 3, 3) are the poses in the
@@ -146,7 +146,7 @@ def see_markers(
     heights_m: Array | float,
     length_m: float,
     headings_rad: Array | float = 0.0,
-) -> MarkerView:
+) -> VisibleMarkers:
     """Return the markers at points (p, 2) that are whole in the image of a camera, with their margins."""
     lens = replace(model.calibration, width=size_px[0], height=size_px[1])
     floor_m = model.floor.heights(points_m, model.amplitudes)[0]
@@ -162,7 +162,7 @@ def see_markers(
     around = corners_c(WHOLE_PRINT * length_m, everywhere)
     seen: Mask = np.asarray(in_image(around, lens).reshape(-1, 4).all(axis=1), dtype=np.bool_)
     corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
-    return MarkerView(seen, corners_px, centres_m[seen], turns[seen], heights_m[seen])
+    return VisibleMarkers(seen, corners_px, centres_m[seen], turns[seen], heights_m[seen])
 
 
 def mean_lengths(covariances_m2: Array) -> Array:
@@ -170,7 +170,9 @@ def mean_lengths(covariances_m2: Array) -> Array:
     return mean_length(covariances_m2[:, [0, 1, 0], [0, 1, 1]].T)
 
 
-def find_gaps(expected: ExpectedErrors, grid: FloorGrid, places_m: Array) -> tuple[float, list[FloorGap]]:
+def find_floor_gaps(
+    expected: ExpectedErrors, grid: FloorGrid, places_m: Array
+) -> tuple[float, list[FloorGap]]:
     """Return the share of the seen floor where a camera saw a marker, and the gaps, largest first.
 
     Parameters

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ipsys_log.analysis.floor_grid import FloorGrid
+from ipsys_log.analysis.model_kinds import joint_models
 from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
 from ipsys_log.geometry.lenses import check_calibration, in_image, undistort
 from ipsys_log.geometry.posed_camera import PosedCamera
 from ipsys_log.messages import CameraCalibration, CameraModel, Floor, Model
 from ipsys_log.models.rigid import rigid_transform
-from ipsys_log.models.table import reads_corners
 
 if TYPE_CHECKING:
     from ipsys_log.joint.model import JointModel
@@ -45,7 +45,7 @@ def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) ->
     IpsysError
         The model of a camera is not complete, or its intrinsics are not valid.
     """
-    cameras, joints = {}, _joint_models(model)
+    cameras, joints = {}, joint_models(model)
     for camera in model.cameras:
         if camera.camera not in lenses:
             continue
@@ -55,16 +55,6 @@ def read_floor_cameras(model: Model, lenses: Mapping[str, CameraCalibration]) ->
         if own is not None and np.isfinite(own.camera_from_world).all() and np.isfinite(own.origin_m).all():
             cameras[own.name] = own
     return cameras
-
-
-def _joint_models(model: Model) -> Mapping[str, JointModel]:
-    """Return the joint models of a model by camera; none if it is another model."""
-    if not reads_corners(model.name):
-        return {}
-    # Late: scipy takes 1 s, and most commands need no joint model.
-    from ipsys_log.joint.payload import restore_joint
-
-    return restore_joint(model)
 
 
 def _joint_camera(name: str, joint: JointModel, lens: CameraCalibration) -> PosedCamera:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.pairs import Sightings, still_interval
+from ipsys_log.analysis.pairs import TimedPoints, still_interval
 from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.arrays import Array
 from ipsys_log.geometry.time_brackets import bracket_times
@@ -44,15 +44,15 @@ class TrackErrors(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotPath:
+class TrackedPath:
     """The positions of a robot in order of time, and its headings (n,) in rad, NaN where there is none."""
 
     robot: str
-    positions: Sightings
+    positions: TimedPoints
     headings_rad: Array
 
 
-def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
+def gather_tracks(messages: Iterable[Message]) -> dict[int, TimedPoints]:
     """Return positions of tracks by marker, in order of time; those of equal time in log order.
 
     Predicted positions of unseen robots are left out.
@@ -60,7 +60,7 @@ def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
     return {marker_id: path.positions for marker_id, path in gather_paths(messages).items()}
 
 
-def gather_paths(messages: Iterable[Message]) -> dict[int, RobotPath]:
+def gather_paths(messages: Iterable[Message]) -> dict[int, TrackedPath]:
     """Return the positions of :func:`gather_tracks` with headings and the names of the robots, by marker."""
     rows: dict[int, list[tuple[int, float, float, float, float]]] = {}
     robots: dict[int, str] = {}
@@ -74,9 +74,9 @@ def gather_paths(messages: Iterable[Message]) -> dict[int, RobotPath]:
     for values in rows.values():
         values.sort(key=lambda row: row[0])
     return {
-        marker_id: RobotPath(
+        marker_id: TrackedPath(
             robots[marker_id],
-            Sightings(
+            TimedPoints(
                 np.array([row[0] for row in values], dtype=np.int64),
                 np.array([row[1:4] for row in values], dtype=np.float64),
             ),
@@ -87,7 +87,7 @@ def gather_paths(messages: Iterable[Message]) -> dict[int, RobotPath]:
 
 
 def true_points(
-    places: Iterable[RiggedMeasurement], ground_truth: Mapping[int, Sightings]
+    places: Iterable[RiggedMeasurement], ground_truth: Mapping[int, TimedPoints]
 ) -> dict[str, NDArray[np.float64]]:
     """Return the true position of each measured marker, (3,) in m by id, if the ground truth is known."""
     points = {}
@@ -101,7 +101,7 @@ def true_points(
 
 
 def track_errors(
-    tracks: Mapping[int, Sightings], ground_truth: Mapping[int, Sightings], at_track_height: bool = False
+    tracks: Mapping[int, TimedPoints], ground_truth: Mapping[int, TimedPoints], at_track_height: bool = False
 ) -> TrackErrors | None:
     """Return the 3D errors and the floor errors of tracks against the ground truth at the same instants.
 

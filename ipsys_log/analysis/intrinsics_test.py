@@ -24,13 +24,19 @@ from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.square_pose import is_convex, reprojection_px, solve_squares
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig
 
-# Chi-square of seven parameters: chance exceeds it once in 10,000 tests. Least deviation of shapes that the
-# correction explains: a good calibration has 0.4 % at the border of the image. Least ratio of the deviations
-# before and after the correction.
-_CHI2, _LEAST_EFFECT, _LEAST_RATIO = 30.0, 0.005, 1.5
-# Square fit of raw corners: error of a blurred photograph, and error in shares of the side (a bent print);
-# least ratio of the median, and number. In real videos of a moving board, the median is up to 1.4 px.
-_FIT_PX, _FIT_SHARE, _FIT_FACTOR, _LEAST_FITS = 0.7, 0.01, 3.0, 8
+# Chi-square of seven parameters: chance exceeds it once in 10,000 tests.
+_CHI2 = 30.0
+# Least deviation of shapes that the correction explains: a good calibration has 0.4 % at the border.
+_LEAST_EFFECT = 0.005
+# Least ratio of the deviations before and after the correction: other causes leave their deviations.
+_LEAST_RATIO = 1.5
+# Error of the square fit of raw corners in a blurred photograph, and by a bent print in shares of the side.
+_FIT_PX = 0.7
+_FIT_SHARE = 0.01
+# Least ratio of the median to this error. In real videos of a moving board, the median is up to 1.4 px.
+_FIT_FACTOR = 3.0
+# A median of fewer fits is not reliable.
+_LEAST_FITS = 8
 # Corners with a smaller residual are those of a fitted square: they say nothing about their shape.
 _FITTED_PX = 1e-4
 
@@ -131,7 +137,7 @@ def _contradicts(given: ShapeFit, corrected: ShapeFit) -> bool:
     )
 
 
-def find_contradictions(
+def find_contradicted_inputs(
     frames: Iterable[tuple[str, Markers]], lenses: Mapping[str, CameraCalibration], rig: Rig
 ) -> Iterator[str]:
     """Yield what the frames of cameras contradict: intrinsics that are not nominal, and sizes of the rig."""

@@ -30,10 +30,14 @@ from ipsys_log.joint.locate import edge_motion, linearise_corners
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.settings import JointSettings
 
-# A drive lasts this time, and a camera sees the robot so often per second.
-DRIVE_S, _RATE_HZ = 30.0, 10.0
-# Places of the robot are this far apart; a drive covers a square of so many places.
-_STEP_M, _SQUARE = 0.3, 4
+# A drive lasts this time.
+DRIVE_S = 30.0
+# A camera sees the robot so often per second.
+_RATE_HZ = 10.0
+# Places of the robot are this far apart.
+_STEP_M = 0.3
+# A drive covers a square of so many places.
+_SQUARE = 4
 # Usual noise of a detected corner.
 _CORNER_SIGMA_PX = 0.02
 # Two successive places have headings that differ by the golden angle, so that all headings occur.

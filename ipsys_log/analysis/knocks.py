@@ -22,21 +22,30 @@ from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
 # The state now is the median of the last sightings, at most so many and so old.
-_RECENT, _RECENT_NS, _FEWEST_RECENT = 5, NS_PER_S // 2, 3
-# The state before is the median of earlier sightings.
-_BEFORE_NS, _FEWEST_BEFORE = 3 * NS_PER_S, 5
-# Motions of a marker, and of the difference of two cameras, that count; and how often the usual spread. The
-# difference also changes with the place of the robot: at most so many m per m.
-_LEAST_MARKER_M, _LEAST_OVERLAP_M, _SPREADS = 0.002, 0.015, 6.0
+_RECENT = 5
+_RECENT_NS = NS_PER_S // 2
+# With fewer, one wrong sighting is the median.
+_FEWEST_RECENT = 3
+# The state before is the median of earlier sightings, at most so old and at least so many.
+_BEFORE_NS = 3 * NS_PER_S
+_FEWEST_BEFORE = 5
+# Smallest motion of a marker that counts.
+_LEAST_MARKER_M = 0.002
+# Smallest change of the difference of two cameras that counts. It also changes with the place of the robot,
+# at most so many m per m.
+_LEAST_OVERLAP_M = 0.015
 _OVERLAP_SLOPE = 0.02
+# A smaller change in units of the usual spread is noise.
+_SPREADS = 6.0
 # Values within such an extent cannot have changed by _LEAST_OVERLAP_M, also with rounding.
 _CALM_M = 0.99 * _LEAST_OVERLAP_M
 # A motion must last so long. Meanwhile the other cameras send their frames.
 _CONFIRMED_NS = NS_PER_S // 5
 # A camera without a reference marker for so long counts as one without reference markers.
 _UNWATCHED_NS = 2 * NS_PER_S
-# In the overlap, the state before is that at nearly the same place.
-_OVERLAP_BEFORE_NS, _FEWEST_OVERLAP = 3 * NS_PER_S // 2, 4
+# In the overlap, the state before is that at nearly the same place: the robot moves on.
+_OVERLAP_BEFORE_NS = 3 * NS_PER_S // 2
+_FEWEST_OVERLAP = 4
 
 
 class Knock(NamedTuple):

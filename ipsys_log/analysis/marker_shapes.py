@@ -39,12 +39,19 @@ _ANY = np.array([0.3, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1])
 _CALIBRATED = np.array([0.004, 0.004, 0.004, 0.003, 0.003, 0.002, 0.002])
 _NONE = 1e-6 * _ANY
 _PARAMETERS = len(_ANY)
-# Sigma of the tilt of the top of a robot, in rad; of the floor to the image, any tilt.
-_TOP_TILT, _ANY_TILT = 0.035, 3.0
+# Sigma of the tilt of the top of a robot, in rad: 2 degrees.
+_TOP_TILT = 0.035
+# The floor has any tilt to the image.
+_ANY_TILT = 3.0
 # Error of the shape of a print: stretched by the printer by 0.3 %, bent, on a floor that is not flat.
 SHAPE_SIGMA = 0.002
+# Larger deviations, in units of the spread, have less weight.
 _HUBER = 2.5
-_ITERATIONS, _SETTLED, _STEP = 12, 0.05, 1e-5
+_ITERATIONS = 12
+# A step that changes the cost and, relatively, the spread by less is the last one.
+_SETTLED = 0.05
+# Step of numerical slopes.
+_STEP = 1e-5
 
 
 class MarkerPlaces:

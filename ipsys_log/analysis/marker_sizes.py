@@ -17,8 +17,12 @@ from ipsys_log.analysis.marker_shapes import (
 from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraCalibration, Marker, Rig
 
-# Least contradiction, and in units of the scatter of distances; least number of sightings of a marker.
-_SIZE_SHARE, _SIZE_SCATTER, _LEAST_OF_MARKER = 0.03, 4.0, 5
+# Least contradiction, as a share of the distance.
+_SIZE_SHARE = 0.03
+# Least contradiction in units of the scatter of distances.
+_SIZE_SCATTER = 4.0
+# A median of fewer sightings of a marker is not reliable.
+_LEAST_OF_MARKER = 5
 
 
 class Contradiction(NamedTuple):

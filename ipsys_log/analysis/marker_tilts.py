@@ -19,8 +19,15 @@ _LEVEL_RAD = np.radians(6.0)
 _CAMERA_RAD = np.radians(15.0)
 _MOST_SIGMAS = 5.0
 # The first frames are all used, then one of sixteen: a fit takes 1 ms.
-_FIRST_FRAMES, _EVERY_FRAME = 20, 16
-_NORMALS, _LEAST_NORMALS, _LEAST_TILTED = 200, 10, 5
+_FIRST_FRAMES = 20
+_EVERY_FRAME = 16
+# The newest normals count.
+_NORMALS = 200
+# A common direction needs so many normals.
+_LEAST_NORMALS = 10
+# So many normals must contradict the others: a single one can be wrong.
+_LEAST_TILTED = 5
+# So many normals are tried as the common direction.
 _CANDIDATES = 20
 # A pose with a larger chi2 than the other one is not that of the marker.
 _OTHER_POSE_CHI2 = 25.0

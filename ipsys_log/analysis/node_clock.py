@@ -41,8 +41,11 @@ _WINDOW_NS = 60 * NS_PER_S
 _STEPS = 34
 # The round trip is never shorter, in s; the mean jitter is not 0.
 _LEAST_JITTER_S = 1e-6
-# Later estimates change slowly: they are made after so many exchanges more, or after this time.
-_FEW, _GROWTH, _REFIT_NS = 10, 1.1, 5 * NS_PER_S
+# Each of the first exchanges gives an estimate. Later ones change slowly: they are made after this factor of
+# exchanges, or after this time.
+_FEW = 10
+_GROWTH = 1.1
+_REFIT_NS = 5 * NS_PER_S
 
 
 class Exchange(NamedTuple):

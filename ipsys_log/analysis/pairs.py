@@ -15,23 +15,24 @@ from ipsys_log.units import NS_PER_S
 
 # A marker is stationary if it stays within these distances from its position at the measurement. They are
 # above the noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
-_STILL_ACROSS_M = 0.01
-_STILL_ALONG_M = 0.04
-_GAP_NS = 2 * NS_PER_S
+STILL_ACROSS_M = 0.01
+STILL_ALONG_M = 0.04
+# In a longer gap of the sightings, the marker may have moved.
+LONGEST_GAP_NS = 2 * NS_PER_S
 _FARTHEST_M = 10_000.0
 # Heights with smaller differences are equal: the accuracy of a ruler and of uneven boards.
 _ONE_HEIGHT_M = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """Sightings of one marker by one camera: ``times_ns`` (n,), ascending, and ``points_m`` (n, 3)."""
+class TimedPoints:
+    """The points of a marker, by camera or track: ``times_ns`` (n,), ascending, and ``points_m`` (n, 3)."""
 
     times_ns: NDArray[np.int64]
     points_m: NDArray[np.float64]
 
 
-def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
+def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], TimedPoints]:
     """Return camera points by camera and marker, ordered by the time of exposure of the marker.
 
     Raises
@@ -56,7 +57,7 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
                 f"camera {key[0]}: a camera point of marker {key[1]} is impossible; run camera-frame again, "
                 "with --run and another name"
             )
-        sightings[key] = Sightings(times_ns, points_m)
+        sightings[key] = TimedPoints(times_ns, points_m)
     return sightings
 
 
@@ -150,7 +151,7 @@ def _follow(withdrawn: dict[str, Measurement], message: Measurement) -> None:
         withdrawn.pop(message.readmits or message.id, None)
 
 
-def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:
+def still_interval(sightings: TimedPoints, time_ns: int) -> tuple[int, int] | None:
     """Return the stationary interval of a marker around a time.
 
     Parameters
@@ -166,11 +167,11 @@ def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None
     if len(sightings.times_ns) == 0:
         return None
     anchor = int(np.abs(sightings.times_ns - time_ns).argmin())
-    if abs(int(sightings.times_ns[anchor]) - time_ns) > _GAP_NS:
+    if abs(int(sightings.times_ns[anchor]) - time_ns) > LONGEST_GAP_NS:
         return None
     moved = np.abs(sightings.points_m - sightings.points_m[anchor])
-    still = (np.hypot(moved[:, 0], moved[:, 1]) <= _STILL_ACROSS_M) & (moved[:, 2] <= _STILL_ALONG_M)
-    joined = np.diff(sightings.times_ns) <= _GAP_NS
+    still = (np.hypot(moved[:, 0], moved[:, 1]) <= STILL_ACROSS_M) & (moved[:, 2] <= STILL_ALONG_M)
+    joined = np.diff(sightings.times_ns) <= LONGEST_GAP_NS
     first = last = anchor
     while first > 0 and still[first - 1] and joined[first - 1]:
         first -= 1
@@ -180,7 +181,7 @@ def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None
 
 
 def build_pairs(
-    sightings: Mapping[tuple[str, int], Sightings], places: Iterable[RiggedMeasurement]
+    sightings: Mapping[tuple[str, int], TimedPoints], places: Iterable[RiggedMeasurement]
 ) -> dict[str, list[Pair]]:
     """Return the calibration points that each camera saw.
 
@@ -237,7 +238,7 @@ def _check_duplicates(camera: str, pairs: Iterable[Pair]) -> None:
 
 
 def _mean_point(
-    sightings: Sightings | None, measurement: Measurement
+    sightings: TimedPoints | None, measurement: Measurement
 ) -> tuple[NDArray[np.float64], int] | None:
     if sightings is None:
         return None

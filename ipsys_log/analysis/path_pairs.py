@@ -11,13 +11,21 @@ from numpy.typing import NDArray
 from ipsys_log.arrays import Array, Mask
 from ipsys_log.geometry.time_brackets import bracket_times
 
-# Longest gap for an interpolation, in multiples of the usual interval, and in s.
-_USUAL_INTERVALS, _SHORTEST_GAP_S, _LONGEST_GAP_S = 2.5, 0.1, 1.0
+# Longest gap for an interpolation, in usual intervals: one missing frame is no gap.
+_USUAL_INTERVALS = 2.5
+# A gap is never shorter than the first, at high rates, and never longer than the second, at low ones.
+_SHORTEST_GAP_S = 0.1
+_LONGEST_GAP_S = 1.0
 # Neighbouring errors of tracks are alike. Errors further apart than this count as independent.
 _BLOCK_S = 2.0
-# A jump is this many times longer than the usual distance of a position from its neighbours, and than 1 cm,
+# A jump is this many times longer than the usual distance of a position from its neighbours,
+_JUMP = 10.0
+# longer than this,
+_LEAST_JUMP_M = 0.01
 # and needs a larger acceleration than a robot has.
-_JUMP, _LEAST_JUMP_M, _LARGEST_ACCELERATION_M_S2, _PASSES = 10.0, 0.01, 10.0, 4
+_LARGEST_ACCELERATION_M_S2 = 10.0
+# Of neighbouring jumps, each pass removes the largest only.
+_PASSES = 4
 
 
 class PathPair(NamedTuple):

@@ -19,7 +19,11 @@ from ipsys_log.units import NS_PER_S
 
 # A log has at most so many windows. A longer log is read in part: a camera that has moved stays there.
 _MOST_WINDOWS = 60
-_LEAST_NS, _LONGEST_NS = NS_PER_S, 2 * NS_PER_S
+# Windows follow each other at least this long,
+_LEAST_NS = NS_PER_S
+# and are at most this long: so much of a longer log is read.
+_LONGEST_NS = 2 * NS_PER_S
+# With fewer frames, one hand before a marker changes the median.
 _FEWEST_FRAMES = 3
 _FARTHEST_PX = 1e5
 

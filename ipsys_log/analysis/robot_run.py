@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.ground_truth import gather_tracks
-from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.analysis.pairs import TimedPoints
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
@@ -85,8 +85,8 @@ class RobotResult:
     path: tuple[Waypoint, ...]
     reached: list[WaypointResult]
     stops: list[Stop]
-    received: Sightings
-    true: Sightings | None
+    received: TimedPoints
+    true: TimedPoints | None
     positioning_m: dict[str, ErrorStatistics]
     is_finished: bool
 
@@ -151,8 +151,8 @@ def _ids(session: Session) -> dict[str, int]:
 def _robot(
     path: RobotPath,
     commands: Sequence[WheelCommand],
-    true: Sightings | None,
-    estimated: Mapping[str, Sightings],
+    true: TimedPoints | None,
+    estimated: Mapping[str, TimedPoints],
 ) -> RobotResult:
     errors = {run: _errors_m(track, true) for run, track in estimated.items()} if true is not None else {}
     reached = [
@@ -170,7 +170,7 @@ def _robot(
         path.waypoints,
         reached,
         _stops(commands, true),
-        Sightings(
+        TimedPoints(
             np.array([row[0] for row in received], dtype=np.int64),
             np.array([row[1:] for row in received], dtype=np.float64).reshape(-1, 2),
         ),
@@ -180,7 +180,7 @@ def _robot(
     )
 
 
-def _errors_m(track: Sightings, true: Sightings) -> Array:
+def _errors_m(track: TimedPoints, true: TimedPoints) -> Array:
     """Return rows of time in ns and error on the floor in m, at the instants of the ground truth.
 
     The last pose of an instant counts: it uses all cameras.
@@ -199,7 +199,7 @@ def _waypoint(
     number: int,
     place: Waypoint,
     commands: Sequence[WheelCommand],
-    true: Sightings | None,
+    true: TimedPoints | None,
     errors: Mapping[str, Array],
 ) -> WaypointResult | None:
     """Return the last stay at a waypoint; None if the robot did not reach it."""
@@ -243,7 +243,7 @@ def _within(times_ns: NDArray[np.int64] | Array, start_ns: int, end_ns: int) -> 
     return within
 
 
-def _stops(commands: Sequence[WheelCommand], true: Sightings | None) -> list[Stop]:
+def _stops(commands: Sequence[WheelCommand], true: TimedPoints | None) -> list[Stop]:
     """Return the stops after the first movement: before it, the robot waits for its first position."""
     begun = next((n for n, command in enumerate(commands) if command.state != STOPPED), len(commands))
     stops = []
@@ -265,13 +265,13 @@ def _stops(commands: Sequence[WheelCommand], true: Sightings | None) -> list[Sto
     return stops
 
 
-def _length_m(true: Sightings, start_ns: int, end_ns: int) -> float:
+def _length_m(true: TimedPoints, start_ns: int, end_ns: int) -> float:
     """Return the length of a true path between two times."""
     points_m = true.points_m[_within(true.times_ns, start_ns, end_ns), :2]
     return float(np.linalg.norm(np.diff(points_m, axis=0), axis=1).sum())
 
 
-def _nearest_m(paths: Sequence[Sightings]) -> float | None:
+def _nearest_m(paths: Sequence[TimedPoints]) -> float | None:
     distances_m = []
     for one, other in combinations(paths, 2):
         _, first, second = np.intersect1d(one.times_ns, other.times_ns, return_indices=True)

@@ -9,15 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.analysis.pairs import LONGEST_GAP_NS, STILL_ACROSS_M, STILL_ALONG_M, TimedPoints
 from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraPoint, CameraPoints, Measurement
 from ipsys_log.units import NS_PER_S
 
-# A marker is stationary if its motion is below these limits, which are above the noise of plain corners.
-_STILL_ACROSS_M, _STILL_ALONG_M, _STILL_ALONG = 0.01, 0.04, 0.02
-# In a longer gap of the sightings, the marker may have moved.
-_GAP_NS = 2 * NS_PER_S
+# A marker is stationary if its motion is within the limits of calibration pairs; in a high lab, the noise
+# along the view is this share of the depth.
+_STILL_ALONG = 0.02
 # Least duration of a stationary interval directly before or after a motion.
 _LEAST_NS = NS_PER_S // 2
 
@@ -82,7 +81,7 @@ def _stretches(sightings: Sequence[tuple[int, CameraPoint]]) -> Iterator[tuple[i
     """Yield the first and last index of each stationary interval."""
     times_ns = np.array([time_ns for time_ns, _ in sightings], dtype=np.int64)
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for _, p in sightings])
-    joined = np.diff(times_ns) <= _GAP_NS
+    joined = np.diff(times_ns) <= LONGEST_GAP_NS
     first = 0
     while first < len(points_m):
         last = first
@@ -96,7 +95,7 @@ def _stretches(sightings: Sequence[tuple[int, CameraPoint]]) -> Iterator[tuple[i
 
 def _together(one_m: Array, other_m: Array) -> bool:
     x_m, y_m, z_m = np.abs(other_m - one_m).tolist()
-    return bool(np.hypot(x_m, y_m) <= _STILL_ACROSS_M and z_m <= max(_STILL_ALONG_M, _STILL_ALONG * one_m[2]))
+    return bool(np.hypot(x_m, y_m) <= STILL_ACROSS_M and z_m <= max(STILL_ALONG_M, _STILL_ALONG * one_m[2]))
 
 
 def _lying(sightings: Sequence[tuple[int, CameraPoint]], height_m: float) -> StationaryMarker:
@@ -111,20 +110,18 @@ def _lying(sightings: Sequence[tuple[int, CameraPoint]], height_m: float) -> Sta
 def _height(marker_id: int, start_ns: int, end_ns: int, measurements: Sequence[Measurement]) -> float:
     for measurement in measurements:
         still = measurement.still
-        from_ns = still.start if still is not None else measurement.timestamp - _GAP_NS
-        to_ns = still.end if still is not None else measurement.timestamp + _GAP_NS
+        from_ns = still.start if still is not None else measurement.timestamp - LONGEST_GAP_NS
+        to_ns = still.end if still is not None else measurement.timestamp + LONGEST_GAP_NS
         if measurement.marker_id == marker_id and from_ns <= end_ns and start_ns <= to_ns:
             point = measurement.point
             return (point.z_m if point is not None else measurement.height_m) or 0.0
     return 0.0
 
 
-# The limits of calibration pairs (analysis/pairs.py), above the noise of plain sub-pixel corners.
-_ACROSS_M = 0.01
-_ALONG_M = 0.04
 # A very slow marker stays within these limits for some time, but the means of the earlier and the later half
 # differ. The means of few sightings are less accurate.
-_DRIFT_M, _DRIFT_OF_ONE_M = 0.002, 0.004
+_DRIFT_M = 0.002
+_DRIFT_OF_ONE_M = 0.004
 # A slow motion can look stationary for a shorter time. A shorter interval is valid only if the marker is not
 # visible before and after.
 _SHORTEST_NS = NS_PER_S
@@ -162,11 +159,13 @@ def is_near(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
     """Return a mask (n,) of the camera points (n, 3) that are at a position (3,), within their noise."""
     across_m = (points_m[:, :2] / points_m[:, 2:] - place_m[:2] / place_m[2]) * place_m[2]
     along_m = np.abs(points_m[:, 2] - place_m[2])
-    near: NDArray[np.bool_] = (np.hypot(across_m[:, 0], across_m[:, 1]) <= _ACROSS_M) & (along_m <= _ALONG_M)
+    near: NDArray[np.bool_] = (np.hypot(across_m[:, 0], across_m[:, 1]) <= STILL_ACROSS_M) & (
+        along_m <= STILL_ALONG_M
+    )
     return near
 
 
-def stationary_intervals(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tuple[str, ...]]]:
+def stationary_intervals(cameras: Mapping[str, TimedPoints]) -> list[tuple[int, int, tuple[str, ...]]]:
     """Return the stationary intervals of one marker, from the sightings of all cameras, in order of time.
 
     Parameters
@@ -198,7 +197,7 @@ def stationary_intervals(cameras: Mapping[str, Sightings]) -> list[tuple[int, in
     return rows
 
 
-def _seen_still(cameras: Mapping[str, Sightings], start_ns: int, end_ns: int) -> tuple[str, ...]:
+def _seen_still(cameras: Mapping[str, TimedPoints], start_ns: int, end_ns: int) -> tuple[str, ...]:
     """Return the cameras that saw the marker in an interval; none if one of them saw it move."""
     seen = []
     for camera, sightings in sorted(cameras.items()):
@@ -210,27 +209,31 @@ def _seen_still(cameras: Mapping[str, Sightings], start_ns: int, end_ns: int) ->
     return tuple(seen)
 
 
-def _between(sightings: Sightings, start_ns: int, end_ns: int) -> Array:
+def _between(sightings: TimedPoints, start_ns: int, end_ns: int) -> Array:
     within = (sightings.times_ns >= start_ns) & (sightings.times_ns <= end_ns)
     return sightings.points_m[within]
 
 
-def _joined(sightings: Sightings) -> list[tuple[int, int]]:
+def _joined(sightings: TimedPoints) -> list[tuple[int, int]]:
     """Return the stationary intervals of one camera; join consecutive intervals at the same position."""
     intervals: list[tuple[int, int]] = []
     for start_ns, end_ns in _camera_stretches(sightings):
         both = (intervals[-1][0], end_ns) if intervals else (start_ns, end_ns)
-        if intervals and start_ns - intervals[-1][1] <= _GAP_NS and is_stationary(_between(sightings, *both)):
+        if (
+            intervals
+            and start_ns - intervals[-1][1] <= LONGEST_GAP_NS
+            and is_stationary(_between(sightings, *both))
+        ):
             intervals[-1] = both
         else:
             intervals.append((start_ns, end_ns))
     return intervals
 
 
-def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
+def _camera_stretches(sightings: TimedPoints) -> Iterator[tuple[int, int]]:
     """Yield the intervals in which one camera sees a marker stationary."""
     times_ns, points_m = sightings.times_ns, sightings.points_m
-    ends = np.append(np.flatnonzero(np.diff(times_ns) > _GAP_NS), len(times_ns) - 1) + 1
+    ends = np.append(np.flatnonzero(np.diff(times_ns) > LONGEST_GAP_NS), len(times_ns) - 1) + 1
     rays = (points_m[:, :2] / points_m[:, 2:]).tolist()
     depths_m = points_m[:, 2].tolist()
     first = 0
@@ -260,6 +263,6 @@ def _first_away(rays: Sequence[Sequence[float]], depths_m: Sequence[float], firs
     (u, v), depth_m = rays[first], depths_m[first]
     for n in range(first + 1, end):
         across = (rays[n][0] - u) ** 2 + (rays[n][1] - v) ** 2
-        if across * depth_m**2 > _ACROSS_M**2 or abs(depths_m[n] - depth_m) > _ALONG_M:
+        if across * depth_m**2 > STILL_ACROSS_M**2 or abs(depths_m[n] - depth_m) > STILL_ALONG_M:
             return n
     return end

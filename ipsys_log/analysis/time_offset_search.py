@@ -15,7 +15,10 @@ from ipsys_log.geometry.time_brackets import bracket_times
 
 # Half the time over which a speed is measured. Noise of 5 mm then is a speed of 0.035 m/s.
 _HALF_WINDOW_S = 0.1
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.02, 0.25
+# The step is the longest usual interval of the recordings, within these limits.
+_SHORTEST_STEP_S = 0.02
+_LONGEST_STEP_S = 0.25
+# A longer recording has longer steps: this bounds the Fourier transform.
 _MOST_STEPS = 1 << 20
 # Offsets with a shorter common time than this share of the longest one are not tried: a short piece of a path
 # looks like many others.
@@ -23,7 +26,10 @@ _LEAST_SHARE = 0.3
 _LEAST_INSTANTS = 8
 # Outliers of positions are jumps. Speeds above this multiple of the 90th percentile are clipped.
 _CLIPPED_ABOVE = 1.5
-_CANDIDATES, _APART_S = 5, 1.0
+# So many offsets are returned. Each is refined, which takes longer than the search.
+_CANDIDATES = 5
+# Offsets nearer together are one.
+_APART_S = 1.0
 
 
 def search_offsets_s(pairs: Sequence[PathPair]) -> list[float]:

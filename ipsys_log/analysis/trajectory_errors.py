@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.ground_truth import LONGEST_GAP_NS, RobotPath
+from ipsys_log.analysis.ground_truth import LONGEST_GAP_NS, TrackedPath
 from ipsys_log.arrays import Array
 from ipsys_log.geometry.time_brackets import TimeBrackets, bracket_times
 from ipsys_log.messages import ErrorStatistics
@@ -19,9 +19,10 @@ Places = NDArray[np.int64]
 
 # The distances (m) and times (s) of the relative pose error.
 DELTAS = ((1.0, "m"), (1.0, "s"))
-# A pair counts if its distance differs from the stated one by at most this share, as in evo; or if its time
-# differs by at most this share of the usual interval.
-_DISTANCE_SHARE, _INTERVAL_SHARE = 0.1, 0.5
+# A pair counts if its distance differs from the stated one by at most this share, as in evo;
+_DISTANCE_SHARE = 0.1
+# or if its time differs by at most this share of the usual interval.
+_INTERVAL_SHARE = 0.5
 TRANSLATION, DISTANCE = "translation_part", "point_distance"
 
 
@@ -64,8 +65,8 @@ class TrajectoryErrors(NamedTuple):
 
 
 def trajectory_errors(
-    tracks: Mapping[int, RobotPath],
-    ground_truth: Mapping[int, RobotPath],
+    tracks: Mapping[int, TrackedPath],
+    ground_truth: Mapping[int, TrackedPath],
     deltas: Sequence[tuple[float, str]] = DELTAS,
 ) -> list[TrajectoryErrors]:
     """Return the absolute trajectory error (ATE) and the relative pose error (RPE) of each robot.
@@ -107,7 +108,7 @@ def pool_trajectories(trajectories: Sequence[TrajectoryErrors]) -> TrajectoryErr
 
 
 def _errors_of(
-    track: RobotPath, truth: RobotPath, deltas: Sequence[tuple[float, str]]
+    track: TrackedPath, truth: TrackedPath, deltas: Sequence[tuple[float, str]]
 ) -> TrajectoryErrors | None:
     # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
     times_ns, last = np.unique(track.positions.times_ns[::-1], return_index=True)

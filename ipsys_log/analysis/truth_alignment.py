@@ -17,11 +17,15 @@ from ipsys_log.geometry.rotations import cross
 
 _LEAST_SPREAD_M = 0.1
 _SINGULAR = 1e-9
-_LARGEST_TURN_SIGMA_RAD, _LARGEST_OFFSET_SIGMA_S = np.radians(2.0), 0.1
+# With larger standard deviations, the motion does not determine the alignment.
+_LARGEST_TURN_SIGMA_RAD = np.radians(2.0)
+_LARGEST_OFFSET_SIGMA_S = 0.1
 # A larger median residual, as a share of the extent of the path, shows that the paths differ.
 _LARGEST_SHARE = 0.2
-# Two offsets are alike if their median residuals differ by less than this factor and length.
-_ALIKE, _ALIKE_M = 1.5, 1e-3
+# Two offsets are alike if their median residuals differ by less than this factor and this length
+# (test_repeated_path_needs_a_time_offset). The length is for residuals near 0, as of a simulated truth.
+_ALIKE = 1.5
+_ALIKE_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,9 +28,15 @@ ALIGNMENTS = {
 }
 # The median length of a vector with normal components of unit variance, by their number.
 _MEDIAN_LENGTH = {2: 1.1774, 3: 1.5382}
-# Residuals above 5 sigma are outliers. A smaller sigma than 0.1 mm is none of a camera.
-_OUTLIER, _LEAST_SCALE_M = 5.0, 1e-4
-_ROUNDS, _FREE_ROUNDS, _CONVERGED_M = 40, 15, 1e-11
+# Residuals above 5 sigma are outliers.
+_OUTLIER = 5.0
+# A smaller sigma than 0.1 mm is none of a camera.
+_LEAST_SCALE_M = 1e-4
+_ROUNDS = 40
+# After so many rounds, the limit of the outliers stays: otherwise an instant at the limit can alternate.
+_FREE_ROUNDS = 15
+# Below this step, the estimate is exact to rounding.
+_CONVERGED_M = 1e-11
 # The velocity of a path holds for a short time only.
 _LARGEST_OFFSET_STEP_S = 0.3
 LEAST_INSTANTS = 8

@@ -174,8 +174,12 @@ _NEAR_PX = 0.05
 # Pixels are square unless the squares of held-out images become smaller without this, by this many standard
 # errors of the change.
 _HELD_OUT_GAIN = 1.0
-# Factors of other focal lengths to try, least difference of their fits in standard deviations, and steps.
-_OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40
+# Factors of other focal lengths to try;
+_OTHER_FOCALS = (0.7, 1.3)
+# their fits must be worse by so many standard deviations,
+_WORSE = 3.0
+# after at most so many steps.
+_OTHER_STEPS = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,12 +29,21 @@ from ipsys_log.calibration.solve import fitted_basis, loss_scale_px, rms_px, sol
 Group = NDArray[np.bool_]
 
 _MIN_IMAGES = 4
-_DIRECTIONS, _ROUNDS, _STEPS, _POSE_STEPS = 3, 8, 8, 4
+# The images are divided along so many directions of the largest contradictions,
+_DIRECTIONS = 3
+# and each division is improved in so many rounds.
+_ROUNDS = 8
+# Steps of the fit of a group, and of the poses of the other images.
+_STEPS = 8
+_POSE_STEPS = 4
 # Least relative excess of the squared errors with one set of intrinsics for two cameras. Images of
 # one camera reach 0.37 (fisheye_chessboard), and fewer images per parameter reach more.
-_GAIN, _GAIN_PER_PARAMETER = 0.4, 0.6
-# Least excess if the names of the images show the same groups, and least share of images that agree.
-_NAMED_GAIN, _AGREE = 0.25, 0.9
+_GAIN = 0.4
+_GAIN_PER_PARAMETER = 0.6
+# Least excess if the names of the images show the same groups,
+_NAMED_GAIN = 0.25
+# and least share of images that agree.
+_AGREE = 0.9
 # Largest ratio of the errors of the groups: a group with larger errors consists of bad images.
 _ALIKE = 3.0
 

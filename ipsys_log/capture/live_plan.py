@@ -20,14 +20,13 @@ from ipsys_log.messages.channels import (
     channel_of,
 )
 from ipsys_log.messages.stage import Plan, Stage
-from ipsys_log.models.table import needs_height
+from ipsys_log.models.table import model_run, needs_height
 from ipsys_log.runs.execute import LiveRun, copy_messages
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, stages_until
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
-from ipsys_log.stages.fit import model_run
 
 
 class LivePlan(NamedTuple):

@@ -25,6 +25,7 @@ from ipsys_log.capture.frames import (
     report_refused_settings,
 )
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
+from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigCamera
 from ipsys_log.plain_text import hide_password
 from ipsys_log.units import NS_PER_S
@@ -276,14 +277,16 @@ def _explain(error: Exception) -> str:
 
 
 def check_address(camera: RigCamera) -> None:
-    """Check that the source of a camera is a valid address.
+    """Check that the source of a camera is a valid address, and that the library for it is installed.
 
     Raises
     ------
-    SourceError
-        The address names no host. A stream that is sent to this machine (``udp://:5000``) needs no host.
+    IpsysError
+        The library is missing, or the address names no host. A stream that is sent to this machine
+        (``udp://:5000``) needs no host.
     """
     address = camera.source or ""
+    check_installed(f"camera {camera.name}: the source {hide_password(address)} needs", "av")
     if not address.lower().startswith(("http", "rtsp")):
         return
     try:

@@ -12,7 +12,6 @@ from typing import Protocol
 
 from ipsys_log.capture.disk import (
     Confirm,
-    RecordedFile,
     Syncer,
     describe_disk_failure,
     describe_disk_fault,
@@ -112,19 +111,16 @@ class Recording:
     counts : number of messages so far, by topic.
     full : set when the disk is full; then the reserved space is in use.
     is_deleted : set soon after another program has deleted the file.
-    path : path of the log; after :func:`open_recording`, the one at its end. None if another program has
-        renamed the log, and its present path cannot be found.
+    is_renamed : set if the path does not lead to the file any more.
     syncer : syncs the log to the disk.
     """
 
     def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
         self.counts: dict[str, int] = {}
         self.full: WriteError | None = None
-        self.is_deleted = False
-        self.path: Path | None = writer.path
-        self._first_path = writer.path
+        self.is_deleted = self.is_renamed = False
+        self.path = writer.path
         self.syncer = Syncer(self._sync)
-        self._file = RecordedFile(writer.path, writer.fd)
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
         self._torn = False
@@ -153,32 +149,35 @@ class Recording:
         """The first error of the disk when it failed to keep written messages."""
         return self.syncer.fault
 
-    def follow(self) -> None:
-        """Note the present path of the log before its end: another program may have renamed it."""
-        self._look()
-        self.path = self._file.find()
-        if self.path is not None:
-            self._writer.follow(self.path)
-
-    def describe_rename(self) -> str | None:
-        """Describe where a log is that another program has renamed; None if it has its first name."""
-        if self.path == self._first_path or self.is_deleted:
-            return None
-        place = "its present name cannot be found" if self.path is None else f"it is {self.path} now"
-        return f"another program has renamed the log {self._first_path}: {place}"
+    def look(self) -> None:
+        """Note whether another program has deleted or renamed the log."""
+        try:
+            own = os.fstat(self._writer.fd)
+        except OSError:  # a fault of the disk is no proof
+            return
+        self.is_deleted = self.is_deleted or own.st_nlink == 0
+        try:
+            self.is_renamed = not os.path.samestat(own, self.path.stat())
+        except OSError:
+            self.is_renamed = True
 
     def check_file(self) -> None:
-        """Check that the log exists.
+        """Check that the log is where it was created.
 
         Raises
         ------
         IpsysError
-            Another program has deleted it.
+            Another program has deleted or renamed it.
         """
         if self.is_deleted:
             raise IpsysError(
-                f"{self._first_path}: {_DELETED}; the recording has stopped. If it was moved to another "
+                f"{self.path}: {_DELETED}; the recording has stopped. If it was moved to another "
                 "disk, repair it there: ipsys repair FILE"
+            )
+        if self.is_renamed:
+            raise IpsysError(
+                f"{self.path}: another program has renamed the log. It has all frames under its new name; to "
+                "complete its runs: ipsys repair FILE"
             )
 
     def check_disk(self) -> None:
@@ -190,22 +189,18 @@ class Recording:
             The disk was full or failed, or :meth:`check_file` fails; the text describes the log.
         """
         self.check_file()
-        path = self.path or self._first_path
         if self.full is not None:
-            raise IpsysError(describe_disk_full(path, self.full)) from self.full
+            raise IpsysError(describe_disk_full(self.path, self.full)) from self.full
         if self.fault is not None:
-            raise IpsysError(describe_disk_failure(path, self.fault)) from self.fault
+            raise IpsysError(describe_disk_failure(self.path, self.fault)) from self.fault
 
     def settle(self) -> bool:
         """Prevent further writes from all threads; return False if a thread is still writing."""
         return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
 
     def _sync(self) -> None:
-        self._look()
+        self.look()
         self._writer.sync()
-
-    def _look(self) -> None:
-        self.is_deleted = self.is_deleted or self._file.is_deleted
 
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
@@ -286,7 +281,7 @@ def open_recording(
                 for message in settings:
                     log.put(message)
                 log.flush()
-                resources.callback(log.follow)
+                resources.callback(log.look)
                 resources.enter_context(log.syncer)
                 yield log
             except KeyboardInterrupt as error:

@@ -15,6 +15,7 @@ import simplejpeg
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
+from ipsys_log.extras import check_installed
 from ipsys_log.images.decode import MAX_PIXELS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -63,6 +64,7 @@ def open_video(path: Path, say: Say) -> Iterator[Iterator[TimedFrame]]:
     SourceError
         The file cannot be read, or is no video.
     """
+    check_installed(f"{path}: a video needs", "av")
     import av
 
     with ExitStack() as stack:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import simplejpeg
 
 from ipsys_log.capture.frames import Frame, SourceError
+from ipsys_log.extras import check_installed
 from ipsys_log.images.decode import MAX_PIXELS
 
 if TYPE_CHECKING:
@@ -99,6 +100,7 @@ def find_size(frame: Frame) -> tuple[int, int] | None:
 
 
 def _find_video_size(frame: Frame) -> tuple[int, int] | None:
+    check_installed(f"{frame.format} video needs", "av")
     import av
 
     codec = next(codec for codec, name in _FORMATS.items() if name == frame.format)

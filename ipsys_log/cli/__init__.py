@@ -16,12 +16,12 @@ def main() -> None:
 
     hold_signals()
     from ipsys_log.cli.app import app
-    from ipsys_log.cli.console import print_warnings
+    from ipsys_log.cli.console import OLD_JSON, print_warnings
     from ipsys_log.errors import IpsysError, is_full, os_error_text
 
     try:
         with print_warnings():
-            app()
+            app(["--json" if word == OLD_JSON else word for word in sys.argv[1:]])
     except IpsysError as error:
         sys.exit(_complain(str(error)))
     except BrokenPipeError:

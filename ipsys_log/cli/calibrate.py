@@ -277,7 +277,7 @@ def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
 
 
 def _draw(lenses: list[CalibrationResult], plot: Path) -> None:
-    from ipsys_log.report.calibration_figure import calibration_figure
+    from ipsys_log.report.calibration_figures import calibration_figure
     from ipsys_log.report.figures import figure_bytes
     from ipsys_log.report.files import write_files
 

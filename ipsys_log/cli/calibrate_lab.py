@@ -206,10 +206,10 @@ def _refuse_live(**options: object) -> None:
 
 
 def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.report.lab_calibration_text import lab_advice, lab_headline, lab_json, lab_table
+    from ipsys_log.report.expected_error_texts import lab_advice, lab_headline, lab_json, lab_table
 
     if plot is not None:
-        from ipsys_log.report.lab_calibration_figure import draw_lab
+        from ipsys_log.report.expected_error_figures import draw_lab
 
         draw_lab(lab, plot)
     if as_json:

@@ -172,9 +172,16 @@ def warn(text: str) -> None:
     remarks.print(text, style="yellow")
 
 
+# ``--json=1`` gives the keys of format 1 for one release.
+OLD_JSON = "--json=1"
+
+
 def print_json(value: Any) -> None:
     """Print a result for programs."""
-    print(json.dumps(value, indent=2, allow_nan=False))  # noqa: T201
+    from ipsys_log.report.json_format import document, old_document
+
+    result = old_document(value, sys.argv[1]) if OLD_JSON in sys.argv else document(value)
+    print(json.dumps(result, indent=2, allow_nan=False))  # noqa: T201
 
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:

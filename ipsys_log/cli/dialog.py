@@ -168,7 +168,7 @@ def ask_places(scene: MeasuringScene) -> None:
 def _ask_baseline(scene: MeasuringScene) -> None:
     """Ask once for the distance AB with this tape, where it counts; Enter or a letter skips it."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.survey.baseline import baseline_names, needs_baseline, read_baseline
+    from ipsys_log.survey.checks import baseline_names, needs_baseline, read_baseline
 
     while needs_baseline(scene.rig, scene.history()):
         first, second = baseline_names(scene.rig)

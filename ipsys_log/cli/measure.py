@@ -114,7 +114,7 @@ def measure(
             return
         before = len(scene.history())
         if ab is not None:
-            from ipsys_log.survey.baseline import read_baseline
+            from ipsys_log.survey.checks import read_baseline
 
             scene.add([read_baseline(ab, scene.rig, scene.history(), scene.start_ns)])
         elif csv is not None:

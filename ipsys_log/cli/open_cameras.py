@@ -149,7 +149,6 @@ def open_cameras(
         status = LiveStatus(
             opened.cameras.states, monitor, output, monotonic, growing, None if doing else say
         )
-        stack.callback(status.close)
         _say_room(opened, room, seconds, doing)
         say(doing or "the cameras are open; Ctrl-C to end")
         if panel:

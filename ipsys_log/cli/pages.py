@@ -120,7 +120,7 @@ def serve_dashboard(
     if plan is None:
         yield []
         return
-    from ipsys_log.web.dashboard.sources import dashboard_of_recording
+    from ipsys_log.web.dashboard.app import dashboard_of_recording
 
     dashboard = dashboard_of_recording(opened, status.checks, log, plan.model, run, streams)
     with _serve(dashboard, plan.host, plan.port, has_viewers=True):
@@ -152,7 +152,7 @@ def serve_playback(player: Player, host: str | None, port: int) -> Iterator[None
     if player.scene is None:
         yield
         return
-    from ipsys_log.web.dashboard.sources import dashboard_of_player
+    from ipsys_log.web.dashboard.app import dashboard_of_player
 
     dashboard = dashboard_of_player(player, player.scene)
     player.show_on(dashboard)

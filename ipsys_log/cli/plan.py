@@ -15,9 +15,6 @@ from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile
 from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from ipsys_log.analysis.joint_plan import PlannedDrive
     from ipsys_log.messages import Rig
     from ipsys_log.survey.floor_plan import PlannedFloor
 
@@ -93,17 +90,17 @@ def plan(
 
 
 def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
+    from ipsys_log.report.expected_error_texts import plan_json, plan_lines, plan_table
+
     if plot is not None:
-        from ipsys_log.report.plan_figure import draw_plan
+        from ipsys_log.report.expected_error_figures import draw_plan
 
         draw_plan(found, plot)
     if as_json:
-        print_json(_plan_json(found))
+        print_json(plan_json(found))
     else:
-        console.print(_table(found))
-        console.print(_headline(found))
-        if found.drive is not None:
-            console.print(_drive_line(found.drive))
+        for part in (plan_table(found), *plan_lines(found)):
+            console.print(part)
     for note in found.notes:
         warn(note)
     if plot is not None:
@@ -141,97 +138,3 @@ def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: S
                 f"{session}: has no calibration points, so a plan is not possible; first measure about 10 "
                 "points over the whole view of each camera, at the heights in use"
             )
-
-
-def _headline(found: PlannedFloor) -> str:
-    from ipsys_log.report.rows import means_cm
-
-    before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
-    subject = "this point" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} points"
-    return f"predicted mean error over the floor: {before} cm now, {after} cm with {subject}"
-
-
-def _drive_line(drive: PlannedDrive) -> str:
-    """Return the line of the drive that reduces the error most, with its effect without new points."""
-    from ipsys_log.analysis.joint_plan import DRIVE_S
-    from ipsys_log.report.rows import means_cm
-    from ipsys_log.units import CM_PER_M
-
-    if not drive.is_useful:
-        return "another drive changes little: most of the predicted error is that of the tape"
-    (x0, y0), (x1, y1) = (
-        (corner_m * CM_PER_M).round().astype(int) for corner_m in (drive.low_m, drive.high_m)
-    )
-    before, after = means_cm(drive.mean_before_m, drive.mean_after_m)
-    where = f"x {x0} to {x1}, y {y0} to {y1} cm (seen by {', '.join(drive.cameras)})"
-    return f"or drive a robot for {DRIVE_S:.0f} s, in curves, through {where}: {before} -> {after} cm"
-
-
-def _table(found: PlannedFloor) -> Table:
-    from rich.table import Table
-
-    from ipsys_log.report.rows import means_cm
-    from ipsys_log.units import CM_PER_M
-
-    title = f"Next points to measure, for the model {found.model} of run {found.run}"
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    for name in ("", "x cm", "y cm", "height cm"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("tape cm", overflow="fold")
-    table.add_column("seen by", overflow="fold")
-    table.add_column("mean error cm", justify="right", no_wrap=True)
-    places = found.plan.places
-    means = means_cm(places[0].mean_before_m, *(place.mean_after_m for place in places))
-    for number, place in enumerate(places, 1):
-        x, y, z = place.point_m.tolist()
-        distances = [
-            f"{name} {value * CM_PER_M:.0f}" for name, value in found.distances_m(place.point_m).items()
-        ]
-        side = found.side(place.point_m)
-        table.add_row(
-            str(number), f"{x * CM_PER_M:.0f}", f"{y * CM_PER_M:.0f}", f"{z * CM_PER_M:g}",
-            ", ".join([*distances, *([side] if side else [])]) or "-", ", ".join(place.cameras),
-            f"{means[number - 1]} -> {means[number]}",
-        )  # fmt: skip
-    return table
-
-
-def _plan_json(found: PlannedFloor) -> dict[str, Any]:
-    from ipsys_log.units import CM_PER_M
-
-    places = [
-        {
-            "number": number,
-            **dict(zip(("x_m", "y_m", "height_m"), place.point_m.tolist(), strict=True)),
-            "distances_m": found.distances_m(place.point_m),
-            "side": found.side(place.point_m),
-            "cameras": list(place.cameras),
-            "mean_before_cm": place.mean_before_m * CM_PER_M,
-            "mean_after_cm": place.mean_after_m * CM_PER_M,
-        }
-        for number, place in enumerate(found.plan.places, 1)
-    ]
-    return {
-        "model": found.model,
-        "run": found.run,
-        "marker_height_m": found.height_m,
-        "mean_before_cm": places[0]["mean_before_cm"],
-        "mean_after_cm": places[-1]["mean_after_cm"],
-        "places": places,
-        **({} if found.drive is None else {"drive": _drive_json(found.drive)}),
-        "notes": list(found.notes),
-    }
-
-
-def _drive_json(drive: PlannedDrive) -> dict[str, Any]:
-    from ipsys_log.analysis.joint_plan import DRIVE_S
-    from ipsys_log.units import CM_PER_M
-
-    return {
-        "low_m": drive.low_m.tolist(),
-        "high_m": drive.high_m.tolist(),
-        "duration_s": DRIVE_S,
-        "cameras": list(drive.cameras),
-        "mean_before_cm": drive.mean_before_m * CM_PER_M,
-        "mean_after_cm": drive.mean_after_m * CM_PER_M,
-    }

@@ -17,8 +17,7 @@ from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.sinks.streams.addresses import LOOPBACK
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure, topic_key
-from ipsys_log.sinks.streams.ros2_messages import POSE
-from ipsys_log.sinks.streams.ros2_types import type_hash
+from ipsys_log.sinks.streams.ros2_messages import POSE, type_hash
 
 _NODE = "ipsys_relay"
 _DOMAIN = 0

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ipsys_log.analysis.ground_truth import gather_tracks
-from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.analysis.pairs import TimedPoints
 from ipsys_log.analysis.path_pairs import PathPair
 from ipsys_log.analysis.truth_alignment import Residuals, TruthAlignment, align_truth, residuals_of
 from ipsys_log.analysis.truth_fit import ALIGNMENTS, RigidMotion
@@ -166,7 +166,7 @@ def _marker_ids(rig: Rig, paths: Sequence[TruthPath], where: str) -> dict[str, i
     }
 
 
-def _tracks(session: Session | None, run: str | None, ids: dict[str, int]) -> dict[str, Sightings]:
+def _tracks(session: Session | None, run: str | None, ids: dict[str, int]) -> dict[str, TimedPoints]:
     """Return the tracks of a run by robot, for the robots with a track."""
     if session is None or run is None:
         return {}
@@ -187,7 +187,7 @@ def _tracks_run(session: Session | None, run: str | None) -> str | None:
 
 def _fit(
     paths: Sequence[TruthPath],
-    tracks: dict[str, Sightings],
+    tracks: dict[str, TimedPoints],
     options: TruthOptions,
     session: Session | None,
     run: str | None,
@@ -209,7 +209,7 @@ def _fit(
 
 
 def _given_residuals(
-    paths: Sequence[TruthPath], tracks: dict[str, Sightings], offset_ns: int
+    paths: Sequence[TruthPath], tracks: dict[str, TimedPoints], offset_ns: int
 ) -> Residuals | None:
     if not tracks:
         return None
@@ -229,7 +229,7 @@ def _no_tracks(paths: Sequence[TruthPath], session: Session | None, run: str | N
 
 
 def _check_overlap(
-    paths: Sequence[TruthPath], offset_ns: int, tracks: dict[str, Sightings], session: Session, where: str
+    paths: Sequence[TruthPath], offset_ns: int, tracks: dict[str, TimedPoints], session: Session, where: str
 ) -> None:
     start_ns = min(int(path.times_ns[0]) for path in paths) + offset_ns
     end_ns = max(int(path.times_ns[-1]) for path in paths) + offset_ns
@@ -248,7 +248,7 @@ def _time(time_ns: int) -> str:
     return format_time(time_ns) if 0 <= time_ns < 1 << 63 else f"{time_ns / NS_PER_S:.3f} s"
 
 
-def _pairs(paths: Sequence[TruthPath], tracks: dict[str, Sightings]) -> tuple[list[PathPair], int]:
+def _pairs(paths: Sequence[TruthPath], tracks: dict[str, TimedPoints]) -> tuple[list[PathPair], int]:
     """Return the paths of both systems, each in s since its start, and the difference of the starts in ns."""
     true_ns = min(int(path.times_ns[0]) for path in paths)
     track_ns = min(int(track.times_ns[0]) for track in tracks.values())

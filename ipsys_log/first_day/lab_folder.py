@@ -53,7 +53,7 @@ class LogFacts:
 class FitFacts:
     """The newest evaluation of the calibration logs.
 
-    ``answer`` are the sentences of ``ipsys replay``, ``mean_cm`` the mean distance to the tape points.
+    ``answer`` are the sentences of ``ipsys replay``, ``mean_m`` the mean distance to the tape points.
     ``outliers`` are the points that contradict the fit. ``stale`` is the reason if the evaluation is out of
     date; "" if it is current.
     """
@@ -61,7 +61,7 @@ class FitFacts:
     run: str
     stale: str
     answer: tuple[str, ...]
-    mean_cm: float | None
+    mean_m: float | None
     outliers: tuple[OutlierPoint, ...]
 
 
@@ -187,8 +187,8 @@ def _read_fit(paths: Sequence[Path]) -> FitFacts | None:
     except IpsysError:
         return None
     stale = newest.state.partition(": ")[2] if newest.out_of_date else ""
-    mean_cm = answer_json(accuracies).get("answer", {}).get("mean_cm")
-    return FitFacts(run, stale, _sentences(accuracies), mean_cm, outliers)
+    mean_m = answer_json(accuracies).get("answer", {}).get("mean_m")
+    return FitFacts(run, stale, _sentences(accuracies), mean_m, outliers)
 
 
 def _sentences(accuracies: Sequence[Accuracy]) -> tuple[str, ...]:

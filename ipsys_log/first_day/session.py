@@ -12,8 +12,7 @@ from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.extras import check_installed
 from ipsys_log.first_day import work
 from ipsys_log.first_day.alignment import AlignmentResult
-from ipsys_log.first_day.board_entry import BOARD_FIELDS, parse_board_entry
-from ipsys_log.first_day.board_search import BoardSearch
+from ipsys_log.first_day.board import BOARD_FIELDS, BoardSearch, parse_board_entry
 from ipsys_log.first_day.camera_address import parse_camera_address
 from ipsys_log.first_day.camera_choice import save_cameras, set_calibration
 from ipsys_log.first_day.camera_pictures import CameraPictures
@@ -23,6 +22,7 @@ from ipsys_log.first_day.outlier_points import exclude_outlier
 from ipsys_log.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.first_day.steps import SetupProgress, Status, read_progress
 from ipsys_log.report.prints import Print, board_print, rig_prints
+from ipsys_log.report.rows import cm
 from ipsys_log.rig.file import load_rig
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.survey.entry import Fault
@@ -296,7 +296,7 @@ class SetupSession:
 
 def _describe_fit(fit: FitFacts) -> dict[str, Any]:
     """Return the result of the fit: one figure, the points to measure again, and the full answer."""
-    figure = "" if fit.mean_cm is None else f"Mean distance to the tape points: {fit.mean_cm:.1f} cm"
+    figure = "" if fit.mean_m is None else f"Mean distance to the tape points: {cm(fit.mean_m, 1)} cm"
     return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}
 
 

@@ -14,6 +14,7 @@ from ipsys_log.geometry.plausible_lenses import calibration_remarks
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.models.table import min_pairs
 from ipsys_log.plain_text import join_names, shell_words
+from ipsys_log.report.rows import cm
 from ipsys_log.rig.file import load_rig
 from ipsys_log.survey.entry import check_references
 
@@ -206,7 +207,9 @@ def _accuracy_step(calibration: list[Path], logs: tuple[LogFacts, ...], fit: Fit
     names = shell_words(*(path.name for path in calibration)) or "calibration.mcap"
     title, command = "Fit and evaluation", f"ipsys replay {names}"
     if fit is not None and not fit.stale:
-        text = "fitted" if fit.mean_cm is None else f"mean distance to the tape points {fit.mean_cm:.1f} cm"
+        text = "fitted"
+        if fit.mean_m is not None:
+            text = f"mean distance to the tape points {cm(fit.mean_m, 1)} cm"
         return StepState("accuracy", title, command, Status.DONE, text)
     if sum(log.points for log in logs) < min_pairs(_MODEL):
         return StepState("accuracy", title, command, Status.WAITS, "first measure calibration points")

@@ -20,8 +20,7 @@ from ipsys_log.capture.simulated import show_board
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, read_lab
-from ipsys_log.first_day.board_entry import BoardEntry
-from ipsys_log.first_day.board_search import BoardSearch
+from ipsys_log.first_day.board import BoardEntry, BoardSearch
 from ipsys_log.first_day.camera_choice import set_calibration
 from ipsys_log.first_day.jobs import Job
 from ipsys_log.first_day.lab_folder import ALIGNMENT_LOG, LabFolder

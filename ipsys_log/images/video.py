@@ -15,6 +15,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.errors import FrameError
+from ipsys_log.extras import check_installed
 from ipsys_log.images.decode import MAX_PIXELS
 from ipsys_log.messages import CompressedVideo, RawImage
 
@@ -260,6 +261,7 @@ def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:
 
 
 def _open(codec: str) -> VideoCodecContext:
+    check_installed(f"{codec} video needs", "av")
     import av
 
     decoder = av.VideoCodecContext.create(codec, "r")

@@ -37,9 +37,12 @@ _ON_FLOOR_M = 0.0003
 _UNKNOWN_CORNER_PX = 0.25
 # Without a stationary interval, a marker is stationary while its centre moves less than this.
 _STILL_PX = 0.5
+# In a longer gap of the sightings, the marker may have moved.
 _GAP_NS = 2 * NS_PER_S
-# A frame is left out of an average if a corner is this far from the median, in px and in usual deviations.
-_FAR_PX, _FAR = 0.3, 6.0
+# A frame is left out of an average if a corner is this far from the median,
+_FAR_PX = 0.3
+# also in usual deviations.
+_FAR = 6.0
 # Share of the variance of a corner that repeats in all images of a stationary marker, because the pixels
 # sample its print at the same places. Measured in rendered labs.
 _REPEATABLE_SHARE = 0.35

@@ -39,15 +39,19 @@ _Cause = tuple[float, CameraMotion | None]
 
 # A reading contradicts the fit above this many standard deviations.
 _WRONG = 4.5
-# A rough place of a point that is farther than this from its tape readings shows a wrong start.
-_ROUGH_M, _ROUGH_SHARE = 0.1, 0.03
+# A rough place of a point that is farther than this from its tape readings shows a wrong start: a length, and
+# a share of the reach of the readings.
+_ROUGH_M = 0.1
+_ROUGH_SHARE = 0.03
 # With more sightings that do not fit, the fit is not to be believed.
 _MOST_OUTLIERS = 0.2
 # A hypothesis about cameras must decrease twice the cost by this much: once in a million sessions by chance.
 _LEAST_GAIN = 60.0
 _MOST_HYPOTHESES = 3
-# If the best hypothesis leaves more outliers than this, the next one is tried instead of it.
-_MOST_TRIALS, _FEW_OUTLIERS = 2, 0.01
+# If the best hypothesis leaves a larger share of outliers, the next one is tried instead of it,
+_FEW_OUTLIERS = 0.01
+# up to so many: each is a fit.
+_MOST_TRIALS = 2
 # Row times have fewer unknowns than a motion at any time: they come first if they explain this share of it.
 _ROWS_SHARE = 0.25
 # Two hypotheses are both possible if their probabilities differ by less than a factor of 100.

@@ -22,8 +22,8 @@ _CORNERS = marker_corners(1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Positions:
-    """Positions of n markers in the world.
+class LevelPositions:
+    """Positions of n level markers in the world.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def locate_markers(
     lengths_m: Array,
     height_sigmas_m: Array | float = 0.001,
     tilt_sigma_rad: float = 0.005,
-) -> Positions:
+) -> LevelPositions:
     """Return the positions of level markers at known heights above the floor.
 
     The rays of the corners meet the height of the marker: this is the exact position if the corners have no
@@ -72,7 +72,7 @@ def locate_markers(
 
     Returns
     -------
-    Positions.
+    LevelPositions : those of the markers.
     """
     inward = edge_motion(corners_px)
     points_m, headings_rad, floor_slopes, floor_modes = _start(model, corners_px, inward, heights_m)
@@ -106,7 +106,9 @@ def locate_markers(
     covariances += by_height @ by_height.swapaxes(1, 2)
     headings_rad = (headings_rad - change[:, 2] + np.pi) % (2 * np.pi) - np.pi
     chi2 = (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0]
-    return Positions(points_m, headings_rad, covariances, chi2, modes_m, noise_m2, np.sqrt(spread[:, 2, 2]))
+    return LevelPositions(
+        points_m, headings_rad, covariances, chi2, modes_m, noise_m2, np.sqrt(spread[:, 2, 2])
+    )
 
 
 class CornerSlopes(NamedTuple):

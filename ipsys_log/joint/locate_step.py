@@ -9,8 +9,7 @@ import numpy as np
 
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.locate import Positions as LocatedMarkers
-from ipsys_log.joint.locate import locate_markers
+from ipsys_log.joint.locate import LevelPositions, locate_markers
 from ipsys_log.joint.locate_poses import Poses, hold_heights, locate_poses
 from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import restore_joint
@@ -123,7 +122,7 @@ class LocateCorners:
         return _rows(locate_poses(camera, *_corners(markers), lengths_m), MOST_CHI2_OF_POSE)
 
 
-def _rows(located: LocatedMarkers | Poses, most_chi2: float) -> list[_Located]:
+def _rows(located: LevelPositions | Poses, most_chi2: float) -> list[_Located]:
     """Return the rows of located markers; residuals above ``most_chi2`` are unusual."""
     columns = (
         located.points_m,

@@ -20,9 +20,11 @@ from ipsys_log.joint.trajectories import Kind
 _CANDIDATES = 12
 # With so many candidates between the neighbours of the last time, three searches find one of 400 sightings.
 _SEARCHES = 3
-# On either side of the time there are at least two sightings of stationary markers, or ten of moving ones.
-# The last sightings of a robot often show how it is lifted from the floor.
-_STATIONARY, _LEAST = 5, 10
+# On either side of the time there are at least ten sightings of moving markers: the last sightings of a robot
+# often show how it is lifted from the floor.
+_LEAST = 10
+# A sighting of a stationary marker counts as so many.
+_STATIONARY = 5
 # A camera without motion exceeds this chi2, with six degrees of freedom, once in a million sessions. Right
 # row times exceed it less often: they have one degree of freedom for each camera.
 _CONTRADICTED = 60.0
@@ -30,8 +32,10 @@ _CONTRADICTED = 60.0
 _POSE = 6
 # A larger turn is that of a few outliers, which any pose explains.
 _MOST_TURN_RAD = 0.17
-# A factor on the limits of the loss with which no residual is an outlier; rounding errors of a cost.
-_NO_LIMIT, _SAME_COST = 1e12, 1e-9
+# A factor on the limits of the loss with which no residual is an outlier.
+_NO_LIMIT = 1e12
+# Rounding errors of a cost.
+_SAME_COST = 1e-9
 
 
 class CameraMotion(NamedTuple):

@@ -18,14 +18,19 @@ from ipsys_log.joint.trajectories import Paths, Trajectories
 
 # A longer time without sightings divides a path.
 _GAP_S = 1.0
-_LEAST_SIGHTINGS, _LEAST_S = 8, 0.5
-# Time between knots, in intervals between the frames of a camera, and its limits.
+# A part of a path with fewer sightings, or shorter, is left out.
+_LEAST_SIGHTINGS = 8
+_LEAST_S = 0.5
+# Time between knots, in intervals between the frames of a camera,
 _FRAMES_PER_KNOT = 1.0
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.09, 0.25
+# and its limits.
+_SHORTEST_STEP_S = 0.09
+_LONGEST_STEP_S = 0.25
 # The path continues this long before and after its sightings, because clocks have offsets.
 _PAD_S = 0.25
 # Errors of a place and of a heading from one marker and rough camera poses.
-_PLACE_M, _HEADING_RAD = 0.01, 0.02
+_PLACE_M = 0.01
+_HEADING_RAD = 0.02
 _ROUNDS = 4
 # In a hall, a longer part of a path is divided. A robot passes only a few cameras in this time, and its place
 # at a cut is known from their sightings alone.

@@ -17,7 +17,9 @@ from ipsys_log.joint.parameters import State
 from ipsys_log.joint.problem import Problem
 
 _FIRST_DAMPING = 1e-4
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
+# Limits of the damping.
+_LEAST_DAMPING = 1e-12
+_MOST_DAMPING = 1e8
 _MOST_STEPS = 200
 # Share of the standard deviation: the optimum is exact to a thousandth of its uncertainty.
 SHORT = 1e-3
@@ -36,9 +38,14 @@ _NOT_CONVERGED = (
 )
 # The strict loss; before it, fits move fast.
 _STRICT = 1.0
-_LEAST_LEAP_DAMPING, _MOST_LEAP_DAMPING, _MORE_LEAP_DAMPING = 1e-12, 1e-2, 10.0
-# Steps back to the bottom of the valley. Each must halve the excess of the cost.
-_RETURN_STEPS, _RETURNING = 5, 0.5
+# Dampings of a leap, from the least to the most by this factor: the least one that leads on is taken.
+_LEAST_LEAP_DAMPING = 1e-12
+_MOST_LEAP_DAMPING = 1e-2
+_MORE_LEAP_DAMPING = 10.0
+# Steps back to the bottom of the valley.
+_RETURN_STEPS = 5
+# Each must halve the excess of the cost.
+_RETURNING = 0.5
 # A decrease of this size is that of rounding errors.
 _ROUNDING = 1e-6
 # Residuals of readings above this many standard deviations get less weight.

@@ -27,15 +27,19 @@ WRONG_NUMBER = _MISTAKE + 2 * float(np.log(300.0))
 _AS_PROBABLE = _MISTAKE
 # Explanations that move no point farther than this are the same.
 _SAME_M = 0.02
-# Error of a shape that is turned by two of its points alone: 1 cm, and 1 % for its scale.
-_ROUGH_M, _ROUGH_SCALE = 0.02, 0.01
+# Error of a shape that is turned by two of its points alone: a length,
+_ROUGH_M = 0.02
+# and a share of it by its scale.
+_ROUGH_SCALE = 0.01
 # The farthest pairs of points are enough to find the right motion.
 _MOST_PAIRS = 80
 # Explanations that are fitted exactly.
 _MOST_EXACT = 6
 _ROUNDS = 3
-# A side contradicts the cameras if the point is this far beyond the line, in m and in standard deviations.
-_BEYOND_M, _BEYOND = 0.005, 4.5
+# A side contradicts the cameras if the point is this far beyond the line,
+_BEYOND_M = 0.005
+# also in standard deviations.
+_BEYOND = 4.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

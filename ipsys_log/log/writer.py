@@ -193,11 +193,6 @@ class LogWriter:
         """The descriptor of the file until it is closed."""
         return self._output.fd
 
-    def follow(self, path: Path) -> None:
-        """Take the new name of a new log that another program has renamed."""
-        if isinstance(self._output, NewFile):
-            self.path = self._output.path = path
-
     def add_channel(
         self,
         topic: str,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ipsys_log.messages.message import TimeNs
@@ -54,6 +55,11 @@ class Event:
     start: TimeNs | None = None
     end: TimeNs | None = None
     segment: str | None = None
+
+
+def skipped_frames(events: Iterable[Event]) -> set[int]:
+    """Return the log times in ns of the frames that live processing skipped."""
+    return {event.timestamp for event in events if event.kind == FRAME_SKIPPED}
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,6 +128,11 @@ def reads_corners(name: str) -> bool:
     return name in CORNER_MODELS
 
 
+def model_run(name: str) -> str:
+    """Return the name of the run of a model, unless it is taken."""
+    return name.replace("+", "_").replace("-", "_")
+
+
 def create(name: str) -> Any:
     """Return an unfitted estimator by its name in :data:`MODELS`.
 

@@ -25,10 +25,10 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
 from ipsys_log.models.table import is_known, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import cm
 from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
-from ipsys_log.units import CM_PER_M
 
 
 class ErrorRow(NamedTuple):
@@ -162,7 +162,7 @@ def _uses_heights(session: Session, run: str) -> bool:
 
 
 def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
-    """Return the summary as plain data, in cm.
+    """Return the summary as plain data, in m.
 
     ``models -> cameras -> 3d / 2d`` are the errors on held-out points. Each camera may also have
     ``cross_validation`` and ``truth``. ``pooled`` has the same over all cameras. ``recommendation`` exists
@@ -179,10 +179,10 @@ def _model_json(accuracy: Accuracy) -> dict[str, Any]:
     summary: dict[str, Any] = {"run": accuracy.run, **_rows_json(accuracy, rows)}
     if accuracy.evaluation is not None:
         summary["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
-        summary["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
+        summary["suspects"] = plain(accuracy.evaluation.suspects)
         if accuracy.evaluation.excluded:
             rows = (*accuracy.rows_with_excluded(False), *accuracy.rows_with_excluded(True))
-            summary["excluded"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.excluded]
+            summary["excluded"] = plain(accuracy.evaluation.excluded)
             summary["with_excluded"] = _rows_json(accuracy, rows)
     if accuracy.tracks is not None:
         summary["tracks"] = _tracks_json(accuracy.tracks) | _trajectories_json(accuracy.trajectories)
@@ -204,18 +204,12 @@ def _rows_json(accuracy: Accuracy, rows: Sequence[CameraEvaluation]) -> dict[str
 
 def _tracks_json(tracks: TrackErrors) -> dict[str, Any]:
     """Return the errors at the instants that count, at the others, and at all; one of them may be missing."""
-
-    def both(space: ErrorStatistics, floor: ErrorStatistics) -> dict[str, Any]:
-        return {
-            "3d": _statistics(space, root_mean_square_m(space)),
-            "2d": _statistics(floor, root_mean_square_m(floor)),
-        }
-
     instants = {"counted": tracks.counted, "all": tracks.instants}
-    summary: dict[str, Any] = {"truth": both(tracks.space, tracks.floor), "instants": instants}
+    pairs = {"truth": (tracks.space, tracks.floor)}
     if tracks.others is not None:
-        summary |= {"other_heights": both(*tracks.others), "all_heights": both(*tracks.whole)}
-    return summary
+        pairs |= {"other_heights": tracks.others, "all_heights": tracks.whole}
+    rows = {name: ErrorRow(POOLED, "truth", *pair) for name, pair in pairs.items()}
+    return {"instants": instants, **{name: _errors_json(row) for name, row in rows.items()}}
 
 
 def _trajectories_json(trajectories: Sequence[TrajectoryErrors]) -> dict[str, Any]:
@@ -227,71 +221,42 @@ def _trajectories_json(trajectories: Sequence[TrajectoryErrors]) -> dict[str, An
 
 
 def _trajectory_json(trajectory: TrajectoryErrors) -> dict[str, Any]:
-    absolute = {"3d": trajectory.absolute_3d, "2d": trajectory.absolute_2d}
     return {
-        "ate": {name: _statistics(errors, root_mean_square_m(errors)) for name, errors in absolute.items()},
+        "ate": _errors_json(ErrorRow(POOLED, "truth", trajectory.absolute_3d, trajectory.absolute_2d)),
         "rpe": [
-            {
-                "delta": one.delta,
-                "unit": one.unit,
-                "relation": one.relation,
-                **_statistics(one.summary, root_mean_square_m(one.summary)),
-            }
+            {"delta": one.delta, "unit": one.unit, "relation": one.relation, **_statistics(one.summary, 1)}
             for one in trajectory.relative
         ],
     }
 
 
 def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:
-    summary: dict[str, Any] = {}
-    if row.error_3d is not None:
-        summary["3d"] = _statistics(row.error_3d, accuracy.errors_of(row).rmse_m(row.error_3d))
-    summary["2d"] = _statistics(row.error_2d, accuracy.errors_of(row).rmse_m(row.error_2d))
-    if row.bias_m is not None:
-        summary["bias_cm"] = (row.bias_m * CM_PER_M).tolist()
-    if row.within_68 is not None and row.within_95 is not None:
-        summary["within"] = {"68": row.within_68, "95": row.within_95}
-    return summary
+    within = None if row.within_68 is None else {"68": row.within_68, "95": row.within_95}
+    return _errors_json(accuracy.errors_of(row)) | dict(plain({"bias_m": row.bias_m, "within": within}))
 
 
-def _statistics(errors: ErrorStatistics, rmse_m: float | None) -> dict[str, float | int]:
-    values = {
-        "mean_cm": errors.mean_m,
-        "rmse_cm": rmse_m,
-        "min_cm": errors.min_m,
-        "max_cm": errors.max_m,
-        "std_cm": errors.std_m,
-        "median_cm": errors.median_m,
-        "p95_cm": errors.p95_m,
-        "mean_low_cm": errors.mean_low_m,
-        "mean_high_cm": errors.mean_high_m,
-    }
-    values_cm: dict[str, float | int] = {k: v * CM_PER_M for k, v in values.items() if v is not None}
-    return {**values_cm, **remaining_json(errors), "n": errors.count}
+def _errors_json(row: ErrorRow) -> dict[str, Any]:
+    """Return the statistics and the RMSE of errors in space, if they are known, and on the floor."""
+    kinds = {name: errors for name, errors in (("3d", row.space), ("2d", row.floor)) if errors is not None}
+    return {name: _statistics(errors, row.repeats) for name, errors in kinds.items()}
 
 
-def remaining_json(errors: ErrorStatistics) -> dict[str, float]:
-    """Return the mean error after the stated error of the tape, in cm; empty if it is not known."""
-    values = {
-        "remaining_cm": errors.remaining_m,
-        "remaining_low_cm": errors.remaining_low_m,
-        "remaining_high_cm": errors.remaining_high_m,
-    }
-    return {name: value_m * CM_PER_M for name, value_m in values.items() if value_m is not None}
+def _statistics(errors: ErrorStatistics, repeats: int | None) -> dict[str, Any]:
+    rmse = {} if repeats is None else {"rmse_m": root_mean_square_m(errors, repeats)}
+    return {**plain(errors), **rmse}
 
 
-def _learning_json(point: LearningPoint) -> dict[str, Any]:
-    summary: dict[str, Any] = {"camera": point.camera, "pairs": point.pairs, "subsets": point.subsets}
-    if point.label is not None:
-        summary["label"] = point.label
-    for kind, mean_m, std_m in (
-        ("3d", point.mean_3d_m, point.std_3d_m),
-        ("2d", point.mean_2d_m, point.std_2d_m),
-    ):
-        summary[kind] = {"mean_cm": mean_m * CM_PER_M}
-        if std_m is not None:
-            summary[kind]["std_cm"] = std_m * CM_PER_M
-    return summary
+def _learning_json(point: LearningPoint) -> Any:
+    return plain(
+        {
+            "camera": point.camera,
+            "pairs": point.pairs,
+            "subsets": point.subsets,
+            "label": point.label,
+            "3d": {"mean_m": point.mean_3d_m, "std_m": point.std_3d_m},
+            "2d": {"mean_m": point.mean_2d_m, "std_m": point.std_2d_m},
+        }
+    )
 
 
 def _advice_json(advice: Advice) -> dict[str, Any]:
@@ -310,26 +275,10 @@ def _advice_json(advice: Advice) -> dict[str, Any]:
 def _choice_json(choice: Choice) -> dict[str, Any]:
     return {
         "use": choice.model,
-        "mean_cm": choice.mean_m * CM_PER_M,
+        "mean_m": choice.mean_m,
         "lowest": choice.lowest,
-        "lowest_mean_cm": choice.lowest_mean_m * CM_PER_M,
+        "lowest_mean_m": choice.lowest_mean_m,
     }
-
-
-def _suspect_json(suspect: Suspect) -> dict[str, Any]:
-    summary: dict[str, Any] = {
-        "measurement": suspect.measurement,
-        "cameras": list(suspect.cameras),
-        "residual_cm": (suspect.residual_m * CM_PER_M).tolist(),
-        "score": suspect.score,
-    }
-    if suspect.kind is not None:
-        summary["kind"] = suspect.kind
-    if suspect.text is not None:
-        summary["text"] = suspect.text
-    if suspect.corrected_m is not None:
-        summary["corrected_m"] = suspect.corrected_m.tolist()
-    return summary
 
 
 def gather_outliers(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:

@@ -16,8 +16,7 @@ from ipsys_log.analysis.coverage import FloorCoverage
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.report.alignment import AlignedLab
-from ipsys_log.report.figures import figure_bytes, legend_label, name_cameras
-from ipsys_log.report.files import write_files
+from ipsys_log.report.figures import add_panel, legend_label, name_cameras, save_figure
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.units import CM_PER_M
@@ -50,7 +49,7 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
     size = (left_in + columns * (_PANEL_IN + _GAP_IN), 0.3 + _ROW_IN * rows)
     figure = Figure(figsize=size, dpi=_DPI)
     if lab.coverage is not None:
-        axes = figure.add_axes((0.65 / size[0], 1.0 / size[1], _FLOOR_IN / size[0], _FLOOR_IN / size[1]))
+        axes = add_panel(figure, 0.65, 1.0, _FLOOR_IN, _FLOOR_IN)
         _draw_floor(axes, lab, lab.coverage)
         handles, labels = axes.get_legend_handles_labels()
         location = (0.5 / size[0], 0.05 / size[1])
@@ -58,10 +57,9 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
     for number, alignment in enumerate(lab.alignments):
         column, row = divmod(number, _ROWS)
         x_in, y_in = left_in + column * (_PANEL_IN + _GAP_IN), size[1] - 0.15 - (row + 1) * _ROW_IN
-        height_in = _PANEL_IN * 9 / 16
-        box = (x_in / size[0], y_in / size[1], _PANEL_IN / size[0], height_in / size[1])
-        _draw_picture(figure.add_axes(box), alignment, lab.lenses)
-    write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
+        panel = add_panel(figure, x_in, y_in, _PANEL_IN, _PANEL_IN * 9 / 16)
+        _draw_picture(panel, alignment, lab.lenses)
+    save_figure(figure, path)
 
 
 def _draw_floor(axes: Axes, lab: AlignedLab, coverage: FloorCoverage) -> None:

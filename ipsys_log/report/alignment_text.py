@@ -11,6 +11,7 @@ from rich.text import Text
 from ipsys_log.analysis.alignment import LEVEL_M, Alignment
 from ipsys_log.analysis.coverage import FloorCoverage, Overlap, Patch
 from ipsys_log.report.alignment import AlignedLab
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import Rows, cm
 from ipsys_log.units import CM_PER_M
 
@@ -148,17 +149,24 @@ def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[st
 
 def alignment_json(lab: AlignedLab) -> dict[str, Any]:
     """Return the alignment as plain data; None for unknown values."""
+    coverage = lab.coverage
     return {
         "run": lab.run,
-        "level_below_cm": LEVEL_M * CM_PER_M,
+        "level_below_m": LEVEL_M,
         "cameras": [_camera_json(alignment) for alignment in lab.alignments],
-        "coverage": None if lab.coverage is None else _coverage_json(lab.coverage),
+        "coverage": None
+        if coverage is None
+        else {
+            "marker_height_m": coverage.height_m,
+            "unseen": plain(coverage.unseen),
+            "whole_in_no_picture": plain(coverage.gaps),
+        },
         "marker_diagonal_m": lab.diagonal_m,
         "overlaps": [
             {
                 "cameras": list(overlap.cameras),
                 "width_m": overlap.width_m,
-                "at_m": None if lab.coverage is None else overlap.at_m.tolist(),
+                "at_m": None if coverage is None else overlap.at_m.tolist(),
                 "enough": overlap.width_m >= lab.diagonal_m,
             }
             for overlap in lab.overlaps
@@ -168,39 +176,22 @@ def alignment_json(lab: AlignedLab) -> dict[str, Any]:
 
 
 def _camera_json(one: Alignment) -> dict[str, Any]:
-    right_rad, bottom_rad = one.turns_rad
-    is_known = one.down is not None
+    right_rad, bottom_rad = one.turns_rad if one.down is not None else (None, None)
     return {
         "camera": one.camera,
         "places": len(one.floor_markers),
         "markers": sorted({marker.marker_id for marker in one.floor_markers}),
         "raised": [
-            {"marker": marker.marker_id, "above_cm": m * CM_PER_M} for marker, m in one.raised_markers
+            {"marker": marker.marker_id, "above_m": above_m} for marker, above_m in one.raised_markers
         ],
-        "spread_cm": _scaled(one.spread_m, CM_PER_M),
-        "spread_after_cm": _scaled(one.remaining_m, CM_PER_M),
+        "spread_m": one.spread_m,
+        "spread_after_m": one.remaining_m,
         "level": one.level,
-        "tilt_deg": _scaled(one.tilt_rad, math.degrees(1)),
-        "tilt_sigma_deg": _scaled(one.sigma_rad, math.degrees(1)),
-        "look_further_right_deg": math.degrees(right_rad) if is_known else None,
-        "look_further_down_deg": math.degrees(bottom_rad) if is_known else None,
+        "tilt_rad": one.tilt_rad,
+        "tilt_sigma_rad": one.sigma_rad,
+        "look_further_right_rad": right_rad,
+        "look_further_down_rad": bottom_rad,
         "known_directions": one.axes,
         "height_m": one.height_m,
         "advice": advise(one),
     }
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
-
-
-def _coverage_json(coverage: FloorCoverage) -> dict[str, Any]:
-    return {
-        "marker_height_m": coverage.height_m,
-        "unseen": [_patch_json(patch) for patch in coverage.unseen],
-        "whole_in_no_picture": [_patch_json(patch) for patch in coverage.gaps],
-    }
-
-
-def _patch_json(patch: Patch) -> dict[str, Any]:
-    return {"area_m2": patch.area_m2, "low_m": patch.low_m.tolist(), "high_m": patch.high_m.tolist()}

@@ -9,6 +9,7 @@ from typing import Any
 
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.calibration.image_selection import ExcludedSighting
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import Rows, counted, mm
 
 _SHOWN_DROPPED = 6
@@ -89,9 +90,9 @@ def calibration_json(found: CalibrationResult) -> dict[str, Any]:
             "looked_at": found.examined_count,
             "seen": found.seen,
             "used": [{"name": name, "rms_px": rms_px} for name, rms_px in found.used],
-            "dropped": [drop._asdict() for drop in found.dropped],
-            "not_needed": [drop._asdict() for drop in found.spare],
-            "not_seen": [drop._asdict() for drop in found.unseen],
+            "dropped": plain(found.dropped),
+            "not_needed": plain(found.spare),
+            "not_seen": plain(found.unseen),
         },
         "coverage": {
             "share": coverage.share,

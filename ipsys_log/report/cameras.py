@@ -16,7 +16,7 @@ from ipsys_log.analysis.differences import Comparison
 from ipsys_log.analysis.latency import Percentiles
 from ipsys_log.analysis.overlap_stream import OverlapSummary
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.disk import DiskRoom, RecordedFile
+from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
 from ipsys_log.plain_text import plain_text
@@ -40,9 +40,6 @@ class LiveStatus:
     expected_bytes_per_s : growth of the log, until it can be measured; None if it does not grow with time.
     say : called once, with the path of the log, when the first frame is in the file.
 
-    Attributes
-    ----------
-    log : after :meth:`close`, the path of the log; another program may have renamed it.
     """
 
     def __init__(
@@ -54,9 +51,7 @@ class LiveStatus:
         expected_bytes_per_s: float | None = None,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        self._states, self._monitor, self._target, self._now_s = states, monitor, target, now_s
-        self.log, self._size = target, 0
-        self._file: RecordedFile | None = None
+        self._states, self._monitor, self.log, self._now_s = states, monitor, target, now_s
         self._begin_s = now_s()
         self._say, self._size_with_frame = say, 0
         self._span_ns: tuple[int, int] | None = None
@@ -83,25 +78,18 @@ class LiveStatus:
 
     def _announce(self, message: Message) -> None:
         """Report the recording as soon as the file has grown by the first frame."""
-        file = self._open_log()
-        if self._say is None or file is None:
+        if self._say is None:
             return
-        if self._size_with_frame and file.size >= self._size_with_frame:
-            self._say(f"recording into {self._target}; Ctrl-C to end")
+        size = self._size()
+        if self._size_with_frame and size >= self._size_with_frame:
+            self._say(f"recording into {self.log}; Ctrl-C to end")
             self._say = None
         elif not self._size_with_frame:
             frame = message.payload
             if isinstance(frame, (CompressedImage, CompressedVideo)):
-                self._size_with_frame = file.size + len(frame.data)
+                self._size_with_frame = size + len(frame.data)
             elif isinstance(frame, Markers):
-                self._size_with_frame = file.size + 1
-
-    def close(self) -> None:
-        """Note the path and the size of the finished log."""
-        if self._file is not None:
-            self.log, self._size = self._file.find() or self._target, self._file.size
-            self._file.close()
-            self._file = None
+                self._size_with_frame = size + 1
 
     def show(self) -> Group:
         """Return the display: cameras, robots, warnings on cameras, and the disk."""
@@ -119,9 +107,8 @@ class LiveStatus:
 
     def _disk(self, took_s: float) -> Text:
         """Return the size of the log, and how long the disk lasts at its measured growth."""
-        file = self._open_log()
-        size = 0 if file is None else file.size
-        folder = self._target.absolute().parent
+        size = self._size()
+        folder = self.log.absolute().parent
         free = shutil.disk_usage(folder).free
         line = f"{took_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
         if self._expected_bytes_per_s is None:
@@ -134,17 +121,18 @@ class LiveStatus:
             style="bold red" if room.is_short() else "",
         )
 
-    def _open_log(self) -> RecordedFile | None:
-        """Return the open log, which another program may rename; None before it exists."""
-        if self._file is None:
-            self._file = RecordedFile.open(self._target)
-        return self._file
+    def _size(self) -> int:
+        """Return the size of the log in bytes; 0 before it exists."""
+        try:
+            return self.log.stat().st_size
+        except OSError:
+            return 0
 
     def summary(self) -> list[str]:
         """Return the lines that describe a finished recording."""
         begin_ns, end_ns = self._span_ns or (0, 0)
         span_s = (end_ns - begin_ns) / NS_PER_S
-        lines = [f"{self.log} written: {span_s:.1f} s, {format_bytes(self._size)}"]
+        lines = [f"{self.log} written: {span_s:.1f} s, {format_bytes(self._size())}"]
         for name, state in self._states.items():
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
             missed = f", {state.missed} lost before arrival" if state.missed else ""

@@ -39,7 +39,7 @@ def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
             "marker": stop.marker_id,
             "time_s": round((stop.start_ns - scene.start_ns) / NS_PER_S, 3),
             "start": format_time(stop.start_ns),
-            "seconds": round((stop.end_ns - stop.start_ns) / NS_PER_S, 3),
+            "duration_s": round((stop.end_ns - stop.start_ns) / NS_PER_S, 3),
             "cameras": list(stop.cameras),
             "measured": [m.id for m in active if stop.covers(m)],
         }
@@ -53,7 +53,7 @@ def intervals_table(found: list[dict[str, Any]]) -> Rows:
     cells = [
         [
             str(row["place"]), str(row["marker"]), f"{row['time_s']:.1f}", row["start"][11:19],
-            f"{row['seconds']:.1f}", ", ".join(row["cameras"]), ", ".join(row["measured"]) or "-",
+            f"{row['duration_s']:.1f}", ", ".join(row["cameras"]), ", ".join(row["measured"]) or "-",
         ]
         for row in found
     ]  # fmt: skip

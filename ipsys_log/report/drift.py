@@ -8,13 +8,12 @@ import numpy as np
 
 from ipsys_log.analysis.camera_moves import CameraState, MarkerMove, Move
 from ipsys_log.analysis.drift import LEAST_SHIFT_M, Motion
-from ipsys_log.report.rows import Rows, wrap_text
+from ipsys_log.report.rows import Rows, mm, wrap_text
 from ipsys_log.survey.drift_reading import DriftReading
-from ipsys_log.units import MM_PER_M, format_time
+from ipsys_log.units import format_time
 
 # A normal distribution has 95 % within this many standard deviations.
 _NORMAL_95 = 1.96
-_SEPARATE = "turn {turn:.2f} ({turn_sigma:.2f}) degrees, shift {shift:.1f} ({shift_sigma:.1f}) mm"
 
 
 def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
@@ -23,8 +22,8 @@ def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
     lines = [line for move in drift.moves for line in _move_lines(move)]
     lines += [(_marker_line(move), False) for move in drift.marker_moves]
     if not lines:
-        least_mm = LEAST_SHIFT_M * MM_PER_M
-        lines = [(f"No camera has moved: the mean shift of each floor map is below {least_mm:.1f} mm.", True)]
+        text = f"No camera has moved: the mean shift of each floor map is below {mm(LEAST_SHIFT_M)} mm."
+        lines = [(text, True)]
     return [(wrap_text(text), is_good) for text, is_good in lines]
 
 
@@ -36,13 +35,13 @@ def _marker_line(move: MarkerMove) -> str:
 
 
 def _move_lines(move: Move) -> list[tuple[str, bool]]:
-    low_mm, high_mm = _band_mm(move.motion)
+    low, high = map(mm, _band_m(move.motion))
     when = f"between {format_time(move.before_ns)[:19]} and {format_time(move.after_ns)[:19]} UTC"
     logs = f"in {move.after}" if move.before == move.after else f"after {move.before}, before {move.after}"
     how = "gradually " if move.gradual else ""
     text = (
         f"Camera {move.camera} moved {how}{when} ({logs}). The mean shift of its floor map is "
-        f"{move.motion.mean_shift_m * MM_PER_M:.1f} mm (95 % band {low_mm:.1f} to {high_mm:.1f} mm)."
+        f"{mm(move.motion.mean_shift_m)} mm (95 % band {low} to {high} mm)."
     )
     lines = [(text, False)]
     if move.motion.is_unclear or len(move.motion.markers) == 1:
@@ -56,33 +55,22 @@ def _move_lines(move: Move) -> list[tuple[str, bool]]:
     return lines
 
 
-def _band_mm(motion: Motion) -> tuple[float, float]:
+def _band_m(motion: Motion) -> tuple[float, float]:
     half_m = _NORMAL_95 * motion.sigma_m
-    return (
-        max(motion.mean_shift_m - half_m, 0.0) * MM_PER_M,
-        (motion.mean_shift_m + half_m) * MM_PER_M,
-    )
-
-
-def _lengths(motion: Motion) -> dict[str, float]:
-    """Return the lengths of turn and shift in rad and m, and their standard deviations."""
-    lengths = {}
-    for name, part in (("turn", slice(0, 3)), ("shift", slice(3, 6))):
-        vector, covariance = motion.motion[part], motion.covariance[part, part]
-        length = float(np.linalg.norm(vector))
-        unit = vector / length if length else np.zeros(3)
-        lengths[name], lengths[f"{name}_sigma"] = length, float(np.sqrt(unit @ covariance @ unit))
-    return lengths
+    return max(motion.mean_shift_m - half_m, 0.0), motion.mean_shift_m + half_m
 
 
 def _split_text(motion: Motion) -> str:
-    lengths = _lengths(motion)
-    return _SEPARATE.format(
-        turn=np.degrees(lengths["turn"]),
-        turn_sigma=np.degrees(lengths["turn_sigma"]),
-        shift=lengths["shift"] * MM_PER_M,
-        shift_sigma=lengths["shift_sigma"] * MM_PER_M,
-    )
+    """Return the lengths of turn and shift as text, each with its standard deviation in brackets."""
+    lengths = []
+    for part in (slice(0, 3), slice(3, 6)):
+        vector, covariance = motion.motion[part], motion.covariance[part, part]
+        length = float(np.linalg.norm(vector))
+        unit = vector / length if length else np.zeros(3)
+        lengths += [length, float(np.sqrt(unit @ covariance @ unit))]
+    turn, turn_sigma, shift, shift_sigma = lengths
+    degrees = f"turn {np.degrees(turn):.2f} ({np.degrees(turn_sigma):.2f}) degrees"
+    return f"{degrees}, shift {mm(shift)} ({mm(shift_sigma)}) mm"
 
 
 def drift_table(reading: DriftReading) -> Rows:
@@ -101,8 +89,8 @@ def drift_table(reading: DriftReading) -> Rows:
 def _cell(state: CameraState | None) -> str:
     if state is None or state.motion is None:
         return "-"
-    low_mm, high_mm = _band_mm(state.motion)
-    return f"{state.motion.mean_shift_m * MM_PER_M:.1f} ({low_mm:.1f}-{high_mm:.1f})"
+    low, high = map(mm, _band_m(state.motion))
+    return f"{mm(state.motion.mean_shift_m)} ({low}-{high})"
 
 
 def drift_json(reading: DriftReading) -> dict[str, Any]:
@@ -136,12 +124,12 @@ def drift_json(reading: DriftReading) -> dict[str, Any]:
 
 
 def _motion_json(motion: Motion) -> dict[str, Any]:
-    half_m = _NORMAL_95 * motion.sigma_m
+    low_m, high_m = _band_m(motion)
     result: dict[str, Any] = {
         "moved": motion.is_moved,
         "mean_shift_m": motion.mean_shift_m,
-        "low_m": max(motion.mean_shift_m - half_m, 0.0),
-        "high_m": motion.mean_shift_m + half_m,
+        "low_m": low_m,
+        "high_m": high_m,
         "markers": list(motion.markers),
         "unclear": motion.is_unclear,
     }

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 
 from ipsys_log.analysis.camera_moves import CameraState
 from ipsys_log.analysis.drift import LEAST_SHIFT_M
-from ipsys_log.report.figures import figure_bytes, style_axes
-from ipsys_log.report.files import write_files
+from ipsys_log.report.figures import save_figure, style_axes
 from ipsys_log.report.styles import NOTE, camera_styles, shorten
 from ipsys_log.survey.drift_reading import DriftReading
 from ipsys_log.units import MM_PER_M, NS_PER_S
@@ -56,7 +55,7 @@ def draw_drift(reading: DriftReading, path: Path) -> None:
     style_axes(axes)
     columns = -(-len(drift.baselines) // _ROWS)
     axes.legend(loc="upper left", fontsize=9 if columns == 1 else 7, ncols=columns, frameon=False)
-    write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
+    save_figure(figure, path)
 
 
 def _draw_camera(axes: Axes, camera: str, states: Sequence[CameraState], style: tuple[str, str]) -> None:

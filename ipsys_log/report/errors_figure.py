@@ -14,9 +14,11 @@ from matplotlib.transforms import Transform, blended_transform_factory
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
-from ipsys_log.analysis.ground_truth import TrackErrors
 from ipsys_log.messages import ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.figures import add_panel
+from ipsys_log.report.findings import in_space
+from ipsys_log.report.rows import cm
 from ipsys_log.units import CM_PER_M
 
 _TRACKS = "tracks"
@@ -43,14 +45,9 @@ class _Row:
     statistics: ErrorStatistics
 
 
-def _in_space(accuracies: Sequence[Accuracy]) -> bool:
-    """Return whether the errors are in space; they are on the floor if heights cannot be learned."""
-    return all(row.error_3d is not None for accuracy in accuracies for row in accuracy.rows(False))
-
-
 def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
     rows = []
-    in_space = _in_space(accuracies)
+    space = in_space(accuracies)
     for accuracy in accuracies:
         evaluation = accuracy.evaluation
         model = evaluation.model if evaluation else accuracy.run
@@ -61,22 +58,26 @@ def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
             else f"{model} ({accuracy.run})"
         )
         for row in accuracy.rows(False):
-            errors = row.error_3d if in_space else row.error_2d
+            errors = row.error_3d if space else row.error_2d
             if row.camera == POOLED or errors is None:
                 continue
             offsets_m = np.array([r.predicted_m - r.world_m for r in row.residuals]).reshape(-1, 3)
-            errors_cm = np.linalg.norm(offsets_m[:, : 3 if in_space else 2], axis=1) * CM_PER_M
+            errors_cm = np.linalg.norm(offsets_m[:, : 3 if space else 2], axis=1) * CM_PER_M
             rows.append(_Row(name, row.camera, row.against, errors_cm, errors))
         if accuracy.tracks is not None:
-            rows.append(_Row(name, _TRACKS, "truth", np.zeros(0), _errors(accuracy.tracks, in_space)))
+            rows.append(
+                _Row(
+                    name,
+                    _TRACKS,
+                    "truth",
+                    np.zeros(0),
+                    accuracy.tracks.space if space else accuracy.tracks.floor,
+                )
+            )
             if accuracy.tracks.others is not None:
-                others = accuracy.tracks.others[0 if in_space else 1]
+                others = accuracy.tracks.others[0 if space else 1]
                 rows.append(_Row(name, _OTHER_HEIGHTS, "truth", np.zeros(0), others))
     return rows
-
-
-def _errors(tracks: TrackErrors, in_space: bool) -> ErrorStatistics:
-    return tracks.space if in_space else tracks.floor
 
 
 def count_rows(accuracies: Sequence[Accuracy]) -> int:
@@ -116,7 +117,7 @@ def draw_errors(
     axes.set_yticks(heights, [_name(row) for row in rows], fontsize=size)
     _name_models(axes, rows, heights, size, bar_in)
     _print_figures(axes, rows, heights, size)
-    kind = "3D" if _in_space(accuracies) else "2D"
+    kind = "3D" if in_space(accuracies) else "2D"
     axes.set_title(f"{kind} errors at held-out points", loc="left", fontsize=10, pad=size + 12)
     axes.annotate(
         _note(rows), (0, 0), (0, -38), xycoords="axes fraction", textcoords="offset points", fontsize=8,
@@ -134,12 +135,9 @@ def _name_widths(rows: Sequence[_Row], size: float) -> tuple[float, float]:
 
 def _add_axes(figure: Figure, left_in: float, top_in: float, high_in: float) -> Axes:
     """Add axes that end at the columns of numbers, for names of any length."""
-    width, height = figure.get_size_inches()
     left_in = min(left_in, _RIGHT_IN - _LEAST_IN)
-    low_in = height - top_in - high_in
-    axes = figure.add_axes(
-        (left_in / width, low_in / height, (_RIGHT_IN - left_in) / width, high_in / height)
-    )
+    low_in = figure.get_size_inches()[1] - top_in - high_in
+    axes = add_panel(figure, left_in, low_in, _RIGHT_IN - left_in, high_in)
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x", color="#E6E6E6", lw=0.7)
     axes.set_axisbelow(True)
@@ -229,22 +227,9 @@ def _print_figures(axes: Axes, rows: Sequence[_Row], heights: Sequence[float], s
         axes.text(x, -0.9, title, transform=beside, fontsize=size, color="#505050", ha="right", va="bottom")
     for y, row in zip(heights, rows, strict=True):
         statistics = row.statistics
-        values_m = {"mean": statistics.mean_m, "std": statistics.std_m, "max": statistics.max_m}
-        cells = {name: "-" if m is None else _figure(m * CM_PER_M) for name, m in values_m.items()}
-        for name, text in {**cells, "n": str(statistics.count)}.items():
-            weight = "bold" if name == "mean" else "normal"
+        lengths = map(cm, (statistics.mean_m, statistics.std_m, statistics.max_m))
+        for (name, x), text in zip(_COLUMNS_IN.items(), (*lengths, str(statistics.count)), strict=True):
             axes.text(
-                _COLUMNS_IN[name],
-                y,
-                text,
-                transform=beside,
-                fontsize=size,
-                ha="right",
-                va="center",
-                weight=weight,
-            )
-
-
-def _figure(value_cm: float) -> str:
-    """Format a value with two decimals, as in the paper, or with none if the column is too narrow."""
-    return f"{value_cm:.2f}" if value_cm < 100 else f"{value_cm:.0f}"
+                x, y, text, transform=beside, fontsize=size, ha="right", va="center",
+                weight="bold" if name == "mean" else "normal",
+            )  # fmt: skip

@@ -10,15 +10,24 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 
+from ipsys_log.report.files import write_files
 from ipsys_log.report.styles import GRID, shorten
 
 _DPI = 150
+# Colours from pale (small error) to dark (large error), readable with any colour vision.
+ERROR_COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
+# The width of a page on a phone.
+PAGE_IN = 4.7
 # Options that leave out the time of writing.
 _WITHOUT: dict[str, dict[str, object]] = {
     "pdf": {"metadata": {"Creator": None, "Producer": None, "CreationDate": None}},
@@ -62,6 +71,33 @@ def _saved(figure: Figure, **how: object) -> bytes:
         warnings.filterwarnings("ignore", message="Glyph")
         figure.savefig(buffer, **how)  # type: ignore[arg-type]
     return buffer.getvalue()
+
+
+def save_figure(figure: Figure, path: Path, dpi: int = 100) -> None:
+    """Write a figure into a file; an existing file is replaced. The suffix gives the file format."""
+    write_files(path.parent, {path.name: figure_bytes(figure, path, dpi)})
+
+
+def new_figure(height_in: float) -> tuple[Figure, Axes]:
+    """Return a figure as wide as a phone, with its axes."""
+    figure = Figure(figsize=(PAGE_IN, height_in), layout="constrained")
+    axes = figure.add_subplot()
+    axes.tick_params(labelsize=8)
+    return figure, axes
+
+
+def add_panel(figure: Figure, left_in: float, low_in: float, width_in: float, height_in: float) -> Axes:
+    """Return new axes at a place in inches from the bottom left of a figure."""
+    width, height = figure.get_size_inches()
+    return figure.add_axes((left_in / width, low_in / height, width_in / width, height_in / height))
+
+
+def add_bar(figure: Figure, shades: ScalarMappable, axes: Axes, label: str, size: float = 9) -> Colorbar:
+    """Return the colour bar below the axes of a narrow figure."""
+    bar = figure.colorbar(shades, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30)
+    bar.set_label(label, fontsize=size)
+    bar.ax.tick_params(labelsize=8)
+    return bar
 
 
 def style_axes(axes: Axes, grid: str = "both") -> None:

@@ -14,8 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.log.lock import describe_broken_link
-from ipsys_log.messages import CameraEvaluation, ErrorStatistics
-from ipsys_log.report.findings import Findings
+from ipsys_log.report.findings import Findings, errors_in
 from ipsys_log.units import CM_PER_M
 
 # Names of the methods in Tables I and II of the paper.
@@ -43,14 +42,10 @@ def paper_csv(findings: Findings, in_space: bool) -> bytes:
     rows = []
     for accuracy in findings.accuracies:
         by_camera = {row.camera: row for row in accuracy.rows(False) if row.against == "tape"}
-        errors = [_errors(by_camera.get(camera), in_space) for camera in findings.cameras]
+        errors = [errors_in(by_camera.get(camera), in_space) for camera in findings.cameras]
         cells = [_cm(getattr(e, name) if e else None) for name in _FIGURES.values() for e in errors]
         rows.append([accuracy.model, _PAPER_NAMES.get(accuracy.model, ""), *cells])
     return _csv(header, rows)
-
-
-def _errors(row: CameraEvaluation | None, in_space: bool) -> ErrorStatistics | None:
-    return None if row is None else row.error_3d if in_space else row.error_2d
 
 
 _STATISTICS = {

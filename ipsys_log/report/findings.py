@@ -143,6 +143,11 @@ def ranking_errors(row: CameraEvaluation, space: bool) -> ErrorStatistics:
     return row.error_3d if space and row.error_3d is not None else row.error_2d
 
 
+def errors_in(row: CameraEvaluation | None, space: bool) -> ErrorStatistics | None:
+    """Return the errors of a row in space or on the floor; None without them."""
+    return None if row is None else row.error_3d if space else row.error_2d
+
+
 def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
     """Sort models: the lowest mean error first; models with heights as input come last."""
     space = in_space(accuracies)
@@ -156,18 +161,19 @@ def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
 
 def overall_row(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:
     """Return the row over all cameras; with a single camera, return the row of this camera."""
-    rows = [row for row in accuracy.rows(cross_validated) if row.against == against]
-    pooled = [row for row in rows if row.camera == POOLED]
-    return next(iter(pooled or rows), None)
+    return _overall(accuracy.rows(cross_validated), against)
+
+
+def _overall(rows: Sequence[CameraEvaluation], against: str) -> CameraEvaluation | None:
+    rows = [row for row in rows if row.against == against]
+    return next((row for row in rows if row.camera == POOLED), next(iter(rows), None))
 
 
 def overall_row_with_excluded(accuracy: Accuracy, cross_validated: bool) -> CameraEvaluation | None:
     """Return the row over all cameras with the gross outliers; None if no measurement is excluded."""
     if not (accuracy.evaluation and accuracy.evaluation.with_excluded):
         return None
-    rows = [row for row in accuracy.rows_with_excluded(cross_validated) if row.against == "tape"]
-    pooled = [row for row in rows if row.camera == POOLED]
-    return next(iter(pooled or rows), None)
+    return _overall(accuracy.rows_with_excluded(cross_validated), "tape")
 
 
 def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Findings:

@@ -32,8 +32,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.figures import figure_bytes, legend_label, name_cameras
-from ipsys_log.report.files import write_files
+from ipsys_log.report.figures import add_panel, legend_label, name_cameras, save_figure
 from ipsys_log.report.styles import GRID, REST, camera_styles, robot_colour, robot_line, shorten
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import rig_in_force
@@ -277,7 +276,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
     width, height = figure.get_size_inches()
     low_in = height - _TOP_IN - _SIDE_IN
-    axes = figure.add_axes((0.65 / width, low_in / height, _SIDE_IN / width, _SIDE_IN / height))
+    axes = add_panel(figure, 0.65, low_in, _SIDE_IN, _SIDE_IN)
     styles = camera_styles(row.camera for a in accuracies if a.evaluation for row in a.evaluation.cameras)
     draw_floor(axes, scene, styles)
     handles, labels = axes.get_legend_handles_labels()
@@ -287,7 +286,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     )  # fmt: skip
     if rows:
         draw_errors(figure, accuracies, styles, left_in=7.3, top_in=_TOP_IN)
-    write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
+    save_figure(figure, path)
 
 
 def read_floor(session: Session, accuracies: Sequence[Accuracy]) -> FloorData:

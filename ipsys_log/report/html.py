@@ -25,9 +25,9 @@ from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy, read_trajectories
 from ipsys_log.report.cameras import latency_table
 from ipsys_log.report.contents import runs_table, states_json
-from ipsys_log.report.figures import MOST_IN_LEGEND, style_axes
+from ipsys_log.report.figures import MOST_IN_LEGEND, new_figure, style_axes
 from ipsys_log.report.findings import Findings, gather_findings
-from ipsys_log.report.html_figures import new_figure, picture
+from ipsys_log.report.html_figures import picture
 from ipsys_log.report.latency_figure import draw_shares, draw_steps
 from ipsys_log.report.rows import Rows
 from ipsys_log.report.styles import camera_styles, shorten
@@ -62,15 +62,8 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
             f"{session}: no model was evaluated, because no calibration point is held "
             "out; measure more points"
         )
-    environment = Environment(
-        loader=PackageLoader("ipsys_log", "report"),
-        autoescape=True,  # names in a log may hold any text
-        finalize=_plain,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("session.html").render(
+    return render_page(
+        "session.html",
         **_text_values(findings),
         flat=html_sections.weak_points_table(_measured(session, findings)),
         **_figure_values(findings),
@@ -81,6 +74,19 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         commands=_commands(session, findings),
         most_cameras=MOST_IN_LEGEND,
     )
+
+
+def render_page(template: str, **values: Any) -> str:
+    """Return the page of a template; all texts are escaped, because names in a log may hold any text."""
+    environment = Environment(
+        loader=PackageLoader("ipsys_log", "report"),
+        autoescape=True,
+        finalize=_plain,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)
 
 
 def _recording_values(session: Session) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
@@ -15,10 +14,7 @@ from ipsys_log.analysis.disagreement import PairDisagreement, divide_floor, divi
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
 from ipsys_log.report.advice import has_published, label
-from ipsys_log.report.figures import has_legend, style_axes, svg_data_uri
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.floor_figure import draw_ground
-from ipsys_log.report.joint_figures import (
+from ipsys_log.report.calibration_figures import (
     clocks_figure,
     first_residuals,
     has_clocks,
@@ -26,24 +22,26 @@ from ipsys_log.report.joint_figures import (
     residual_limit_px,
     residuals_figure,
 )
+from ipsys_log.report.figures import PAGE_IN, add_bar, has_legend, new_figure, style_axes, svg_data_uri
+from ipsys_log.report.findings import Findings
+from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
 from ipsys_log.report.paper_figures import (
     HELD_OUT,
     draw_models,
     draw_residuals,
-    models_note,
     residual_scale,
     shown_models,
 )
 from ipsys_log.report.points_figure import draw_coverage
 from ipsys_log.report.styles import robot_colour, shorten
+from ipsys_log.report.tables import height_note
 from ipsys_log.report.tracks_figure import draw_tracks, read_drawn_tracks
 from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 
 if TYPE_CHECKING:
     from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 
-_WIDTH_IN = 4.7
 _SPACE = {True: "3D", False: "2D"}
 
 Picture = dict[str, Any]
@@ -58,14 +56,6 @@ def picture(figure: Figure, caption: str) -> Picture:
     # The size in pixels reserves the space of a figure while the page loads.
     size = {"width": round(96 * width_in), "height": round(96 * height_in)}
     return {"uri": svg_data_uri(figure), "caption": caption, **size}
-
-
-def new_figure(height_in: float) -> tuple[Figure, Axes]:
-    """Return a figure as wide as a phone, with its axes."""
-    figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
-    axes = figure.add_subplot()
-    axes.tick_params(labelsize=8)
-    return figure, axes
 
 
 def _spaces(findings: Findings) -> tuple[bool, ...]:
@@ -84,7 +74,7 @@ def models_pictures(findings: Findings) -> list[Picture]:
             handles, ["cross-validation, 95 % interval", "held-out points"],
             loc="outside lower center", ncols=2, frameon=False, fontsize=8,
         )  # fmt: skip
-        note = models_note(ranked)
+        note = height_note(accuracy.model for accuracy in ranked)
         caption = f"Mean {_SPACE[in_space]} error of each model" + (f" ({note})" if note else "")
         pictures.append(picture(figure, caption))
     return pictures
@@ -100,11 +90,7 @@ def residual_pictures(findings: Findings) -> list[Picture]:
     for accuracy in accuracies:
         figure, axes = new_figure(5.6)
         arrows = draw_residuals(axes, findings, accuracy, scale)
-        bar = figure.colorbar(
-            arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30
-        )
-        bar.set_label(f"{_SPACE[findings.in_space]} error in cm", fontsize=9)
-        bar.ax.tick_params(labelsize=8)
+        add_bar(figure, arrows, axes, f"{_SPACE[findings.in_space]} error in cm")
         caption = (
             f"Errors of {label(accuracy.model)}, seen from above. An arrow points from the calibration "
             "point to the estimated position; arrows are enlarged. "
@@ -147,7 +133,7 @@ def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
     """Return one figure per caption, all with the same scale."""
     limits = limits_cm(panels.values())
     return [
-        picture(curves_picture(curves, _WIDTH_IN, limits), caption)
+        picture(curves_picture(curves, PAGE_IN, limits), caption)
         for caption, curves in panels.items()
         if curves
     ]
@@ -248,9 +234,7 @@ def _floor_picture(pairs: Sequence[PairDisagreement], rig: Rig | None) -> dict[s
     for cell, value_mm in zip(cells, values_mm.tolist(), strict=True):
         corner = cell.x_m - _CELL_M / 2, cell.y_m - _CELL_M / 2
         axes.add_patch(Rectangle(corner, _CELL_M, _CELL_M, fc=shades.to_rgba(value_mm), lw=0, zorder=2))
-    bar = figure.colorbar(shades, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30)
-    bar.set_label("median difference of two cameras in mm", fontsize=9)
-    bar.ax.tick_params(labelsize=8)
+    add_bar(figure, shades, axes, "median difference of two cameras in mm")
     return picture(
         figure,
         f"Disagreement of the cameras over the floor, all pairs, in cells of {_CELL_M * CM_PER_M:g} cm",

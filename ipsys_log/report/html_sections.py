@@ -126,7 +126,7 @@ def models_table(findings: Findings, camera: str = POOLED) -> Rows:
     last = [">with gross outliers, mean"] if has_excluded else []
     return Rows(
         "",
-        [*names, *(f">{head}" for heads in columns.values() for head in heads), *last],
+        [*names, *(_head(name) for heads in columns.values() for name in heads), *last],
         cells,
         groups=[
             ("", len(names)),
@@ -134,6 +134,11 @@ def models_table(findings: Findings, camera: str = POOLED) -> Rows:
             ("", len(last)),
         ],
     )
+
+
+def _head(column: str) -> str:
+    """Return the head of a column of errors; means line up at the left, beside their intervals."""
+    return column if "CI" in column else f">{column}"
 
 
 def _mean_with_excluded(accuracy: Accuracy, camera: str, against: str) -> str:

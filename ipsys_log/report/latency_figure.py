@@ -10,8 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ipsys_log.report.figures import figure_bytes, style_axes
-from ipsys_log.report.files import write_files
+from ipsys_log.report.figures import save_figure, style_axes
 from ipsys_log.report.styles import NOTE
 
 _STEPS = ("detected", "located", "fused", "published")
@@ -37,7 +36,7 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
     draw_shares(left, total_ms)
     draw_steps(right, times_s)
     figure.text(0.07, 0.94, f"Latency of {len(total_ms)} positions", fontsize=12)
-    write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
+    save_figure(figure, path)
 
 
 def draw_shares(axes: Axes, total_ms: NDArray[np.float64], is_narrow: bool = False) -> None:

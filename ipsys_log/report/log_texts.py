@@ -6,18 +6,16 @@ Long parts and bytes of a message are given by their size.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass
-from math import isfinite
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
-
-import numpy as np
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.channel_sizes import ChannelSize
 from ipsys_log.log.contents import RawMessage, StoredChannel
 from ipsys_log.messages import Message
 from ipsys_log.plain_text import plain_text
+from ipsys_log.report.json_format import FORMAT, plain
 from ipsys_log.report.rows import Rows, counted, percent
 from ipsys_log.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
 from ipsys_log.units import format_bytes, format_time
@@ -39,6 +37,7 @@ def message_json(raw: RawMessage, message: Message | LogError, channel: StoredCh
     """Return a message as one line of JSON; times are in ns, and a missing value is absent or null."""
     is_read = not isinstance(message, LogError)
     row = {
+        "format": FORMAT,
         "topic": raw.topic,
         "log_time_ns": raw.log_time_ns,
         "publish_time_ns": message.publish_time_ns if isinstance(message, Message) else raw.publish_time_ns,
@@ -115,31 +114,15 @@ def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
 def _data(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> dict[str, Any]:
     """Return the content of a message as plain data; its size if it cannot be decoded."""
     if isinstance(message, Message):
-        content: dict[str, Any] = _plain(message.payload)
+        content: dict[str, Any] = plain(message.payload)
         return content
     if channel.message_encoding == "json":
         try:
             read = json.loads(raw.data)
         except (ValueError, RecursionError):
             return {"bytes": len(raw.data)}
-        return _plain(read) if isinstance(read, dict) else {"value": _plain(read)}
+        return plain(read) if isinstance(read, dict) else {"value": plain(read)}
     return {"bytes": len(raw.data)}
-
-
-def _plain(value: Any) -> Any:
-    """Return a payload as plain data, without missing fields; bytes become their number."""
-    if is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
-    elif isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(part) for key, part in value.items() if part is not None}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    if isinstance(value, bytes | bytearray | memoryview):
-        return {"bytes": len(value)}
-    is_number = not isinstance(value, float) or isfinite(value)
-    return value if is_number else None
 
 
 def _short(key: str, value: Any) -> str:

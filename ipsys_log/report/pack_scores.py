@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from rich.console import Group
@@ -15,9 +14,10 @@ from ipsys_log.publish.packing import PackResult
 from ipsys_log.publish.scores import Score
 from ipsys_log.publish.scoring import ScoreComparison, ScoreResult
 from ipsys_log.report.advice import label
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import Rows, counted, name_cell, wrap_text
 from ipsys_log.report.tables import height_note
-from ipsys_log.units import format_bytes
+from ipsys_log.units import MM_PER_M, format_bytes
 
 _HEADS = ("mean", "median", "p95", "RMSE")
 _NAMED = 3  # differences that the answer names
@@ -167,24 +167,30 @@ def _two(value_mm: float) -> str:
 
 
 def score_json(result: ScoreResult) -> dict[str, Any]:
-    """Return the result of a re-scoring as plain data, in mm."""
+    """Return the result of a re-scoring as plain data, in m."""
+    comparisons = [
+        {
+            "stated": comparison.stated,
+            "computed": comparison.computed,
+            "difference_mm": comparison.difference_mm,
+            "as_stated": comparison.as_stated,
+        }
+        for comparison in result.comparisons
+    ]
     return {
         "title": result.title,
         "as_stated": result.as_stated,
-        "comparisons": [
-            {
-                "stated": asdict(comparison.stated),
-                "computed": None if comparison.computed is None else _figures(comparison.computed),
-                "difference_mm": comparison.difference_mm,
-                "as_stated": comparison.as_stated,
-            }
-            for comparison in result.comparisons
-        ],
-        "own": [_figures(score) for score in result.own],
+        "comparisons": _in_m(plain(comparisons)),
+        "own": _in_m(plain(result.own)),
         "other_versions": list(result.other_versions),
     }
 
 
-def _figures(score: Score) -> dict[str, Any]:
-    """Return a computed score, which has no tolerance."""
-    return {name: value for name, value in asdict(score).items() if name != "tolerance_mm"}
+def _in_m(value: Any) -> Any:
+    """Return plain data with lengths in m instead of mm."""
+    if isinstance(value, list):
+        return [_in_m(part) for part in value]
+    if not isinstance(value, dict):
+        return value
+    lengths = {f"{key[:-3]}_m": part / MM_PER_M for key, part in value.items() if key.endswith("_mm")}
+    return {key: _in_m(part) for key, part in value.items() if not key.endswith("_mm")} | lengths

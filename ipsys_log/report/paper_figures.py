@@ -7,22 +7,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.quiver import Quiver
 
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraEvaluation, ErrorStatistics
-from ipsys_log.report import joint_figures
+from ipsys_log.messages import ErrorStatistics
+from ipsys_log.report import calibration_figures
 from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.advice import HEIGHT_NOTE, has_published, label, uses_height
-from ipsys_log.report.figures import png, scale_logarithmic, style_axes
+from ipsys_log.report.advice import has_published, label
+from ipsys_log.report.figures import ERROR_COLOURS, png, scale_logarithmic, style_axes
 from ipsys_log.report.files import cross_validation_csv, paper_csv, write_files
-from ipsys_log.report.findings import Findings, PointErrors, overall_row
+from ipsys_log.report.findings import Findings, PointErrors, errors_in, overall_row
 from ipsys_log.report.floor_figure import (
     Square,
     arrow_factor,
@@ -35,10 +34,9 @@ from ipsys_log.report.floor_figure import (
 from ipsys_log.report.learning_figure import learning_figure, mean_curves, published_figure
 from ipsys_log.report.points_figure import draw_hulls, places_figure
 from ipsys_log.report.styles import NOTE, model_styles
+from ipsys_log.report.tables import height_note
 from ipsys_log.units import CM_PER_M
 
-# Colours from pale (small error) to dark (large error), readable with any colour vision.
-_COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
 # Largest factor by which the map is wider than the floor, to make room for arrows.
 _WIDER = 1.12
 
@@ -111,7 +109,7 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: Re
     # The largest errors are drawn last, on top of the others.
     order = np.argsort(lengths_cm, kind="stable")
     places_m, errors_m, lengths_cm = places_m[order], errors_m[order], lengths_cm[order]
-    look = {"cmap": _COLOURS, "norm": Normalize(0, scale.most_cm)}
+    look = {"cmap": ERROR_COLOURS, "norm": Normalize(0, scale.most_cm)}
     arrows = draw_arrows(axes, places_m, errors_m, factor, lengths_cm, **look)
     x_m, y_m = places_m.T
     axes.scatter(x_m, y_m, c=lengths_cm, s=14, zorder=3.5, lw=0, **look)  # type: ignore[arg-type]
@@ -146,22 +144,17 @@ def models_figure(findings: Findings) -> Figure:
         [dot, held_out], ["cross-validation, with the 95 % interval", "held-out points"],
         loc="outside lower center", ncols=2, frameon=False, fontsize=9,
     )  # fmt: skip
-    if note := models_note(ranked):
+    if note := height_note(accuracy.model for accuracy in ranked):
         figure.suptitle(note, x=0.01, ha="left", fontsize=9, color=NOTE)
     return figure
-
-
-def models_note(accuracies: Sequence[Accuracy]) -> str:
-    """Return the meaning of the mark at the names of some models; empty if no model has it."""
-    return HEIGHT_NOTE if any(uses_height(accuracy.model) for accuracy in accuracies) else ""
 
 
 def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
     """Draw one row per model, the first on top; the scale fits the errors in space and on the floor."""
     styles = model_styles(accuracy.model for accuracy in ranked)
     for y, accuracy in enumerate(ranked):
-        crossed = _errors(overall_row(accuracy, True), in_space)
-        held_out = _errors(overall_row(accuracy, False), in_space)
+        crossed = errors_in(overall_row(accuracy, True), in_space)
+        held_out = errors_in(overall_row(accuracy, False), in_space)
         if crossed is not None:
             colour = styles[accuracy.model].colour
             axes.plot(_ends_cm(crossed), [y, y], color=colour, lw=2.4, solid_capstyle="butt", zorder=3)
@@ -183,58 +176,42 @@ def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _errors(row: CameraEvaluation | None, in_space: bool) -> ErrorStatistics | None:
-    return None if row is None else row.error_3d if in_space else row.error_2d
-
-
 def _ends_cm(errors: ErrorStatistics) -> list[float]:
     """Return the ends of the confidence interval of the mean, or the mean itself, in cm."""
     ends_m = (errors.mean_low_m, errors.mean_high_m)
     return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
 
 
-def _has_models(findings: Findings) -> bool:
-    return bool(findings.accuracies)
-
-
-def _has_cross_validation(findings: Findings) -> bool:
-    return any(accuracy.rows(True) for accuracy in findings.accuracies)
-
-
-def _has_published(findings: Findings) -> bool:
-    return has_published(findings.evaluations)
-
-
 # For each file: the condition to write it, and the function that returns its bytes.
 _FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
-    "table_1.csv": (_has_models, lambda f: paper_csv(f, in_space=True)),
-    "table_2.csv": (_has_models, lambda f: paper_csv(f, in_space=False)),
-    "cross_validation.csv": (_has_cross_validation, cross_validation_csv),
+    "table_1.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=True)),
+    "table_2.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=False)),
+    "cross_validation.csv": (lambda f: any(a.rows(True) for a in f.accuracies), cross_validation_csv),
     "figure_9.png": (lambda f: bool(f.training_m() or f.test_m()), lambda f: png(places_figure(f))),
     "figure_10.png": (
-        lambda f: _has_published(f) and f.in_space,
+        lambda f: has_published(f.evaluations) and f.in_space,
         lambda f: png(published_figure(f, in_space=True)),
     ),
-    "figure_11.png": (_has_published, lambda f: png(published_figure(f, in_space=False))),
+    "figure_11.png": (lambda f: has_published(f.evaluations), lambda f: png(published_figure(f, False))),
     "learning_curve.png": (lambda f: bool(mean_curves(f, False)), lambda f: png(learning_figure(f))),
     "errors_floor.png": (lambda f: bool(shown_models(f)), lambda f: png(residuals_figure(f))),
-    "models.png": (_has_models, lambda f: png(models_figure(f))),
+    "models.png": (lambda f: bool(f.accuracies), lambda f: png(models_figure(f))),
     "camera_poses.png": (
         lambda f: bool(f.calibrated),
-        lambda f: png(joint_figures.poses_figure(f.calibrated, f.rig)),
+        lambda f: png(calibration_figures.poses_figure(f.calibrated, f.rig)),
     ),
     "clock_offsets.png": (
-        lambda f: joint_figures.has_clocks(f.calibrated),
-        lambda f: png(joint_figures.clocks_figure(f.calibrated)),
+        lambda f: calibration_figures.has_clocks(f.calibrated),
+        lambda f: png(calibration_figures.clocks_figure(f.calibrated)),
     ),
 }
 
 
 def _image_residuals(findings: Findings) -> dict[str, bytes]:
     """Return a map of the corner residuals in the image of each camera of the joint model."""
-    most_px = joint_figures.residual_limit_px(findings.calibrated)
+    most_px = calibration_figures.residual_limit_px(findings.calibrated)
     return {
-        f"image_residuals_{camera.camera}.png": png(joint_figures.residuals_figure(camera, most_px))
+        f"image_residuals_{camera.camera}.png": png(calibration_figures.residuals_figure(camera, most_px))
         for camera in findings.calibrated
         if camera.residuals is not None
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import asdict
 from typing import Any
 
 from rich.console import Group
@@ -12,6 +11,7 @@ from rich.text import Text
 from ipsys_log.analysis.robot_run import RobotResult, RobotRunResult, Stop, read_robot_run
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ErrorStatistics
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import Rows, cm
 from ipsys_log.units import NS_PER_S
 
@@ -72,7 +72,7 @@ def stop_line(robot: str, stop: Stop, start_ns: int) -> str:
 def robot_run_json(result: RobotRunResult) -> dict[str, Any]:
     """Return the results as plain data; lengths are in m."""
     return {
-        "seconds": (result.end_ns - result.start_ns) / NS_PER_S,
+        "duration_s": (result.end_ns - result.start_ns) / NS_PER_S,
         "nearest_m": result.nearest_m,
         "robots": [_robot_json(robot, result.start_ns) for robot in result.robots],
     }
@@ -89,12 +89,12 @@ def _robot_json(robot: RobotResult, start_ns: int) -> dict[str, Any]:
                 "y_m": point.place.y_m,
                 "arrival_s": (point.start_ns - start_ns) / NS_PER_S,
                 "control_m": point.control_m,
-                "true": None if point.true_m is None else _errors_json(point.true_m),
-                "positioning": {run: _errors_json(errors) for run, errors in point.positioning_m.items()},
+                "true": plain(point.true_m),
+                "positioning": plain(point.positioning_m),
             }
             for point in robot.reached
         ],
-        "positioning": {run: _errors_json(errors) for run, errors in robot.positioning_m.items()},
+        "positioning": plain(robot.positioning_m),
         "stops": [
             {
                 "start_s": (stop.start_ns - start_ns) / NS_PER_S,
@@ -108,11 +108,6 @@ def _robot_json(robot: RobotResult, start_ns: int) -> dict[str, Any]:
     }
 
 
-def _errors_json(errors: ErrorStatistics) -> dict[str, float | int | None]:
-    known = asdict(errors)
-    return {name: known[name] for name in ("count", "median_m", "p95_m", "max_m")}
-
-
 def render_robot_run(session: Session) -> tuple[str, bytes]:
     """Return the HTML page of a robot run, and the PNG of its figure (figure 12 of the paper).
 
@@ -121,20 +116,12 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
     IpsysError
         The log has no robot run.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     from ipsys_log.report.figures import png, svg_data_uri
+    from ipsys_log.report.html import render_page
     from ipsys_log.report.robot_run_figure import draw_drive, draw_panels, draw_paths
 
     result = read_robot_run(session)
     panels = [png(draw_panels(session, result, robot), _PANELS_DPI) for robot in result.robots]
-    environment = Environment(
-        loader=PackageLoader("ipsys_log", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     robots = [
         {
             **_robot_values(robot, result.start_ns),
@@ -143,7 +130,8 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
         }
         for robot, image in zip(result.robots, panels, strict=True)
     ]
-    text = environment.get_template("robot_run.html").render(
+    text = render_page(
+        "robot_run.html",
         log=session.paths[-1].name,
         seconds=f"{(result.end_ns - result.start_ns) / NS_PER_S:.1f}",
         nearest=None if result.nearest_m is None else f"{result.nearest_m:.2f}",

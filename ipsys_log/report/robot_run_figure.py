@@ -16,6 +16,7 @@ from ipsys_log.images.decode import check_encoded
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Marker, Markers, Rig
 from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.report.figures import new_figure
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.report.styles import NOTE, TEST, robot_colour, shorten
 from ipsys_log.units import NS_PER_S
@@ -126,8 +127,8 @@ def _stack(images: Sequence[Image | None]) -> tuple[list[int], Image]:
 
 def _ordered(session: Session) -> list[tuple[str, str]]:
     """Return names and topics of the cameras: in the simulated lab, the world's y points up in the figure."""
-    rigs: list[Rig] = session.payloads(session.topics(RIG))
-    names = [camera.name for camera in rigs[-1].cameras] if rigs else []
+    rig = _rig(session)
+    names = [camera.name for camera in rig.cameras] if rig else []
     known = [name for name in reversed(names) if name in session.images]
     return [(name, session.images[name]) for name in [*known, *sorted(set(session.images) - set(known))]]
 
@@ -187,31 +188,31 @@ def _markers_at(session: Session, camera: str, time_ns: int) -> list[Marker]:
     return []
 
 
+def _rig(session: Session) -> Rig | None:
+    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    return rigs[-1] if rigs else None
+
+
 def draw_drive(session: Session, robot: RobotResult) -> Figure:
     """Draw the floor with the true path of a robot, its received positions and its waypoints."""
-    figure = Figure(figsize=(4.7, 5.2), layout="constrained")
-    axes = figure.add_subplot()
-    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    figure, axes = new_figure(5.2)
     places_m = np.array([(place.x_m, place.y_m) for place in robot.path])
-    draw_ground(axes, rigs[-1] if rigs else None, [places_m])
+    draw_ground(axes, _rig(session), [places_m])
     if robot.true is not None:
         axes.plot(*robot.true.points_m[:, :2].T, color="black", lw=1.0, label="true path")
     axes.plot(*robot.received.points_m.T, ".", color=robot_colour(0), ms=3, label="received positions")
     axes.plot(*places_m.T, "x", color=TEST, ms=9, mew=1.8, ls="none", label="waypoints")
     for number, place in enumerate(places_m, 1):
         axes.annotate(f"P{number}", place, (6, -12), textcoords="offset points", color=TEST, fontsize=9)
-    axes.tick_params(labelsize=8, colors=NOTE)
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8, frameon=False)
+    _finish_map(axes)
     return figure
 
 
 def draw_paths(session: Session, result: RobotRunResult) -> Figure:
     """Draw the floor with the paths of all robots, and the time in s at which each reached its waypoints."""
-    figure = Figure(figsize=(4.7, 5.2), layout="constrained")
-    axes = figure.add_subplot()
-    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    figure, axes = new_figure(5.2)
     places_m = [np.array([(place.x_m, place.y_m) for place in robot.path]) for robot in result.robots]
-    draw_ground(axes, rigs[-1] if rigs else None, places_m)
+    draw_ground(axes, _rig(session), places_m)
     for number, (robot, at_m) in enumerate(zip(result.robots, places_m, strict=True)):
         colour, path = robot_colour(number), robot.received if robot.true is None else robot.true
         axes.plot(*path.points_m[:, :2].T, color=colour, lw=1.4, label=robot.name)
@@ -219,20 +220,19 @@ def draw_paths(session: Session, result: RobotRunResult) -> Figure:
         for point in robot.reached:
             at_s = (point.start_ns - result.start_ns) / NS_PER_S
             _label(axes, at_m[point.number - 1], f"{at_s:.0f} s", colour)
-    axes.tick_params(labelsize=8, colors=NOTE)
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8, frameon=False)
+    _finish_map(axes)
     return figure
+
+
+def _finish_map(axes: Axes) -> None:
+    axes.tick_params(colors=NOTE)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8, frameon=False)
 
 
 def _label(axes: Axes, where_m: NDArray[np.float64], text: str, colour: str) -> None:
     """Write a text beside a point, on the side of the middle of the floor."""
     side = 1 if where_m[0] < np.mean(axes.get_xlim()) else -1
     axes.annotate(
-        text,
-        (float(where_m[0]), float(where_m[1])),
-        (6 * side, 5),
-        textcoords="offset points",
-        ha="left" if side > 0 else "right",
-        color=colour,
-        fontsize=9,
-    )
+        text, (float(where_m[0]), float(where_m[1])), (6 * side, 5), textcoords="offset points",
+        ha="left" if side > 0 else "right", color=colour, fontsize=9,
+    )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
+from typing import Any
 
 from rich.console import Group
 from rich.table import Table
@@ -47,9 +48,9 @@ class Rows:
         rows = [[cell if isinstance(cell, Text) else name_cell(cell) for cell in row] for row in self.cells]
         table = Table(box=None, pad_edge=False, padding=(0, 2 if self._is_narrow(rows) else 1, 0, 0))
         for name, is_number in self.heads:
-            table.add_column(
-                Text(name), justify="right" if is_number else "left", no_wrap=is_number, overflow="fold"
-            )
+            # A number that does not fit must not look like another number.
+            look: dict[str, Any] = {"justify": "right", "no_wrap": True, "overflow": "ellipsis"}
+            table.add_column(Text(name), **(look if is_number else {"overflow": "fold"}))
         for row in rows:
             table.add_row(*row)
         title = [Text(wrap_text(plain_text(self.title)), style="bold")] if self.title else []

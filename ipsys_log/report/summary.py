@@ -11,15 +11,15 @@ from rich.text import Text
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.consistency import FEWEST_POINTS
+from ipsys_log.analysis.point_evaluation import SCREENING
 from ipsys_log.analysis.trajectory_errors import pool_trajectories
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.models.table import reads_corners
-from ipsys_log.report.accuracy import Accuracy, gather_outliers, remaining_json
+from ipsys_log.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.report.advice import advise, uses_height
 from ipsys_log.report.findings import in_space, overall_row, overall_row_with_excluded, rank, ranking_errors
+from ipsys_log.report.json_format import plain
 from ipsys_log.report.rows import cm, counted, name_cell, wrap_text
-from ipsys_log.stages.evaluate import SCREENING
-from ipsys_log.units import CM_PER_M
 
 # Number of outliers with an explanation in the answer; the other outliers are only named.
 _EXPLAINED = 3
@@ -204,23 +204,18 @@ def _needed() -> str:
 
 
 def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
-    """Return the answer as plain data, in cm; empty without an evaluated model."""
+    """Return the answer as plain data, in m; empty without an evaluated model."""
     best = rank(accuracies)[0] if accuracies else None
     row = None if best is None else overall_row(best, True) or overall_row(best, False)
     if best is None or row is None:
         return {}
     errors = ranking_errors(row, in_space(accuracies))
-    rmse_m = best.errors_of(row).rmse_m(errors)
-    figures: dict[str, Any] = {"mean_cm": errors.mean_m * CM_PER_M} | (
-        {} if rmse_m is None else {"rmse_cm": rmse_m * CM_PER_M}
-    )
-    figures |= remaining_json(errors)
-    names = [suspect.measurement for suspect, _ in gather_outliers(accuracies)]
-    excluded = [suspect.measurement for suspect in best.evaluation.excluded] if best.evaluation else []
-    if excluded:
-        figures = {**figures, "excluded": excluded}
+    answer: dict[str, Any] = {"model": best.model, "scheme": row.scheme} | plain(errors)
+    answer |= plain({"rmse_m": best.errors_of(row).rmse_m(errors)})
+    if best.evaluation and best.evaluation.excluded:
+        answer["excluded"] = [suspect.measurement for suspect in best.evaluation.excluded]
         whole = overall_row_with_excluded(best, row.scheme == CROSS_VALIDATION)
         if whole is not None:
-            mean_m = ranking_errors(whole, in_space(accuracies)).mean_m
-            figures["mean_with_excluded_cm"] = mean_m * CM_PER_M
-    return {"answer": {"model": best.model, "scheme": row.scheme, **figures, "outliers": names}}
+            answer["mean_with_excluded_m"] = ranking_errors(whole, in_space(accuracies)).mean_m
+    outliers = [suspect.measurement for suspect, _ in gather_outliers(accuracies)]
+    return {"answer": answer | {"outliers": outliers}}

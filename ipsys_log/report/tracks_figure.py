@@ -16,8 +16,7 @@ from ipsys_log.geometry.ellipses import covariance_ellipse, enlargement
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Track
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS
-from ipsys_log.report.figures import figure_bytes, style_axes
-from ipsys_log.report.files import write_files
+from ipsys_log.report.figures import save_figure, style_axes
 from ipsys_log.report.styles import robot_colour, robot_line, shorten
 
 # Breaks of a line: a longer step or gap than this.
@@ -110,4 +109,4 @@ def plot_tracks(session: Session, run: str, path: Path) -> None:
         f"Tracks of run {run}; regions of 95 %, {enlarged} times as large", fontsize=10, loc="left"
     )
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-    write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
+    save_figure(figure, path)

@@ -16,11 +16,12 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, ChannelRead, Model, Rig, Run
 from ipsys_log.messages.channels import CALIBRATIONS, MODEL, RIG, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Plan, Progress, Stage, Step
+from ipsys_log.models.table import model_run
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import Outcome, read_channels
 from ipsys_log.runs.select import fitted_in
 from ipsys_log.runs.view import LogView
-from ipsys_log.stages import ENTRIES, fit, load_stage
+from ipsys_log.stages import ENTRIES, load_stage
 
 STAGES: tuple[Stage, ...] = tuple(load_stage(entry.name) for entry in ENTRIES)
 VERSIONS: dict[str, int] = {name: number for stage in STAGES for name, number in stage.versions.items()}
@@ -187,7 +188,7 @@ def copy_model(request: Request, name: str) -> tuple[Task, Model]:
         foreign = read_channels(other, [topic])
     task = Task(
         stage=writer_of(MODEL),
-        run=fit.model_run(name),
+        run=model_run(name),
         compute=lambda progress: model,
         parameters={"model": name},
         foreign=foreign,

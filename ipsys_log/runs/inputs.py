@@ -17,8 +17,8 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.messages.channels import EVENTS, RIG
+from ipsys_log.messages.events import skipped_frames
 from ipsys_log.runs.options import Progress
-from ipsys_log.stages.detect import skipped_frames
 
 if TYPE_CHECKING:
     from ipsys_log.runs.graph import Task

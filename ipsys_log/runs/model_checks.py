@@ -7,12 +7,13 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.calibration_points import find_pairs, measured, split_ids
+from ipsys_log.analysis.calibration_points import measured, split_ids, training_pairs
+from ipsys_log.analysis.model_kinds import model_kind
+from ipsys_log.analysis.point_evaluation import can_evaluate
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Model
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
@@ -20,14 +21,12 @@ from ipsys_log.messages.channels import (
     RIG,
     Channel,
 )
-from ipsys_log.models.table import AppliedModel, min_pairs, needs_height, reads_corners
+from ipsys_log.models.table import needs_height
 from ipsys_log.plain_text import shell_words
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.select import copied_run, fitted_in, has_corners
 from ipsys_log.runs.view import LogView
-from ipsys_log.stages.evaluate import can_evaluate
-from ipsys_log.stages.fit import BESIDE_LINE_M, check_different, check_pairs
 
 
 def check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
@@ -51,28 +50,7 @@ def check_measurements(session: Session, request: Request, models: Sequence[str]
     world_m = _check_places(places)
     train_m = np.array([world_m[name] for name in sorted(train)]).reshape(-1, 3)
     for model in models:
-        if reads_corners(model):
-            _check_corners(session, model)
-        if len(train) < min_pairs(model):
-            raise FitError(
-                f"{session}: {model} needs at least {min_pairs(model)} calibration points for each camera, "
-                f"but the log has {len(train)} in all; measure more"
-                + ("" if model == "rigid" else ", or use --model rigid")
-            )
-        if not reads_corners(model):
-            check_different(model, str(session), train_m)
-    # For a model of all corners, a drive is enough beside the line; its fit checks that.
-    if not all(reads_corners(model) for model in models):
-        _check_line(session, train_m)
-
-
-def _check_corners(session: Session, model: str) -> None:
-    """Check that the log has corners of markers, or images to detect them in."""
-    if not has_corners(session):
-        raise FitError(
-            f"{session}: {model} is fitted to the corners of markers, but the log has only camera points; "
-            "use --model best"
-        )
+        model_kind(model).check_points(model, str(session), train_m, has_corners(session))
 
 
 def _check_places(places: Sequence[RiggedMeasurement]) -> dict[str, NDArray[np.float64]]:
@@ -90,17 +68,6 @@ def _check_places(places: Sequence[RiggedMeasurement]) -> dict[str, NDArray[np.f
     return world_m
 
 
-def _check_line(session: Session, train_m: NDArray[np.float64]) -> None:
-    """Check that not all points lie on a line: then those that one camera sees do so, too."""
-    offsets_m = train_m - train_m.mean(axis=0)
-    along = np.linalg.svd(offsets_m, full_matrices=False)[2][0]
-    beside_m = np.linalg.norm(offsets_m - np.outer(offsets_m @ along, along), axis=1)
-    if beside_m.max() < BESIDE_LINE_M:
-        raise FitError(
-            f"{session}: all {len(train_m)} calibration points are on one line; measure some beside it"
-        )
-
-
 def check_fits(
     session: Session, request: Request, inputs: Mapping[Channel, str], models: Sequence[str]
 ) -> None:
@@ -112,15 +79,10 @@ def check_fits(
         A camera sees too few calibration points for a model, or a measured marker was never seen.
     """
     view = LogView(session, inputs, request.rig)
-    points = measured(view)
-    train, _ = split_ids([point.measurement for point in points], request.options())
-    pairs = {
-        camera: [pair for pair in seen if pair.measurement in train]
-        for camera, seen in find_pairs(view, points).items()
-    }
+    train, _ = split_ids([point.measurement for point in measured(view)], request.options())
+    pairs = training_pairs(view, train)
     for model in models:
-        if not reads_corners(model):
-            check_pairs(model, pairs)
+        model_kind(model).check_pairs(model, pairs)
 
 
 def check_evaluated(session: Session, request: Request, models: Sequence[str]) -> None:
@@ -154,7 +116,7 @@ def check_models(
         for name in models:
             model, _ = fitted_in(other, name)
             if {EVALUATION, POSITIONS} & {*written}:
-                _restore(model)
+                model_kind(model.name).restore(model)
             fitted = {camera.camera for camera in model.cameras}
             if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(
@@ -162,14 +124,6 @@ def check_models(
                     f"{', '.join(sorted(fitted))}, but the log has {', '.join(sorted(cameras))}; give a "
                     "model of these cameras"
                 )
-
-
-def _restore(model: Model) -> object:
-    if not reads_corners(model.name):
-        return [AppliedModel(model.name, camera) for camera in model.cameras]
-    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
-
-    return restore_joint(model)
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Rig
-from ipsys_log.stages.camera_frame import PERIMETER, check_method
-from ipsys_log.stages.detect import check_corners
+from ipsys_log.stages import CORNERS, METHOD
 
 # Called with the stage, the number of messages done, and the number of all messages, if it is known.
 Progress = Callable[[str, int, int | None], None]
@@ -48,15 +47,15 @@ class Request:
     seed: int = 0
     run: str | None = None
     corners: str | None = None
-    method: str = PERIMETER
+    method: str = METHOD.default
     as_live: bool = False
     skip_ambiguous: bool = False
     parameters: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.corners is not None:
-            check_corners(self.corners)
-        check_method(self.method)
+            CORNERS.check(self.corners)
+        METHOD.check(self.method)
 
     def options(self, model: str | None = None) -> dict[str, str]:
         """Return the options of stages by name, for one model."""

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ipsys_log.analysis.model_kinds import model_kind
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import IMAGES, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
-from ipsys_log.models.table import reads_corners
 from ipsys_log.runs.blas import one_blas_thread
 from ipsys_log.runs.checks import check_earlier_runs, describe_changed_images
 from ipsys_log.runs.execute import compute_messages, run_stage
@@ -71,8 +71,7 @@ class Replay:
             try:
                 self._run_stages(of_model, dict(shared), model)
             except FitError as error:
-                # The checks before cannot know if corners determine all cameras.
-                if model in self.request.models or not reads_corners(model):
+                if model in self.request.models or model_kind(model).is_checked:
                     raise
                 self.say(f"{model} is left out: {error}")
 

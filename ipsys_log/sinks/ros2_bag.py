@@ -24,8 +24,14 @@ from ipsys_log.runs.options import Progress
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.poses import PoseSource
-from ipsys_log.sinks.streams.ros2_messages import CAMERA_INFO, encode_camera_info, encode_image
-from ipsys_log.sinks.streams.ros2_types import is_stampable, text_of, type_hash
+from ipsys_log.sinks.streams.ros2_messages import (
+    CAMERA_INFO,
+    encode_camera_info,
+    encode_image,
+    is_stampable,
+    text_of,
+    type_hash,
+)
 
 _STEP = "bag"
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ipsys_log.errors import IpsysError
+
 if TYPE_CHECKING:
     from ipsys_log.messages.stage import Stage
 
@@ -25,6 +27,7 @@ class StageParameter:
     metavar : name of its value in the help; None for a flag.
     kind, default : type and value of the option.
     least : smallest value of a number.
+    choices : the possible values of a method.
     """
 
     name: str
@@ -33,6 +36,18 @@ class StageParameter:
     kind: Any = str | None
     default: Any = None
     least: int | None = None
+    choices: tuple[str, ...] = ()
+
+    def check(self, value: str) -> None:
+        """Check that a value is one of the choices.
+
+        Raises
+        ------
+        IpsysError
+            It is not.
+        """
+        if value not in self.choices:
+            raise IpsysError(f"--{self.name} {value}: is not known; use one of {', '.join(self.choices)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +77,7 @@ CORNERS = StageParameter(
     help="Method for corners: edges of the print (edges, the default if all cameras have a calibration), "
     "or the method of the paper (stock).",
     metavar="NAME",
+    choices=("edges", "stock"),
 )
 AS_LIVE = StageParameter(
     name="as_live",
@@ -82,6 +98,7 @@ METHOD = StageParameter(
     metavar="NAME",
     kind=str,
     default="perimeter",
+    choices=("perimeter", "pose"),
 )
 MODEL = StageParameter(
     name="model",

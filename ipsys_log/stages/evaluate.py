@@ -2,201 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 
-from ipsys_log.analysis.accuracy import evaluate_cross_validated, evaluate_held_out
-from ipsys_log.analysis.calibration_points import (
-    JOINT_READS,
-    find_pairs,
-    has_measurements,
-    held_out_ids,
-    measured,
-    measured_part,
-    split_parameters,
-)
-from ipsys_log.analysis.camera_models import fit_camera_models
-from ipsys_log.analysis.cross_validation import (
-    FOLDS,
-    REPEATS,
-    Study,
-    gather_points,
-    labelled_subsets,
-    learning_curve,
-    learning_sizes,
-    leave_one_out,
-    published_curve,
-)
+from ipsys_log.analysis.calibration_points import find_pairs, held_out_ids, measured, split_parameters
+from ipsys_log.analysis.cross_validation import FOLDS, Study, labelled_subsets
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
-from ipsys_log.analysis.outliers import find_outliers, is_gross
-from ipsys_log.analysis.tape import RiggedMeasurement
-from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
-from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
+from ipsys_log.analysis.model_kinds import JOINT_READS, model_kind
+from ipsys_log.analysis.point_evaluation import can_evaluate, can_refit
+from ipsys_log.messages import Evaluation, Model
+from ipsys_log.messages.channels import EVALUATION, MODEL, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
-from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import min_pairs, reads_corners
-
-# Models that check the measurements. They fit in milliseconds, and they follow the calibration points
-# closely enough to show an error of some centimetres.
-SCREENING = ("poly", "rayplane", "best", "joint")
-# The same model selects the gross outliers for all evaluations, so that all models have the same points. The
-# polynomial is a hundred times as fast; with fewer points of a camera, it is too uncertain.
-_GROSS_MODEL, _GROSS_MODEL_FEW, _FEW = "poly", "best", 20
-
-
-def evaluate_model(
-    model: Model, study: Study, time_ns: int, notes: list[str], progress: Callable[[int, int], None]
-) -> Evaluation:
-    """Compute errors on held-out points and by cross-validation, learning curve and suspect measurements.
-
-    Gross outliers come first. The errors and the learning curve are without them, in the fit and in the test;
-    the errors with them are in ``with_excluded``.
-
-    Parameters
-    ----------
-    model : fitted model.
-    time_ns : of the last input.
-    notes : list of remarks; each impossible step adds a remark.
-    progress : called with the number of steps done, and the number of all steps.
-    """
-    if study.seed is None:
-        return Evaluation(time_ns, model.name, tuple(_held_out_rows(model, study)))
-    cameras = gather_points(_fitted_pairs(model, study))
-    excluded = _gross_outliers(cameras, study.places)
-    reduced, clean = _without(model, study, {suspect.measurement for suspect in excluded}, notes)
-    if reduced is model:
-        excluded = ()
-    remaining = gather_points(_fitted_pairs(reduced, clean))
-    total = 2 + len(learning_sizes(model.name, remaining))
-    progress(0, total)
-    rows = _rows(reduced, clean, notes)
-    progress(1, total)
-    learning: list[LearningPoint] = published_curve(model.name, remaining, study.subsets, clean.held_out)
-    for done, points in enumerate(learning_curve(model.name, remaining, study.seed), 2):
-        learning += points
-        progress(done, total)
-    suspects = _suspects(model.name, cameras, study.places) if model.name in SCREENING else ()
-    with_excluded = _rows(model, study, []) if excluded else ()
-    progress(total, total)
-    return Evaluation(time_ns, model.name, rows, tuple(learning), suspects, excluded, with_excluded)
-
-
-def _fitted_pairs(model: Model, study: Study) -> dict[str, Sequence[Pair]]:
-    fitted = {camera.camera for camera in model.cameras}
-    return {camera: camera_pairs for camera, camera_pairs in study.pairs.items() if camera in fitted}
-
-
-def _held_out_rows(model: Model, study: Study) -> list[CameraEvaluation]:
-    held_out = {
-        camera: [pair for pair in camera_pairs if pair.measurement in study.held_out]
-        for camera, camera_pairs in study.pairs.items()
-    }
-    return evaluate_held_out(model, held_out, study.truth)
-
-
-def _rows(model: Model, study: Study, notes: list[str]) -> tuple[CameraEvaluation, ...]:
-    """Return the errors on held-out points and by cross-validation."""
-    assert study.seed is not None
-    rows, pairs = _held_out_rows(model, study), _fitted_pairs(model, study)
-    if _enough(model.name, pairs, notes):
-        try:
-            rows += evaluate_cross_validated(model, pairs, study.truth, study.seed)
-        except FitError as error:
-            notes.append(f"no cross-validation: {error}")
-    return tuple(rows)
-
-
-def _gross_outliers(
-    cameras: Mapping[str, CalibrationPoints], places: Sequence[RiggedMeasurement]
-) -> tuple[Suspect, ...]:
-    fewest = min((len(points.names) for points in cameras.values()), default=0)
-    name = _GROSS_MODEL if fewest >= _FEW else _GROSS_MODEL_FEW
-    return tuple(suspect for suspect in _suspects(name, cameras, places) if is_gross(suspect))
-
-
-def _without(model: Model, study: Study, names: set[str], notes: list[str]) -> tuple[Model, Study]:
-    """Return the model and the data without some measurements; both unchanged if this is impossible."""
-    if not names:
-        return model, study
-    pairs = {camera: _remaining(camera_pairs, names) for camera, camera_pairs in study.pairs.items()}
-    fitted = {camera.camera: _remaining(camera.pairs, names) for camera in model.cameras}
-    if any(len(camera_pairs) < min_pairs(model.name) for camera_pairs in fitted.values()):
-        notes.append("gross outliers are not excluded: too few calibration points remain")
-        return model, study
-    try:
-        cameras = tuple(fit_camera_models(model.name, gather_points(fitted), fitted))
-    except FitError as error:
-        notes.append(f"gross outliers are not excluded: {error}")
-        return model, study
-    clean = replace(study, pairs=pairs, held_out=study.held_out - names)
-    return replace(model, cameras=cameras), clean
-
-
-def _remaining(pairs: Sequence[Pair], names: set[str]) -> list[Pair]:
-    return [pair for pair in pairs if pair.measurement not in names]
-
-
-def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) -> bool:
-    """Return whether each fold leaves enough calibration points for a fit."""
-    for camera, camera_pairs in pairs.items():
-        if len(camera_pairs) - -(-len(camera_pairs) // FOLDS) < min_pairs(name):
-            notes.append(
-                f"no cross-validation of {name}: camera {camera} has only {len(camera_pairs)} "
-                "calibration points"
-            )
-            return False
-    return True
-
-
-def _suspects(
-    name: str, cameras: Mapping[str, CalibrationPoints], places: Sequence[RiggedMeasurement]
-) -> tuple[Suspect, ...]:
-    if any(len(points.names) <= min_pairs(name) + 1 for points in cameras.values()):
-        return ()
-    seen = {place for camera_places in cameras.values() for place in camera_places.names}
-    try:
-        return find_outliers(leave_one_out(name, cameras), [p for p in places if p.measurement.id in seen])
-    except FitError:
-        return ()
-
-
-def can_evaluate(view: StageView, options: Mapping[str, str], model: str) -> bool:
-    """Return whether a model has held-out points, or enough points for cross-validation."""
-    measurements = [point.measurement for point in measured(view)]
-    enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
-    held_out = held_out_ids(measurements, options)
-    return bool(held_out) or (_is_fitted_here(view, options, model) and enough)
-
-
-def _is_fitted_here(view: StageView, options: Mapping[str, str], model: str) -> bool:
-    """Return whether a model is fitted to points of this log: then it can be fitted to fewer points too."""
-    if "model_from" in options:
-        return False
-    return has_measurements(view) or all(copy.name != model for _, copy in view.copied(MODEL))
-
-
-def _evaluate_joint(
-    view: StageView, model: Model, study: Study, time_ns: int, notes: list[str], progress: Progress
-) -> Evaluation:
-    """Evaluate the model of all corners, without the gross outliers that all models leave out."""
-    # Late: scipy takes 1 s, and most commands need no joint model.
-    from ipsys_log.analysis.joint_calibration import observe
-    from ipsys_log.analysis.joint_evaluation import evaluate_joint
-
-    cameras = gather_points(_fitted_pairs(model, study))
-    excluded = () if study.seed is None else _gross_outliers(cameras, study.places)
-    return evaluate_joint(model, observe(view), study, excluded, time_ns, notes, progress)
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     model: Model = view.payloads(MODEL)[-1]
     if not can_evaluate(view, options, model.name):
         return ""
-    again = _is_fitted_here(view, options, model.name)
+    again = can_refit(view, options, model.name)
     seed = options.get("seed", "0")
-    joint = reads_corners(model.name)
-    reads = (*JOINT_READS, MODEL, TRUTH) if joint else (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
+    kind = model_kind(model.name)
+    reads = (*kind.fit_reads, MODEL, TRUTH)
     notes: list[str] = []
 
     def compute(progress: Progress) -> Evaluation:
@@ -210,12 +35,9 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
             true_points(points, gather_tracks(view.messages(TRUTH))),
             int(seed) if again else None,
         )
-        time_ns = view.last_ns(*reads)
-        if joint:
-            return _evaluate_joint(view, model, study, time_ns, notes, progress)
-        return evaluate_model(model, study, time_ns, notes, progress)
+        return kind.evaluate(model, view, study, view.last_ns(*reads), notes, progress)
 
-    folds = {"folds": str(FOLDS), "repeats": "1" if joint else str(REPEATS), "seed": seed}
+    folds = {"folds": str(FOLDS), "repeats": str(kind.repeats), "seed": seed}
     return Plan(
         run=view.run(MODEL),
         parameters={**split_parameters(view, options), **folds} if again else {},
@@ -231,7 +53,7 @@ STAGE = Stage(
     reads=(*JOINT_READS, MODEL, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,
-    rig_part=measured_part,
+    rig_part=lambda rig, model: model_kind(model).fit_part(rig),
     method=model_read,
     causal=False,
 )

@@ -1,4 +1,4 @@
-"""Plausibility check of a measurement before it is saved: triangle, floor, cameras, model."""
+"""Plausibility check of a measurement before it is saved, and of a typed distance AB."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from itertools import chain, count
 
 import numpy as np
 
-from ipsys_log.analysis.pairs import active_measurements, withdrawals
+from ipsys_log.analysis.pairs import active_baselines, active_measurements, withdrawals
 from ipsys_log.analysis.tape import TapePoint, is_on_reference, reference_points, with_usual_tape, world_point
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
-from ipsys_log.messages import Measurement, Model, Rig
+from ipsys_log.messages import Distance, Measurement, Model, Rig
 from ipsys_log.survey.blunders import (
     MODEL_NAME,
     floor_sigma_m,
@@ -23,7 +23,7 @@ from ipsys_log.survey.blunders import (
     warn_model,
     warn_tapes,
 )
-from ipsys_log.survey.entry import Entry, Fault
+from ipsys_log.survey.entry import Entry, Fault, check_references, parse_baseline
 from ipsys_log.survey.scene import MarkerObservations, Prediction, predict
 from ipsys_log.units import CM_PER_M
 
@@ -274,3 +274,40 @@ def _residuals(read: Measurement, fixed: TapePoint) -> tuple[tuple[str, float], 
         return ()
     names = (tape.reference for tape in read.distances)
     return tuple(zip(names, fixed.residuals_m.tolist(), strict=True))
+
+
+def baseline_names(rig: Rig) -> tuple[str, str]:
+    """Return the names of the first two reference points."""
+    first, second, *_ = rig.reference_points
+    return first.name, second.name
+
+
+def needs_baseline(rig: Rig, history: Sequence[Measurement]) -> bool:
+    """Return whether a reading of AB would count, and there is none yet."""
+    return rig.ab_sigma_m is not None and not active_baselines(history)
+
+
+def read_baseline(text: str, rig: Rig, history: Sequence[Measurement], time_ns: int) -> Measurement:
+    """Return the measurement of a typed distance AB in cm.
+
+    Raises
+    ------
+    IpsysError
+        The text is not a number, or contradicts the reference points of the rig.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import ReferencePoint
+    >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
+    >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points)
+    >>> reading = read_baseline("200,3", rig, [], 0)
+    >>> reading.id, reading.from_reference, reading.distances[0].distance_m
+    ('ab', 'A', 2.003)
+    """
+    check_references(rig)
+    distance_m, fault = parse_baseline(text, rig)
+    if fault is not None:
+        raise IpsysError(fault.text)
+    first, second = baseline_names(rig)
+    name = free_id(history, "ab")
+    return Measurement(time_ns, name, distances=(Distance(second, distance_m),), from_reference=first)

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ipsys_log.analysis.pairs import Sightings, gather_sightings
+from ipsys_log.analysis.pairs import TimedPoints, gather_sightings
 from ipsys_log.analysis.stationary import stationary_intervals
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.images.decode import decode_grey
@@ -210,7 +210,7 @@ def _newest(session: Session, channel: Channel) -> list[str]:
     return session.topics(channel, run) if run else []
 
 
-def _find_intervals(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[StationaryInterval]:
+def _find_intervals(sightings: Mapping[tuple[str, int], TimedPoints], rig: Rig) -> list[StationaryInterval]:
     """Return the stationary intervals of the rig's markers, in order of time."""
     intervals = []
     for marker_id in sorted({marker_id for _, marker_id in sightings}):

@@ -12,10 +12,10 @@ from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
     FloorGap,
     expect_errors,
-    find_gaps,
+    find_floor_gaps,
 )
 from ipsys_log.analysis.floor_grid import FloorGrid
-from ipsys_log.analysis.intrinsics_test import find_contradictions
+from ipsys_log.analysis.intrinsics_test import find_contradicted_inputs
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal, observe
 from ipsys_log.analysis.tape import expected_tape_covariances
 from ipsys_log.analysis.taped_points import TapedPoint, choose_points
@@ -197,7 +197,7 @@ def describe_lab(
     fit = fit_without(observations, {point.id for point in points} - used, progress)
     names = [camera.name for camera in observations.cameras]
     frames = ((str(message.camera), message.payload) for message in view.messages(MARKERS))
-    contradictions = [*find_contradictions(frames, lenses, rig)]
+    contradictions = [*find_contradicted_inputs(frames, lenses, rig)]
     return describe_fit(fit, names, run, rig, lenses, goal_m, contradictions)
 
 
@@ -357,7 +357,7 @@ def _describe_camera(
 ) -> CameraResult:
     sightings = fit.observations.sightings[number]
     moving = int((sightings.point < 0).sum())
-    covered, gaps = find_gaps(expected, grid, places_m)
+    covered, gaps = find_floor_gaps(expected, grid, places_m)
     counts = len(sightings) - moving, moving
     return CameraResult(
         expected,

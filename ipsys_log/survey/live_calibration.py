@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.intrinsics_test import find_contradictions
+from ipsys_log.analysis.intrinsics_test import find_contradicted_inputs
 from ipsys_log.analysis.joint_calibration import fit_without, is_nominal
 from ipsys_log.analysis.pairs import active_baselines, active_measurements
 from ipsys_log.errors import IpsysError
@@ -113,7 +113,7 @@ class LiveCalibration:
         )
         fit = fit_without(observations, ())
         frames = ((camera, frame) for camera, seen in markers.items() for frame in seen)
-        contradictions = [*find_contradictions(frames, self._lenses, self._rig)]
+        contradictions = [*find_contradicted_inputs(frames, self._lenses, self._rig)]
         names = sorted(markers)
         return describe_fit(fit, names, "joint", self._rig, self._lenses, self._goal_m, contradictions)
 

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.analysis.consistency import FEWEST_POINTS
 from ipsys_log.analysis.cross_validation import gather_points, leave_one_out
 from ipsys_log.analysis.outliers import find_outliers
@@ -18,7 +19,6 @@ from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
-from ipsys_log.stages.fit import fit_model
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.model_kinds import joint_models
 from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraModel, Model, Rig
-from ipsys_log.models.table import AppliedModel, reads_corners
+from ipsys_log.models.table import AppliedModel
 from ipsys_log.tracking.bias_modes import FLATTEST, BiasModes, CameraNodes, Grid, NodeModes, reduce_modes
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     -------
     BiasModes : without modes if the model has no covariance.
     """
-    joints = _joint_models(model)
+    joints = joint_models(model)
     grid = _grid(model, joints)
     if grid is None:
         return BiasModes.none()
@@ -50,7 +51,7 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     # In a small lab, each camera sees most nodes.
     in_view = len(grid.points_m) * len(model.cameras) > _MOST_NODES
     nodes: Mapping[str, CameraNodes]
-    if reads_corners(model.name):
+    if joints:
         nodes = {
             name: _joint_nodes(joint, grid, height_m, sigma_m, in_view) for name, joint in joints.items()
         }
@@ -68,15 +69,6 @@ def _height_sigma(rig: Rig | None) -> float | None:
     sigmas_m = [rig.height_sigma_of(marker.id) for marker in rig.markers] if rig else []
     known_m = [sigma_m for sigma_m in sigmas_m if sigma_m is not None]
     return float(np.median(known_m)) if known_m else None
-
-
-def _joint_models(model: Model) -> Mapping[str, JointModel]:
-    """Return the joint models of a model by camera; none if it is another model."""
-    if not reads_corners(model.name):
-        return {}
-    from ipsys_log.joint.payload import restore_joint  # late: scipy takes 1 s
-
-    return restore_joint(model)
 
 
 def _grid(model: Model, joints: Mapping[str, JointModel]) -> Grid | None:

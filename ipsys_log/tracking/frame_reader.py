@@ -15,9 +15,11 @@ from ipsys_log.tracking.bias_modes import BiasModes
 from ipsys_log.tracking.filter import UNKNOWN_RAD2, Sightings
 from ipsys_log.tracking.tracks import Robot
 
-# An offset is used after this number of frames that agree within the gates.
+# An offset is used after this number of frames
 _FEWEST_FRAMES = 10
-_AGREES_M, _AGREES_RAD = 0.01, 0.05
+# that agree within these gates.
+_AGREES_M = 0.01
+_AGREES_RAD = 0.05
 # Noise below this is not resolved: it keeps covariances of known heights positive definite.
 _LEAST_M, _LEAST_RAD = 1e-4, 1e-4
 # The usual noise of positions and headings that have none: a few hundredths of a pixel.

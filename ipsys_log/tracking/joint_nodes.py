@@ -11,7 +11,7 @@ from ipsys_log.arrays import Array
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.rotations import level_turns
-from ipsys_log.joint.locate import Positions, locate_markers
+from ipsys_log.joint.locate import LevelPositions, locate_markers
 from ipsys_log.joint.model import JointModel
 from ipsys_log.tracking.bias_modes import FLATTEST
 
@@ -104,7 +104,7 @@ def make_joint_nodes(
     return JointNodes(model, corners_px, height_m, high - low, steep, rows)
 
 
-def _locate(model: JointModel, corners_px: Array, height_m: float) -> Positions:
+def _locate(model: JointModel, corners_px: Array, height_m: float) -> LevelPositions:
     count = len(corners_px)
     variances = np.broadcast_to(_USUAL_PX**2 * np.eye(8), (count, 8, 8))
     return locate_markers(model, corners_px, variances, np.full(count, height_m), np.full(count, _MARKER_M))

@@ -9,11 +9,17 @@ from ipsys_log.tracking.history import History
 from ipsys_log.tracking.motion import MotionNoise, displacement
 from ipsys_log.units import NS_PER_S
 
-# A prediction of this duration is compared every 0.1 s with the robot's position.
-_AHEAD_NS, _EVERY_NS = 400_000_000, 100_000_000
-# Comparisons that the usual motion counts for, and those after which the weight of an old one is 1 / e.
-_PRIOR, _MEMORY = 15, 300
-_LEAST, _LARGEST = 0.1, 10.0
+# A prediction of this duration is compared
+_AHEAD_NS = 400_000_000
+# every 0.1 s with the robot's position.
+_EVERY_NS = 100_000_000
+# Comparisons that the usual motion counts for.
+_PRIOR = 15
+# Comparisons after which the weight of an old one is 1 / e.
+_MEMORY = 300
+# Limits of the growth.
+_LEAST = 0.1
+_LARGEST = 10.0
 
 
 @dataclass(slots=True)

@@ -16,8 +16,14 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import are_collinear
 from ipsys_log.messages import Measurement
 from ipsys_log.report.styles import camera_styles
-from ipsys_log.survey.baseline import baseline_names, read_baseline
-from ipsys_log.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
+from ipsys_log.survey.checks import (
+    EntryCheck,
+    baseline_names,
+    check_entry,
+    next_id,
+    read_baseline,
+    withdrawal_of,
+)
 from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.scene import (
     CameraView,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ipsys_log.analysis.intrinsics_test import find_contradictions
+from ipsys_log.analysis.intrinsics_test import find_contradicted_inputs
 from ipsys_log.geometry.lenses import in_image, project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig, RigMarker
@@ -87,4 +87,4 @@ def sighted(
 def contradictions(frames: list[list[Marker]], lens: CameraCalibration, rig: Rig = RIG) -> list[str]:
     """Return the contradictions of a camera with these intrinsics and markers."""
     seen = [Markers(n * NS, tuple(markers), lens.width, lens.height) for n, markers in enumerate(frames)]
-    return [*find_contradictions((("red", frame) for frame in seen), {"red": lens}, rig)]
+    return [*find_contradicted_inputs((("red", frame) for frame in seen), {"red": lens}, rig)]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.drift import Baseline, MeanCorners, Motion, build_baseline, estimate_motion
+from ipsys_log.analysis.drift import DriftBaseline, MeanCorners, Motion, build_baseline, estimate_motion
 from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.geometry.lenses import intersect_height, project, undistort
 from ipsys_log.geometry.markers import marker_corners
@@ -48,7 +48,7 @@ def corners(
     return means
 
 
-def baseline(own: PosedCamera, means: Mapping[int, MeanCorners]) -> Baseline:
+def baseline(own: PosedCamera, means: Mapping[int, MeanCorners]) -> DriftBaseline:
     return build_baseline(own, floor_grid(own, FLOOR), means, dict.fromkeys(means, LENGTH_M))
 
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, CameraPoints, Marker, Markers, Message, Positions, Rig
+from ipsys_log.models.locate_step import LocatePoints
 from ipsys_log.simulation.cameras import sees
 from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
-from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate
 from tests.geometric.floor_error import (
     KnownSightings,
     Locator,
@@ -195,7 +195,7 @@ def test_models_locate_as_the_stages_do(name: str, lab: GeometricLab, nodes: lis
         seen.camera, seen.corners_px[some], seen.heights_m[some]
     )
     assert covariances_m2 is not None
-    locate, rig = Locate(model), next(m for m in messages if isinstance(m.payload, Rig))
+    locate, rig = LocatePoints(model), next(m for m in messages if isinstance(m.payload, Rig))
     # The locator assumes the usual error of a height.
     list(locate(replace(rig, payload=replace(rig.payload, marker_height_sigma_m=None))))
     for n, corners_px in enumerate(seen.corners_px[some]):

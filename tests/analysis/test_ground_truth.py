@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
-from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.analysis.pairs import TimedPoints
 from ipsys_log.messages import Message, Track, Tracks
 
 MS = 1_000_000
@@ -53,9 +53,9 @@ def test_poses_of_different_instants_count_one_by_one() -> None:
 def test_ground_truth_is_exact_at_its_own_times() -> None:
     rng = np.random.default_rng(0)
     times_ns = START_NS + np.sort(rng.choice(10_000 * MS, 300, replace=False))
-    known = Sightings(times_ns[[0, *range(300)]], rng.normal(size=(301, 3)))
+    known = TimedPoints(times_ns[[0, *range(300)]], rng.normal(size=(301, 3)))
     there = np.sort(rng.choice(300, 200, replace=False))
-    track = Sightings(times_ns[there], rng.normal(size=(200, 3)))
+    track = TimedPoints(times_ns[there], rng.normal(size=(200, 3)))
     found = track_errors({0: track}, {0: known})
     assert found is not None
     # The first of two poses at one time counts.
@@ -82,7 +82,7 @@ def test_instants_at_other_heights_are_counted_and_shown() -> None:
     every = track_errors(tracks, truth)
     assert every is not None
     assert (every.counted, every.others, every.floor) == (3, None, found.whole[1])
-    none = track_errors({0: Sightings(tracks[0].times_ns[2:], tracks[0].points_m[2:])}, truth, True)
+    none = track_errors({0: TimedPoints(tracks[0].times_ns[2:], tracks[0].points_m[2:])}, truth, True)
     assert none is not None
     assert none.counted == 0
     assert none.floor.mean_m == pytest.approx(0.1)

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from ipsys_log.analysis.expected_error import (
     ExpectedErrors,
-    MarkerView,
+    VisibleMarkers,
     expect_errors,
     see_markers,
 )
@@ -55,7 +55,9 @@ def tape_m2(points_m: Array) -> Array:
 
 def test_some_modes_are_those_of_every_nth_node(expected: list[ExpectedErrors]) -> None:
     """The nodes of all cameras are counted together."""
-    few = [replace(one, view=MarkerView(one.view.seen, *(a[:301] for a in one.view[1:]))) for one in expected]
+    few = [
+        replace(one, view=VisibleMarkers(one.view.seen, *(a[:301] for a in one.view[1:]))) for one in expected
+    ]
     few = [replace(one, errors_m=one.errors_m[:301]) for one in few] * 5
     every = sum(len(one.errors_m) for one in few) // 800
     assert every > 1

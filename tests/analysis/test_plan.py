@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ellipe
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, mean_length, plan_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
@@ -19,7 +20,6 @@ from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.stages.fit import fit_model
 from ipsys_log.survey.floor_plan import view_of_model
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.pairs import Sightings
+from ipsys_log.analysis.pairs import TimedPoints
 from ipsys_log.analysis.stationary import is_stationary, stationary_intervals
 from ipsys_log.messages import CameraPoint, CameraPoints
 from ipsys_log.survey.scene import CameraView, observe_marker
@@ -17,13 +17,13 @@ Array = labs.Array
 RATE_HZ = 30
 
 
-def seen(path_m: Array, start_s: float = 0.0, across_m: float = 0.0008, along: float = 0.002) -> Sightings:
+def seen(path_m: Array, start_s: float = 0.0, across_m: float = 0.0008, along: float = 0.002) -> TimedPoints:
     """Return a path (n, 3) of camera points at 30 Hz, with the noise of plain corners."""
     rng = np.random.default_rng(4)
     noisy = path_m * (1 + rng.normal(0, along, (len(path_m), 1)))
     noisy[:, :2] += rng.normal(0, across_m, (len(path_m), 2))
     times_ns = ((start_s + np.arange(len(path_m)) / RATE_HZ) * NS_PER_S).astype(np.int64)
-    return Sightings(times_ns, noisy)
+    return TimedPoints(times_ns, noisy)
 
 
 def laid(*parts: tuple[float, float, float]) -> Array:
@@ -56,7 +56,7 @@ def test_only_a_long_occlusion_splits_an_interval() -> None:
     path = laid((3, 0, 0))
     for gap_s, count in ((1.0, 1), (3.0, 2)):
         first, last = seen(path), seen(path, 3 + gap_s)
-        joined = Sightings(
+        joined = TimedPoints(
             np.concatenate([first.times_ns, last.times_ns]), np.concatenate([first.points_m, last.points_m])
         )
         assert len(stationary_intervals({"red": joined})) == count

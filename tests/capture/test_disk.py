@@ -142,7 +142,6 @@ def test_recording_is_reported_when_the_first_frame_is_on_the_disk(tmp_path: Pat
         # The log has two seconds, whatever the opening of the cameras and the end of the log take.
         status(Message("/cameras/red/image", 12 * NS_PER_S, 12 * NS_PER_S, image, "red"))
         now_s[0] = 900.9
-        status.close()
         assert status.summary()[0] == f"{log} written: 2.0 s, 7.1 kB"
 
 

@@ -66,9 +66,8 @@ def test_row_has_the_contents_of_its_log(folder: Path, tmp_path: Path, ipsys: Ip
         for key in ("rate_hz", "gaps", "longest_gap_s"):
             assert found[key] == channel[key], key
     row = rows_of(target)["2026/golden.mcap"]
-    states = [
-        (one["run"], one["stage"], one["state"]) for one in json.loads(ipsys("runs", GOLDEN, "--json").out)
-    ]
+    listed = json.loads(ipsys("runs", GOLDEN, "--json").out)
+    states = [(one["run"], one["stage"], one["state"]) for one in listed["rows"]]
     assert [(one["run"], one["stage"], one["state"]) for one in row["runs"]] == states
     assert {one["ipsys"] for one in row["runs"]} == {"0.1.0"}
     means = {

@@ -98,7 +98,7 @@ def test_following_the_advice_makes_a_camera_level(ipsys: Ipsys, tmp_path: Path)
     cameras = hung(TILTS)
     before = aligned(ipsys, film(tmp_path / "before.mcap", cameras))["cameras"]
     for name, (tilt_deg, _) in TILTS.items():
-        assert before[name]["tilt_deg"] == pytest.approx(tilt_deg, abs=0.2)
+        assert np.degrees(before[name]["tilt_rad"]) == pytest.approx(tilt_deg, abs=0.2)
         assert before[name]["markers"] == [0, 1, 2, 3, 4, 5]
     assert [before[name]["level"] for name in TILTS] == [True, False, False]
     told = {
@@ -107,10 +107,10 @@ def test_following_the_advice_makes_a_camera_level(ipsys: Ipsys, tmp_path: Path)
     }
     after = aligned(ipsys, film(tmp_path / "after.mcap", told))["cameras"]
     for name in TILTS:
-        assert after[name]["spread_cm"] < 3.0
-        assert after[name]["tilt_deg"] < 0.2
+        assert after[name]["spread_m"] < 0.03
+        assert np.degrees(after[name]["tilt_rad"]) < 0.2
         assert after[name]["level"] is True
-        assert after[name]["spread_cm"] == pytest.approx(before[name]["spread_after_cm"], abs=1.5)
+        assert after[name]["spread_m"] == pytest.approx(before[name]["spread_after_m"], abs=0.015)
 
 
 def test_a_marker_on_a_box_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
@@ -119,8 +119,8 @@ def test_a_marker_on_a_box_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
     white = found["cameras"]["white"]
     assert white["markers"] == [0, 1, 2, 4, 5]
     assert [row["marker"] for row in white["raised"]] == [3]
-    assert white["raised"][0]["above_cm"] == pytest.approx(6.0, abs=1.0)
-    assert white["tilt_deg"] == pytest.approx(1.0, abs=0.2)
+    assert white["raised"][0]["above_m"] == pytest.approx(0.06, abs=0.01)
+    assert np.degrees(white["tilt_rad"]) == pytest.approx(1.0, abs=0.2)
     assert any("marker 3 is 6 cm above the plane" in note for note in found["notes"])
 
 
@@ -137,7 +137,7 @@ def test_align_reads_a_session_with_calibration_points(
     settings = LabSettings(width=960, height=540, markers=8, stations=26, drive_s=1.0)
     for camera in mount_cameras(settings):
         row = found["cameras"][camera.name]
-        assert row["tilt_deg"] == pytest.approx(true_tilt(camera), abs=0.2)
+        assert np.degrees(row["tilt_rad"]) == pytest.approx(true_tilt(camera), abs=0.2)
         assert row["height_m"] == pytest.approx(camera.origin_m[2], abs=0.01)
         assert row["places"] >= 20
     overlaps = {tuple(row["cameras"]): row for row in found["overlaps"]}
@@ -209,7 +209,7 @@ def test_too_few_markers_are_reported(ipsys: Ipsys, tmp_path: Path) -> None:
     assert "no marker was found in 1 frames" in done.err
     one = aligned(ipsys, film(tmp_path / "a.mcap", cameras, places_m=PLACES_M[:1]))
     red = one["cameras"]["red"]
-    assert (red["spread_cm"], red["tilt_deg"], red["level"]) == (None, None, None)
+    assert (red["spread_m"], red["tilt_rad"], red["level"]) == (None, None, None)
     assert "one is not enough" in red["advice"]
     assert any("at least three calibration points" in note for note in one["notes"])
     near = aligned(ipsys, film(tmp_path / "a.mcap", hung({"red": (0.0, 0.0)}), ((0, 0), (0.5, 0), (0, 0.4))))

@@ -107,7 +107,7 @@ def test_all_of_it_as_json_and_in_all_formats(ipsys: Ipsys, red: Path, tmp_path:
     formats = [word for name in ("opencv", "ros", "kalibr") for word in ("--format", name)]
     done = calibrate(ipsys, red, "--board", "6x4", "-o", out, "--json", *formats)
     assert done.code == 0, done.err
-    [found] = json.loads(done.out)
+    [found] = json.loads(done.out)["rows"]
     assert found["files"] == [str(out / name) for name in ("red.yaml", "red_ros.yaml", "red_kalibr.yaml")]
     assert found["camera"] == "red"
     assert found["pictures"]["looked_at"] == 12
@@ -174,7 +174,7 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
     video.release()
     done = calibrate(ipsys, tmp_path / "red.avi", "--board", "6x4", "-o", tmp_path, "--json")
     assert done.code == 0, done.err
-    [found] = json.loads(done.out)
+    [found] = json.loads(done.out)["rows"]
     assert found["pictures"]["looked_at"] == 12
     assert found["parameters"]["fx"] == pytest.approx(LENS[0], abs=5 * found["standard_deviations"]["fx"])
 
@@ -265,7 +265,7 @@ def test_bad_camera_does_not_cost_the_others(ipsys: Ipsys, red: Path, tmp_path: 
     lines = [line for line in done.err.splitlines() if line.startswith("no file for")]
     assert len(lines) == 1
     assert lines[0].startswith("no file for green: ")
-    blue, green, white = json.loads(done.out)
+    blue, green, white = json.loads(done.out)["rows"]
     assert blue["parameters"] == white["parameters"]
     assert green["camera"] == "green"
     assert green["error"] == lines[0].removeprefix("no file for green: ")
@@ -339,7 +339,7 @@ def test_photographs_through_a_lens_of_more_than_180_degrees(
     folder = data / "fisheye_chessboard"
     done = ipsys("calibrate", folder, "--board", "6x4", "-o", tmp_path, "--json")
     assert done.code == 0, done.err
-    [found] = json.loads(done.out)
+    [found] = json.loads(done.out)["rows"]
     assert len(found["pictures"]["used"]) >= 22
     assert found["rms_px"] <= 0.30
     assert found["parameters"]["fx"] == pytest.approx(190.25, abs=4 * found["standard_deviations"]["fx"])
@@ -356,7 +356,7 @@ def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, cam
     board = ("--board", "charuco:4x5", "--dictionary", "DICT_4X4_1000", "--inverted", "--lens", "pinhole")
     done = ipsys("calibrate", folder / f"cam_{camera}.mp4", *board, "-o", tmp_path, "--json")
     assert done.code == 0, done.err
-    [found] = json.loads(done.out)
+    [found] = json.loads(done.out)["rows"]
     for name, expected in (("fx", matrix[0][0]), ("fy", matrix[1][1])):
         assert found["parameters"][name] == pytest.approx(expected, rel=0.02)
         sigma = np.hypot(found["standard_deviations"][name], 0.005 * expected)
@@ -385,7 +385,7 @@ def test_a_recorded_video_gives_the_lens_of_its_pictures(
         done = calibrate(ipsys, source, "--camera", "red", "--board", "6x4", "-o", tmp_path / "x.yaml",
                          "--force", "--json")  # fmt: skip
         assert done.code == 0
-        (one,) = json.loads(done.out)
+        (one,) = json.loads(done.out)["rows"]
         assert one["pictures"]["seen"] == 12
         lens = read_intrinsics(tmp_path / "x.yaml", "red")
         lenses.append(lens.K)

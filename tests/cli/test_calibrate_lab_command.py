@@ -152,21 +152,21 @@ def test_expected_error_agrees_with_the_ground_truth(ipsys: Ipsys, lab: Geometri
     answer = described(ipsys, fitted)
     mean_m, _ = true_error_m(lab, fitted)
     # The error of one lab varies by a factor of about two, because the tape moves all cameras together.
-    assert 0.3 < mean_m * 1000 / answer["mean_mm"] < 2.5
+    assert 0.3 < mean_m / answer["mean_m"] < 2.5
     for camera in answer["cameras"]:
-        assert 0 < camera["mean_mm"] < camera["p95_mm"] < 3 * camera["mean_mm"]
+        assert 0 < camera["mean_m"] < camera["p95_m"] < 3 * camera["mean_m"]
         assert 0.005 < camera["residual_px"] < 0.05
         assert camera["moving"] > 50
 
 
 def test_clock_offset_is_that_of_the_stored_model(ipsys: Ipsys, fitted: Path) -> None:
     """The clocks of the lab are synchronised: their offsets are not significant, so the model stores 0."""
-    printed_ms = {camera["camera"]: camera["clock_ms"] for camera in described(ipsys, fitted)["cameras"]}
+    printed_s = {camera["camera"]: camera["clock_s"] for camera in described(ipsys, fitted)["cameras"]}
     with Session([fitted]) as session:
         (model,) = session.payloads(session.topics(MODEL, "joint"))
-    stored_ms = {name: camera.clock_s * 1000 for name, camera in restore_joint(model).items()}
-    assert printed_ms == stored_ms
-    assert list(printed_ms.values()).count(0.0) >= 2
+    stored_s = {name: camera.clock_s for name, camera in restore_joint(model).items()}
+    assert printed_s == stored_s
+    assert list(printed_s.values()).count(0.0) >= 2
 
 
 def test_a_proposed_point_gives_the_predicted_error(
@@ -175,15 +175,15 @@ def test_a_proposed_point_gives_the_predicted_error(
     """The prediction of the small linear system equals that of a fit with one more taped point."""
     answer = described(ipsys, fitted, "--goal-mm", "0.5")
     best = answer["tape"][0]
-    assert best["mean_after_mm"] < answer["mean_mm"]
-    later = [point["mean_after_mm"] for point in answer["tape"]]
+    assert best["mean_after_m"] < answer["mean_m"]
+    later = [point["mean_after_m"] for point in answer["tape"]]
     assert later == sorted(later, reverse=True)
     point = replace(lab.points[0][0], x_m=best["x_m"], y_m=best["y_m"], z_m=0.0)
     more = replace(lab, points=(*lab.points, (point,)), settings=replace(lab.settings, points=7))
     log = tmp_path / "more.mcap"
     write_log(log, simulate_session(more))
     measured = described(ipsys, log)
-    assert measured["mean_mm"] == pytest.approx(best["mean_after_mm"], rel=0.1)
+    assert measured["mean_m"] == pytest.approx(best["mean_after_m"], rel=0.1)
 
 
 @pytest.mark.slow
@@ -194,12 +194,12 @@ def test_plan_for_joint_names_points_and_a_drive(ipsys: Ipsys, fitted: Path, tmp
     answer = json.loads(done.out)
     places = [(place["x_m"], place["y_m"]) for place in answer["places"]]
     assert len(set(places)) == 3
-    means_cm = [answer["mean_before_cm"], *(place["mean_after_cm"] for place in answer["places"])]
-    assert means_cm == sorted(means_cm, reverse=True)
-    assert means_cm[-1] < 0.9 * means_cm[0]
+    means_m = [answer["mean_before_m"], *(place["mean_after_m"] for place in answer["places"])]
+    assert means_m == sorted(means_m, reverse=True)
+    assert means_m[-1] < 0.9 * means_m[0]
     assert all(place["height_m"] == 0 and place["cameras"] for place in answer["places"])
     drive = answer["drive"]
-    assert drive["mean_after_cm"] < drive["mean_before_cm"] < 1
+    assert drive["mean_after_m"] < drive["mean_before_m"] < 0.01
     assert cv2.imread(str(drawn)) is not None
 
 
@@ -293,7 +293,7 @@ def test_nominal_field_of_view_replaces_a_chessboard(ipsys: Ipsys, lab: Geometri
     answer = described(ipsys, log, "--focal", "1200", "--save-nominal", folder)
     assert any("nominal intrinsics of camera black, red, white" in note for note in answer["notes"])
     assert all(camera["nominal"] for camera in answer["cameras"])
-    assert answer["mean_mm"] < 5
+    assert answer["mean_m"] < 0.005
     mean_m, _ = true_error_m(lab, log)
     assert mean_m < 0.006
     nominal = read_intrinsics(folder / "red.yaml", "red")
@@ -302,7 +302,7 @@ def test_nominal_field_of_view_replaces_a_chessboard(ipsys: Ipsys, lab: Geometri
     assert line.endswith("black.yaml: exists already; give another folder to --save-nominal")
     lenses = [option for c in lab.cameras for option in ("--calibration", f"{c.name}={folder / c.name}.yaml")]
     # Files with nominal values stay nominal, and give the same result.
-    assert described(ipsys, log, *lenses)["mean_mm"] == answer["mean_mm"]
+    assert described(ipsys, log, *lenses)["mean_m"] == answer["mean_m"]
     assert "--save-nominal needs --focal or --field-of-view" in refused(
         ipsys, log, *lenses, "--save-nominal", tmp_path
     )
@@ -412,4 +412,4 @@ def test_live_cameras_are_recorded_and_points_are_asked_for(ipsys: Ipsys, tmp_pa
     assert ipsys("measure", log, "--csv", tmp_path / "lab_tape.csv", "--force").code == 0
     answer = described(ipsys, log)
     assert [camera["camera"] for camera in answer["cameras"]] == ["black", "red", "white"]
-    assert answer["mean_mm"] < 4
+    assert answer["mean_m"] < 0.004

@@ -213,7 +213,7 @@ CAMERAS = ("red", "white", "black")
 
 
 def test_runs_list_their_inputs(ipsys: Ipsys, replayed_lab: Path) -> None:
-    runs = {run["stage"]: run for run in json.loads(ipsys("runs", replayed_lab, "--json").out)}
+    runs = {run["stage"]: run for run in json.loads(ipsys("runs", replayed_lab, "--json").out)["rows"]}
     assert runs["detect"]["parameters"] == {
         "corners": "edges",
         "reset_s": "30",

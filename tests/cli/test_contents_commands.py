@@ -110,7 +110,7 @@ def test_closed_pipe_ends_cat_quietly(options: list[str]) -> None:
 
 
 def test_du_gives_sizes_and_shares_of_the_file(ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch) -> None:
-    [result] = json.loads(ipsys("du", SMALL, "--json").out)
+    [result] = json.loads(ipsys("du", SMALL, "--json").out)["rows"]
     assert result["bytes"] == SMALL.stat().st_size
     stored = sum(row["stored_bytes"] for row in result["channels"])
     assert stored + result["other_bytes"] == result["bytes"]

@@ -147,7 +147,7 @@ def test_mended_model_is_as_good_as_before_the_knock(
     before, after = (_errors_mm(path) for path in (fitted, log))
     assert before > 4.0
     assert after < before / 4
-    runs = json.loads(ipsys("runs", log, "--json").out)
+    runs = json.loads(ipsys("runs", log, "--json").out)["rows"]
     (row,) = [row for row in runs if row["run"] == "joint_mended"]
     assert row["state"] == "not repeatable"
     assert row["parameters"]["mended"] == "white"

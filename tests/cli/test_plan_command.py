@@ -100,11 +100,11 @@ def test_the_plan_as_json(ipsys: Ipsys, fitted: Path) -> None:
     found = planned(ipsys, fitted, "--places", 3)
     assert (found["model"], found["run"]) == ("best", "best")
     assert [place["number"] for place in found["places"]] == [1, 2, 3]
-    before_cm = found["mean_before_cm"]
+    before_m = found["mean_before_m"]
     for place in found["places"]:
-        assert place["mean_before_cm"] == before_cm
-        before_cm = place["mean_after_cm"]
-        assert before_cm < place["mean_before_cm"]
+        assert place["mean_before_m"] == before_m
+        before_m = place["mean_after_m"]
+        assert before_m < place["mean_before_m"]
         x_m, y_m = place["x_m"], place["y_m"]
         assert (x_m, y_m) == (round(x_m, 2), round(y_m, 2))
         assert 0.1 <= x_m <= 4.78
@@ -116,7 +116,7 @@ def test_the_plan_as_json(ipsys: Ipsys, fitted: Path) -> None:
         }
         assert place["side"] == ("left" if y_m > 2.4384 else "right")
         assert set(place["cameras"]) <= {"red", "white", "black"}
-    assert found["mean_after_cm"] == before_cm
+    assert found["mean_after_m"] == before_m
     assert any("little" in note for note in found["notes"])
 
 
@@ -176,13 +176,13 @@ def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -
     first = planned_m[0]
     assert 3.0 < first[0] < 4.8
     assert 2.5 < first[1] < 3.7
-    assert found["mean_after_cm"] < 0.75 * found["mean_before_cm"]
+    assert found["mean_after_m"] < 0.75 * found["mean_before_m"]
     sides = [place["side"] for place in found["places"]]
     assert sides == ["left" if y_m > 2.4384 else "right" for _, y_m in planned_m]
     assert set(sides) == {"left", "right"}
     # With all 40 points per camera, little improvement is left.
     full = planned(ipsys, authors, "--places", 6)
-    assert full["mean_after_cm"] > 0.95 * full["mean_before_cm"]
+    assert full["mean_after_m"] > 0.95 * full["mean_before_m"]
 
 
 def test_plan_without_calibration_points_names_the_first_step(ipsys: Ipsys, paper: Path) -> None:

@@ -54,9 +54,9 @@ def test_imported_truth_scores_as_that_of_the_simulator(tmp_path: Path, ipsys: I
     assert found["rotation_z_rad"] == pytest.approx(0.8, abs=0.005)
     assert found["translation_x_m"] == pytest.approx(3.0, abs=0.02)
     full, lab = (scores[name]["tracks"]["ate"]["2d"] for name in ("full", "lab"))
-    assert full["n"] * 0.9 < lab["n"] <= full["n"] * 1.1
+    assert full["count"] * 0.9 < lab["count"] <= full["count"] * 1.1
     # An alignment hides the constant part of the errors, so it reduces them.
-    assert 0.5 * full["rmse_cm"] < lab["rmse_cm"] < 1.02 * full["rmse_cm"]
+    assert 0.5 * full["rmse_m"] < lab["rmse_m"] < 1.02 * full["rmse_m"]
     page = tmp_path / "lab.html"
     assert ipsys("report", tmp_path / "lab.mcap", "--model", "poly", "--html", page).code == 0
     assert "ATE RMSE" in page.read_text()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Rig, RigMarker
-from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate
+from ipsys_log.models.locate_step import LocatePoints
 from tests import labs
 
 HEIGHT_M = 0.1
@@ -19,7 +19,7 @@ def drive(rng: np.random.Generator, height_m: float) -> np.ndarray:
 
 def located(model: Model, points_m: np.ndarray, rig: Rig) -> list[bool]:
     """Return ``inside`` of the position of each camera point, of a marker at the height in the rig."""
-    locate = Locate(model)
+    locate = LocatePoints(model)
     list(locate(Message("/rig", 0, 0, rig)))
     inside: list[bool] = []
     for point_m in points_m:
@@ -52,7 +52,7 @@ def test_covariance_contains_the_sigma_of_the_height_in_the_rig() -> None:
     point_m = camera.see(np.array([[4.2, 0.9, HEIGHT_M]]), rng)[0]
     sigmas_m = {}
     for sigma_m in (None, 0.01):
-        locate = Locate(model)
+        locate = LocatePoints(model)
         rig = Rig("lab", "DICT_4X4_100", 0.2, marker_height_m=HEIGHT_M, marker_height_sigma_m=sigma_m)
         list(locate(Message("/rig", 0, 0, rig)))
         seen = CameraPoints(0, (CameraPoint(0, *point_m.tolist()),))

@@ -89,9 +89,9 @@ def test_scores_are_those_of_evaluate(packed: Path, ipsys: Ipsys, tmp_path: Path
     for row in stated:
         camera = evaluated[row["model"]]["cameras"]["red"]
         errors = (camera if row["scheme"] == "held_out" else camera[row["scheme"]])[row["dimensions"]]
-        assert row["points"] == errors["n"]
+        assert row["points"] == errors["count"]
         for name in ("mean", "median", "p95", "rmse"):
-            assert row[f"{name}_mm"] == pytest.approx(errors[f"{name}_cm"] * 10, abs=1e-6)
+            assert row[f"{name}_mm"] == pytest.approx(errors[f"{name}_m"] * 1000, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", ["dataset", "dataset.zip"])
@@ -143,7 +143,7 @@ def test_wrong_stated_figure_is_found(dataset: Path, figure: str, ipsys: Ipsys) 
     found = json.loads(done.out)
     assert found["as_stated"] is False
     assert [row["as_stated"] for row in found["comparisons"]] == [False, True, True, True]
-    assert found["comparisons"][0]["difference_mm"] == pytest.approx(0.015, abs=1e-6)
+    assert found["comparisons"][0]["difference_m"] == pytest.approx(15e-6, abs=1e-9)
 
 
 def made_score(
@@ -304,7 +304,8 @@ def test_own_model_is_scored_in_the_same_folds(packed: Path, tmp_path: Path, ips
     polynomial = [row for row in stated if row["model"] == "poly"]
     assert len(found["own"]) == len(polynomial) == 4
     for own, row in zip(found["own"], polynomial, strict=True):
-        assert own == {name: row[name] for name in own} | {"model": "mine.py:Estimator"}
+        in_m = {f"{key[:-3]}_m": value / 1000 for key, value in row.items() if key.endswith("_mm")}
+        assert own == {name: (row | in_m)[name] for name in own} | {"model": "mine.py:Estimator"}
     assert found["as_stated"] is None
 
 

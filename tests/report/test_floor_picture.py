@@ -96,8 +96,10 @@ def messages(rig: Rig | None, moving: bool, truth: bool) -> list[Message]:
     return [*found, Message("/runs/poly/record", end_ns, end_ns, Run(end_ns, "poly", "fuse", number=1))]
 
 
-@pytest.mark.parametrize("models", [(), MODELS[:1], MODELS[:2], MODELS])
-@pytest.mark.parametrize(("moving", "truth"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(
+    ("models", "moving", "truth"),
+    [((), True, False), (MODELS[:1], False, False), (MODELS[:2], True, True), (MODELS, True, True)],
+)
 def test_figure_is_drawn_for_all_kinds_of_data(
     models: tuple[str, ...], moving: bool, truth: bool, tmp_path: Path
 ) -> None:
@@ -141,9 +143,15 @@ def test_log_without_data_to_draw_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "lab.png").exists()
 
 
-@pytest.mark.parametrize("count", [1, 3, 9])
-@pytest.mark.parametrize("cameras", [("red",), ("red", "white", "black"), ("north_east_corner", "south")])
-@pytest.mark.parametrize("truth", [False, True])
+@pytest.mark.parametrize(
+    ("count", "cameras", "truth"),
+    [
+        (1, ("red",), False),
+        (3, ("red", "white", "black"), True),
+        (9, ("red", "white", "black"), True),
+        (9, ("north_east_corner", "south"), False),
+    ],
+)
 def test_no_text_covers_another_or_leaves_the_picture(
     count: int, cameras: tuple[str, ...], truth: bool
 ) -> None:

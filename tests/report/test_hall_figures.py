@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,9 @@ from matplotlib.figure import Figure
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
 from ipsys_log.messages import Floor
+from ipsys_log.report.calibration_figures import clocks_figure, poses_figure
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.html_figures import joint_pictures, other_residual_pictures
-from ipsys_log.report.joint_figures import clocks_figure, poses_figure
-from ipsys_log.report.lab_calibration_figure import _panels
-from ipsys_log.report.learning_figure import _figure
 from ipsys_log.report.points_figure import draw_hulls
 from ipsys_log.simulation.settings import grid_names
 from ipsys_log.sinks.video.composite import _arrange
@@ -85,15 +82,6 @@ def test_clock_labels_of_a_hall_do_not_overlap() -> None:
     assert all(above.y0 >= below.y1 for above, below in pairwise(boxes))
 
 
-@pytest.mark.parametrize(("count", "most_in"), [(3, 14.7), (24, 20.0)])
-def test_learning_curves_of_many_cameras_are_in_rows(count: int, most_in: float) -> None:
-    figure = _figure({name: {} for name in NAMES[:count]}, "title", "error")
-    width_in, height_in = figure.get_size_inches()
-    assert width_in <= most_in
-    assert height_in / width_in < 2
-    assert sum(axes.get_visible() for axes in figure.axes) == count
-
-
 def test_hulls_of_many_cameras_are_grey() -> None:
     class Fitted:
         cameras = NAMES
@@ -129,15 +117,3 @@ def test_video_of_many_cameras_has_the_largest_pictures(count: int, columns: int
     left, places = _arrange(count, (1920, 1080))
     assert len({x for x, *_ in places}) == columns
     assert left <= 960
-
-
-@pytest.mark.parametrize(("count", "columns", "rows"), [(3, 3, 1), (6, 3, 2), (24, 6, 4)])
-def test_maps_of_expected_errors_fit_a_screen(count: int, columns: int, rows: int) -> None:
-    lab: Any = SimpleNamespace(
-        grid=SimpleNamespace(xs_m=np.linspace(0.25, 19.75, 40), ys_m=np.linspace(0.25, 14.75, 30))
-    )
-    panels = _panels(lab, count)
-    assert panels.columns == columns
-    # A screen of 1920 x 1080 px, at 100 px per inch.
-    assert columns * (panels.width_in + panels.gap_in) < 17.4
-    assert rows * panels.row_in < 9.8

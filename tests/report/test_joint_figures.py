@@ -10,10 +10,10 @@ import pytest
 
 from ipsys_log.analysis.calibrated_cameras import CalibratedCamera, ImageResiduals
 from ipsys_log.messages import Floor, Rig
+from ipsys_log.report.calibration_figures import clocks_figure, poses_figure, residuals_figure
 from ipsys_log.report.figures import png
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.html_figures import joint_pictures
-from ipsys_log.report.joint_figures import clocks_figure, poses_figure, residuals_figure
 from tests import labs
 
 CAMERAS = ("black", "red")

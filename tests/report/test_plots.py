@@ -50,7 +50,7 @@ def test_tables_1_and_2_are_the_figures_of_the_json(paper: Findings) -> None:
         for row in rows:
             for camera, figures in models[row["method"]]["cameras"].items():
                 for name in ("mean", "min", "max", "std"):
-                    assert row[f"{name}_cm_{camera}"] == f"{figures[kind][f'{name}_cm']:.3f}"
+                    assert row[f"{name}_cm_{camera}"] == f"{100 * figures[kind][f'{name}_m']:.3f}"
 
 
 def test_the_table_of_cross_validation_is_the_json(paper: Findings) -> None:
@@ -62,9 +62,9 @@ def test_the_table_of_cross_validation_is_the_json(paper: Findings) -> None:
         figures = (model["pooled"] if row["camera"] == "all" else model["cameras"][row["camera"]])[
             "cross_validation"
         ]
-        assert row["mean_3d_cm"] == f"{figures['3d']['mean_cm']:.3f}"
-        assert row["mean_high_2d_cm"] == f"{figures['2d']['mean_high_cm']:.3f}"
-        assert row["bias_z_cm"] == f"{figures['bias_cm'][2]:.3f}"
+        assert row["mean_3d_cm"] == f"{100 * figures['3d']['mean_m']:.3f}"
+        assert row["mean_high_2d_cm"] == f"{100 * figures['2d']['mean_high_m']:.3f}"
+        assert row["bias_z_cm"] == f"{100 * figures['bias_m'][2]:.3f}"
         assert row["within_95"] == f"{figures['within']['95']:.4f}"
 
 

@@ -121,7 +121,7 @@ def test_errors_are_those_of_the_messages(log: Path) -> None:
     with Session([log]) as session:
         result = robot_run_json(read_robot_run(session))
     cart, van = result["robots"]
-    assert (result["seconds"], result["nearest_m"]) == (4.0, None)
+    assert (result["duration_s"], result["nearest_m"]) == (4.0, None)
     assert (cart["finished"], van["finished"]) == (True, False)
     first, second = cart["waypoints"]
     assert [(row["number"], row["x_m"], row["arrival_s"]) for row in (first, second)] == [

@@ -78,8 +78,8 @@ def test_rmse_is_that_of_the_residuals(paper: Findings) -> None:
             place = cameras[row.camera] if row.camera else models[accuracy.model]["pooled"]
             place = place["cross_validation"] if row.scheme == "cross_validation" else place
             for kind, axes in (("3d", 3), ("2d", 2)):
-                wanted_cm = 100 * np.sqrt(np.mean(errors_of(rows, row, axes) ** 2))
-                assert place[kind]["rmse_cm"] == pytest.approx(wanted_cm, rel=1e-9)
+                wanted_m = np.sqrt(np.mean(errors_of(rows, row, axes) ** 2))
+                assert place[kind]["rmse_m"] == pytest.approx(wanted_m, rel=1e-9)
                 checked += 1
     assert checked == 2 * 2 * (3 + 1) * 2
 
@@ -95,12 +95,12 @@ def test_rmse_is_in_the_table_and_the_csv(paper: Findings) -> None:
     found = accuracy_json(paper.accuracies)["models"]["poly"]["pooled"]["cross_validation"]
     text = printed(paper.accuracies)
     (row,) = [line for line in text.splitlines() if line.startswith("poly ")]
-    assert f"{found['3d']['rmse_cm']:.2f}" in row.split()
-    assert f"{found['2d']['rmse_cm']:.2f}" in row.split()
+    assert f"{100 * found['3d']['rmse_m']:.2f}" in row.split()
+    assert f"{100 * found['2d']['rmse_m']:.2f}" in row.split()
     rows = csv.DictReader(io.StringIO(cross_validation_csv(paper).decode()))
     (line,) = [one for one in rows if (one["method"], one["camera"]) == ("poly", "all")]
-    assert line["rmse_3d_cm"] == f"{found['3d']['rmse_cm']:.3f}"
-    assert line["rmse_2d_cm"] == f"{found['2d']['rmse_cm']:.3f}"
+    assert line["rmse_3d_cm"] == f"{100 * found['3d']['rmse_m']:.3f}"
+    assert line["rmse_2d_cm"] == f"{100 * found['2d']['rmse_m']:.3f}"
 
 
 def test_rmse_of_unknown_repeats_is_missing(paper: Findings) -> None:
@@ -109,8 +109,8 @@ def test_rmse_of_unknown_repeats_is_missing(paper: Findings) -> None:
     bare = tuple(replace(row, residuals=()) for row in accuracy.evaluation.cameras)
     found = replace(accuracy, evaluation=replace(accuracy.evaluation, cameras=bare))
     pooled = accuracy_json([found])["models"][accuracy.model]["pooled"]
-    assert "rmse_cm" not in pooled["cross_validation"]["3d"]
-    assert "rmse_cm" in pooled["3d"]
+    assert "rmse_m" not in pooled["cross_validation"]["3d"]
+    assert "rmse_m" in pooled["3d"]
     assert "-" in printed([found])
 
 
@@ -119,21 +119,16 @@ def test_answer_names_model_error_and_outliers_first(paper: Findings) -> None:
     first, *rest = printed(accuracies, 200).splitlines()
     assert first == "Best model: poly"
     found = accuracy_json(accuracies)["models"]["poly"]["pooled"]["cross_validation"]["3d"]
-    assert rest[0].startswith(f"Mean distance to the tape points: {found['mean_cm']:.1f} cm (95 % CI ")
-    assert f"RMSE {found['rmse_cm']:.1f} cm" in rest[0]
+    assert rest[0].startswith(f"Mean distance to the tape points: {100 * found['mean_m']:.1f} cm (95 % CI ")
+    assert f"RMSE {100 * found['rmse_m']:.1f} cm" in rest[0]
     text = "\n".join(rest)
     outliers, errors = text.index("Outliers: measure 5 points again"), text.index("Errors in cm")
     assert outliers < text.index("white_11, error 8.0 cm: 2: it lies right") < errors
     assert outliers < text.index("m5 (6.0 cm)") < text.index("Between rigid and poly, use rigid") < errors
     assert "\x1b" not in text
     assert NAMES[0] in text
-    assert answer_json(accuracies)["answer"] == {
-        "model": "poly",
-        "scheme": "cross_validation",
-        "mean_cm": found["mean_cm"],
-        "rmse_cm": found["rmse_cm"],
-        "outliers": list(NAMES),
-    }
+    answer = {"model": "poly", "scheme": "cross_validation", "outliers": list(NAMES)}
+    assert answer_json(accuracies)["answer"] == answer | found
 
 
 @pytest.mark.parametrize("truth", [False, True])
@@ -161,18 +156,18 @@ def test_figures_are_without_gross_outliers_and_those_with_them_beside(paper: Fi
     found = accuracy_json(accuracies)["models"]
     best = answer_json(accuracies)["answer"]
     model = found[best["model"]]
-    mean_cm = model["pooled"]["cross_validation"]["3d"]["mean_cm"]
+    mean_m = model["pooled"]["cross_validation"]["3d"]["mean_m"]
     assert model["pooled"] == clean[best["model"]]["pooled"]
-    whole = model["with_excluded"]["pooled"]["cross_validation"]["3d"]["mean_cm"]
-    assert whole == pytest.approx(10 * mean_cm)
+    whole = model["with_excluded"]["pooled"]["cross_validation"]["3d"]["mean_m"]
+    assert whole == pytest.approx(10 * mean_m)
     assert [row["measurement"] for row in model["excluded"]] == ["gross_1"]
-    assert (best["mean_cm"], best["excluded"], best["outliers"][0]) == (mean_cm, ["gross_1"], "gross_1")
-    assert best["mean_with_excluded_cm"] == pytest.approx(10 * mean_cm)
+    assert (best["mean_m"], best["excluded"], best["outliers"][0]) == (mean_m, ["gross_1"], "gross_1")
+    assert best["mean_with_excluded_m"] == pytest.approx(10 * mean_m)
     words = " ".join(text.split())
-    assert f"Mean distance to the tape points: {mean_cm:.1f} cm" in words
+    assert f"Mean distance to the tape points: {100 * mean_m:.1f} cm" in words
     assert (
         "The errors and the advice are without the gross outlier gross_1. With it, the mean error is "
-        f"{10 * mean_cm:.1f} cm."
+        f"{1000 * mean_m:.1f} cm."
     ) in words
     assert "gross_1, error 200.0 cm: they look exchanged." in words
     assert "3D, all points" in words
@@ -193,9 +188,9 @@ def test_tracks_name_the_instants_that_count(paper: Findings) -> None:
     ) in words
     found = accuracy_json([told])["models"]["rayplane"]["tracks"]
     assert found["instants"] == {"counted": 228, "all": 520}
-    assert found["truth"]["2d"]["mean_cm"] == pytest.approx(0.1)
-    assert found["other_heights"]["2d"]["n"] == 292
-    assert found["all_heights"]["2d"]["mean_cm"] == pytest.approx(2.9)
+    assert found["truth"]["2d"]["mean_m"] == pytest.approx(0.001)
+    assert found["other_heights"]["2d"]["count"] == 292
+    assert found["all_heights"]["2d"]["mean_m"] == pytest.approx(0.029)
 
 
 def test_single_model_has_one_row_per_camera(paper: Findings) -> None:

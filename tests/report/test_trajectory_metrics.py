@@ -135,13 +135,13 @@ def test_json_has_ate_and_rpe_of_each_robot(accuracies: list[Accuracy], log: Pat
     assert [*tracks["robots"]] == [*by_robot] == ["ada", "bob"]
     for robot, errors in by_robot.items():
         ate = tracks["robots"][robot]["ate"]
-        assert ate["3d"]["rmse_cm"] == pytest.approx(root_mean_square_m(errors.absolute_3d) * 100)
-        assert ate["2d"]["n"] == 360
-    squares = [tracks["robots"][robot]["ate"]["3d"]["rmse_cm"] ** 2 for robot in by_robot]
-    assert tracks["ate"]["3d"]["rmse_cm"] == pytest.approx(np.sqrt(np.mean(squares)))
-    assert tracks["ate"]["3d"]["rmse_cm"] == pytest.approx(tracks["truth"]["3d"]["rmse_cm"])
+        assert ate["3d"]["rmse_m"] == pytest.approx(root_mean_square_m(errors.absolute_3d))
+        assert ate["2d"]["count"] == 360
+    squares = [tracks["robots"][robot]["ate"]["3d"]["rmse_m"] ** 2 for robot in by_robot]
+    assert tracks["ate"]["3d"]["rmse_m"] == pytest.approx(np.sqrt(np.mean(squares)))
+    assert tracks["ate"]["3d"]["rmse_m"] == pytest.approx(tracks["truth"]["3d"]["rmse_m"])
     assert [(one["delta"], one["unit"]) for one in tracks["rpe"]] == [(1.0, "m"), (1.0, "s")]
-    assert tracks["rpe"][1]["n"] == 2 * 330
+    assert tracks["rpe"][1]["count"] == 2 * 330
 
 
 def test_table_of_metrics_fits_a_terminal(accuracies: list[Accuracy]) -> None:
@@ -151,9 +151,9 @@ def test_table_of_metrics_fits_a_terminal(accuracies: list[Accuracy]) -> None:
     text = output.getvalue()
     pooled = accuracy_json(accuracies)["models"]["poly"]["tracks"]
     row = next(line for line in text.splitlines() if "(all)" in line)
-    assert f"{pooled['ate']['3d']['rmse_cm']:.2f}" in row.split()
-    assert f"{pooled['rpe'][0]['rmse_cm']:.2f}" in row.split()
+    assert f"{100 * pooled['ate']['3d']['rmse_m']:.2f}" in row.split()
+    assert f"{100 * pooled['rpe'][0]['rmse_m']:.2f}" in row.split()
     assert "…" not in text
     console.print(answer_text(accuracies))
     line = " ".join(output.getvalue().split())
-    assert f"(ATE): RMSE {pooled['ate']['3d']['rmse_cm']:.2f} cm in 3D" in line
+    assert f"(ATE): RMSE {100 * pooled['ate']['3d']['rmse_m']:.2f} cm in 3D" in line

@@ -114,7 +114,7 @@ def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, whole: Path,
     assert len(tracks) == len(damped) > 0
     assert tracks[-1].tracks[0].x_m != damped[-1].tracks[0].x_m
     assert all(one.equal for one in verify([whole], None, lambda stage, done, total: None))
-    rows = json.loads(ipsys("runs", whole, "--json").out)
+    rows = json.loads(ipsys("runs", whole, "--json").out)["rows"]
     assert {row["stage"]: row["state"] for row in rows}["damp"] == "current"
 
 

@@ -159,7 +159,7 @@ CASES: dict[str, Case] = {
         change=edit(CompressedImage, lambda image: replace(image, data=b"no image")),
     ),
     # Names that the user gives.
-    "method": Case(said="method 'x' is not known", command="replay LOG --method x"),
+    "method": Case(said="--method x: is not known", command="replay LOG --method x"),
     "pose": Case(
         said="has no effect, because the log has no markers", before="camera-frame LOG", late=True,
         change=without(Markers), command="replay LOG --method pose",

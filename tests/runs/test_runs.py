@@ -241,7 +241,7 @@ def test_model_contains_its_calibration_points(ipsys: Ipsys, paper: Path, tmp_pa
     assert ipsys("fit", plain, "-o", fitted).code == 0
     done = ipsys("evaluate", plain, "--model-from", fitted, "--json")
     assert done.code == 0, done.err
-    counts = {c: e["3d"]["n"] for c, e in json.loads(done.out)["models"]["poly"]["cameras"].items()}
+    counts = {c: e["3d"]["count"] for c, e in json.loads(done.out)["models"]["poly"]["cameras"].items()}
     with Session([plain]) as session:
         total = len(session.payloads(["/measurements"]))
     # A fifth of the points was held out by fit; only these count.
@@ -326,8 +326,8 @@ def test_the_truth_is_compared_only_where_it_is_known(ipsys: Ipsys, paper: Path)
     log = without(paper, lambda m: isinstance(m.payload, Tracks) and m.log_time_ns < middle)
     cameras = json.loads(ipsys("replay", log, "--json").out)["models"]["poly"]["cameras"]
     for errors in cameras.values():
-        assert "truth" not in errors or errors["truth"]["3d"]["n"] < errors["3d"]["n"]
-        assert "truth" not in errors or errors["truth"]["3d"]["mean_cm"] < 2
+        assert "truth" not in errors or errors["truth"]["3d"]["count"] < errors["3d"]["count"]
+        assert "truth" not in errors or errors["truth"]["3d"]["mean_m"] < 0.02
 
 
 @pytest.mark.slow
@@ -351,7 +351,7 @@ def test_rig_of_a_log_can_be_exported_edited_and_used(ipsys: Ipsys, replayed: Pa
     path.write_text(path.read_text().replace("marker_length_m = 0.2", "marker_length_m = 0.19"))
     assert runs_of(ipsys, "replay", replayed, "--rig", path)["camera-frame"] == ("edges_2", True)
     assert "0.19 m" in ipsys("runs", replayed).out
-    runs = json.loads(ipsys("runs", replayed, "--json").out)
+    runs = json.loads(ipsys("runs", replayed, "--json").out)["rows"]
     lengths = [run["rig"]["marker_length_m"] for run in runs if run["rig"]]
     assert lengths == [0.19]
 

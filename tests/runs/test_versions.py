@@ -32,7 +32,7 @@ def log(replayed_lab: Path) -> Path:
 def states(ipsys: Ipsys, log: Path) -> Rows:
     done = ipsys("runs", log, "--json")
     assert done.code == 0, done.err
-    return {(row["run"], row["stage"]): row for row in json.loads(done.out)}
+    return {(row["run"], row["stage"]): row for row in json.loads(done.out)["rows"]}
 
 
 def made(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
@@ -141,7 +141,10 @@ def test_state_does_not_depend_on_the_order_of_logs(
     assert ipsys("verify", last, first, lab).code == 0
     monkeypatch.setitem(VERSIONS, "perimeter", VERSIONS["perimeter"] + 1)
     found = [
-        {(row["run"], row["stage"]): row["state"] for row in json.loads(ipsys("runs", *logs, "--json").out)}
+        {
+            (row["run"], row["stage"]): row["state"]
+            for row in json.loads(ipsys("runs", *logs, "--json").out)["rows"]
+        }
         for logs in ((lab, first, last), (last, first, lab))
     ]
     assert found[0] == found[1]

@@ -194,7 +194,8 @@ def _sheet(folder: Path, target: Path) -> None:
     """Write the distances of the lab's measurements as a sheet, for points with a stationary marker."""
     log = read_log(folder / "lab.mcap")
     start_ns = min(entry.log_time_ns for entry in log.entries)
-    places = json.loads((folder / "0_measure.json").read_text())
+    found = json.loads((folder / "0_measure.json").read_text())
+    places = found if isinstance(found, list) else found["rows"]  # a list before format 2
     rows = ["marker,d_A_cm,d_B_cm,side,height_cm,place,id"]
     for entry in log.entries:
         if entry.topic != "/measurements":

@@ -25,8 +25,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.ros2 import read_ros2
 from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage, Track
 from ipsys_log.messages.channels import MARKERS, TRACKS
-from ipsys_log.sinks.streams.ros2_messages import CAMERA_INFO, encode_camera_info
-from ipsys_log.sinks.streams.ros2_types import text_of
+from ipsys_log.sinks.streams.ros2_messages import CAMERA_INFO, encode_camera_info, text_of
 from tests.conftest import Ipsys
 from tests.exchange.pictured_lab import RUN, START_NS, STEP_NS, PicturedLab, image, track
 

@@ -22,7 +22,7 @@ from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Qos, attachment, gid, topic_key
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
-from ipsys_log.sinks.streams.ros2_types import type_hash
+from ipsys_log.sinks.streams.ros2_messages import type_hash
 from ipsys_log.units import NS_PER_S
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed

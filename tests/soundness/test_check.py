@@ -361,7 +361,7 @@ def test_states_of_runs_are_those_of_the_list_of_runs(replayed_lab: Path, ipsys:
     result = check(stock_copy(replayed_lab, other_lens))
     texts = [finding.text for finding in result.remarks]
     assert "run edges, detect: out of date: the lens of red changed" in texts
-    listed = json.loads(ipsys("runs", replayed_lab.with_name("copy.mcap"), "--json").out)
+    listed = json.loads(ipsys("runs", replayed_lab.with_name("copy.mcap"), "--json").out)["rows"]
     assert {text.split(": ", 1)[1] for text in texts} <= {row["state"] for row in listed}
 
     def without_record(topic: str, times: Times) -> Times | None:

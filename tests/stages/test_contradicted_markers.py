@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.messages import CameraCalibration, CameraPoints, Event, Marker, Markers, Message, Pair
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
+from ipsys_log.models.locate_step import LocatePoints
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
 from ipsys_log.stages.camera_frame import STAGE as CAMERA_FRAME
 from ipsys_log.stages.detect import STAGE as DETECT
 from ipsys_log.stages.detect.reports import LensInUse, Reports
-from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate
 from tests.analysis.marked_floor import FISHEYE, RIG, changed, sighted
 
 
@@ -69,7 +69,7 @@ def test_positions_of_marked_markers_are_not_inside(method: str) -> None:
     frames = sighted(FISHEYE, np.random.default_rng(1), frames=20)
     places_m = [np.array([p.x_m, p.y_m, p.z_m]) for seen in frames for p in camera_points(seen).points]
     pairs = [Pair(str(n), 0, place_m, place_m, 1) for n, place_m in enumerate(places_m)]
-    locate = Locate(fit_model("poly", {"red": pairs}, 0))
+    locate = LocatePoints(fit_model("poly", {"red": pairs}, 0))
     for contradicted in (None, True):
         points = camera_points(frames[0], contradicted)
         (positions,) = locate(Message("t", 1, 1, points, "red"))

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from ipsys_log.analysis.accuracy import POOLED, error_statistics, evaluate_cross_validated, evaluate_held_out
-from ipsys_log.analysis.camera_models import height_sigmas
+from ipsys_log.analysis.camera_models import fit_model, height_sigmas
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
     Study,
@@ -24,13 +24,12 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.analysis.point_evaluation import evaluate_model
 from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import AppliedModel, group_dependent_cameras, min_pairs
-from ipsys_log.stages.evaluate import evaluate_model
-from ipsys_log.stages.fit import fit_model
 from tests import labs
 
 POINTS = np.random.default_rng(0).uniform((-2, -1, 1.9), (2, 1, 2.1), (14, 3))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Pair, Rig
-from ipsys_log.stages.fit import fit_model
-from ipsys_log.stages.locate import Locate
+from ipsys_log.models.locate_step import LocatePoints
 
 RIG = Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, marker_height_m=0.1))
 
@@ -25,7 +25,7 @@ def test_heading_under_a_tilted_camera_is_that_of_a_level_marker(model: str, mos
     pairs = [
         Pair(str(n), 0, seen, place, 1) for n, (seen, place) in enumerate(zip(camera_m, world_m, strict=True))
     ]
-    locate = Locate(fit_model(model, {"red": pairs}, 0))
+    locate = LocatePoints(fit_model(model, {"red": pairs}, 0))
     list(locate(RIG))
     places_m = np.column_stack([rng.uniform(1.3, 2.7, (40, 2)), np.full(40, 0.1)])
     headings = rng.uniform(-np.pi, np.pi, 40)

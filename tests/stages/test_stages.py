@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.messages import (
     CameraPoint,
@@ -21,10 +22,9 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
+from ipsys_log.models.locate_step import LocatePoints
 from ipsys_log.stages.detect import Detect
-from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.fuse import Fuse
-from ipsys_log.stages.locate import Locate
 
 RIG = Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3, robot="ada"),)))
 
@@ -68,7 +68,7 @@ def test_the_world_heading_follows_the_model() -> None:
     points = np.random.default_rng(0).uniform((-1, -1, 1.9), (1, 1, 2.1), (20, 3))
     world = turn.apply(points) + 2.0
     pairs = [Pair(str(n), 0, p, w, 1) for n, (p, w) in enumerate(zip(points, world, strict=True))]
-    locate = Locate(fit_model("rigid", {"red": pairs}, 0))
+    locate = LocatePoints(fit_model("rigid", {"red": pairs}, 0))
     angle = -0.7  # in the image; the heading is minus this angle
     seen = CameraPoints(1, (CameraPoint(3, 0.1, 0.2, 2.0, -angle), CameraPoint(4, 0.1, 0.2, 2.0)))
     (positions,) = locate(Message("t", 1, 1, seen, "red"))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
@@ -32,6 +33,7 @@ from ipsys_log.messages import (
     Vector3,
 )
 from ipsys_log.messages.channels import POSITIONS, TRACKS
+from ipsys_log.models.locate_step import LocatePoints
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
@@ -39,8 +41,7 @@ from ipsys_log.runs.stream import run, wire
 from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.lab import drive_start_ns, simulate
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.stages import fuse, locate
-from ipsys_log.stages.fit import fit_model
+from ipsys_log.stages import fuse
 
 MS = 1_000_000
 RIG = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2, tuple(RigMarker(n) for n in range(9))))
@@ -50,7 +51,7 @@ def test_locate_hands_the_offset_on() -> None:
     seen_m = np.random.default_rng(0).uniform((-1, -1, 1.9), (1, 1, 2.1), (20, 3))
     pairs = [Pair(str(n), 0, point_m, point_m + 1.0, 1) for n, point_m in enumerate(seen_m)]
     points = CameraPoints(1, (CameraPoint(3, 0.1, 0.2, 2.0, None, 17), CameraPoint(4, 0.1, 0.2, 2.0)))
-    (found,) = locate.Locate(fit_model("rigid", {"red": pairs}, 0))(Message("t", 1, 1, points, "red"))
+    (found,) = LocatePoints(fit_model("rigid", {"red": pairs}, 0))(Message("t", 1, 1, points, "red"))
     assert [position.time_offset_ns for position in found.positions] == [17, None]
 
 

@@ -14,8 +14,7 @@ from ipsys_log.analysis.pairs import active_baselines, active_measurements
 from ipsys_log.cli import dialog
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Measurement, ReferencePoint, Rig
-from ipsys_log.survey.baseline import needs_baseline, read_baseline
-from ipsys_log.survey.checks import withdrawal_of
+from ipsys_log.survey.checks import needs_baseline, read_baseline, withdrawal_of
 from ipsys_log.survey.scene import CameraView, StationaryInterval
 from ipsys_log.web.server import serve
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import pose_facing_up, transform
@@ -17,7 +18,6 @@ from ipsys_log.joint.model import JointModel
 from ipsys_log.joint.payload import joint_payload, restore_joint
 from ipsys_log.messages import Model, Pair, Rig, RigMarker
 from ipsys_log.models.table import AppliedModel
-from ipsys_log.stages.fit import fit_model
 from ipsys_log.tracking import bias_modes as modes_module
 from ipsys_log.tracking import calibration_modes as table_module
 from ipsys_log.tracking.bias_modes import LOCAL_M, BiasModes, Grid, NodeModes, reduce_modes

@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from ipsys_log.messages import CameraCalibration, CameraModel, CompressedImage, Model, Pair
 from ipsys_log.units import NS_PER_S
 from ipsys_log.web.dashboard.feed import Feed
-from ipsys_log.web.dashboard.floor import describe_floor
+from ipsys_log.web.dashboard.map import describe_floor, ellipse_of
 from ipsys_log.web.dashboard.pictures import shrink
-from ipsys_log.web.dashboard.robots import ellipse_of
 from ipsys_log.web.dashboard.status import RecentEvents
 from tests.stages.drawing import jpeg
 from tests.web.dashboards import (

@@ -16,8 +16,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import LATENCY, TRACKS
 from ipsys_log.player import Player
 from ipsys_log.sinks.playback import PlaybackOptions
+from ipsys_log.web.dashboard.app import dashboard_of_player
 from ipsys_log.web.dashboard.pictures import EVERY_NS
-from ipsys_log.web.dashboard.sources import dashboard_of_player
 from ipsys_log.web.dashboard.state import PlayedLog
 from tests.cli.test_stream_command import started, stop
 from tests.conftest import Ipsys

@@ -17,7 +17,7 @@ from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
-from ipsys_log.sinks.streams.ros2_types import is_stampable, type_hash
+from ipsys_log.sinks.streams.ros2_messages import is_stampable, type_hash
 
 _NODE = "ipsys"
 _MOST_DOMAIN = 232

@@ -1,4 +1,4 @@
-"""Poses, images and camera intrinsics as messages of ROS 2: axes and frames by REP 103 and REP 105.
+"""Messages of ROS 2: their types, and poses, images and intrinsics by REP 103 and REP 105.
 
 The axes of the lab are those of the frame ``map``: x and y on the floor, z up, m and rad. The frame of a
 robot has the robot's name; its origin is the marker, and x points along the heading.
@@ -7,22 +7,74 @@ robot has the robot's name; its origin is the marker, and x points along the hea
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from math import cos, sin, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.rotations import quaternion
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
-from ipsys_log.sinks.streams.ros2_types import encode, make, make_header, make_time, message_class
 from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from ipsys_log.geometry.posed_camera import PosedCamera
+
+# Jazzy and Kilted have the same definitions of these messages.
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+_LAST_S = 2**31
+
+
+def type_hash(ros_type: str) -> str:
+    """Return the hash of a message type (REP 2016), ``RIHS01_`` and 64 characters."""
+    return str(_STORE.hash_rihs01(ros_type))
+
+
+def text_of(ros_type: str) -> str:
+    """Return the definition of a message type with all types that it contains, as in a bag (``ros2msg``)."""
+    return str(_STORE.generate_msgdef(ros_type, ros_version=2)[0])
+
+
+def is_stampable(time_ns: int) -> bool:
+    """Return whether a stamp of ROS 2 can hold a time: it ends in 2038."""
+    return 0 <= time_ns < _LAST_S * NS_PER_S
+
+
+def message_class(ros_type: str) -> Any:
+    """Return the class of a message type, with its constants."""
+    return _STORE.types[ros_type]
+
+
+def make(name: str, *values: Any) -> Any:
+    """Return a message of a type such as ``std_msgs/Header``, with the values of its fields."""
+    return _class_of(name)(*values)
+
+
+@cache
+def _class_of(name: str) -> Any:
+    package, _, short = name.partition("/")
+    return message_class(f"{package}/msg/{short}")
+
+
+def encode(message: Any, ros_type: str) -> bytes:
+    """Return the bytes of a message."""
+    return bytes(_STORE.serialize_cdr(message, ros_type))
+
+
+def make_time(time_ns: int) -> Any:
+    """Return the stamp of a time in ns."""
+    return make("builtin_interfaces/Time", *divmod(time_ns, NS_PER_S))
+
+
+def make_header(time_ns: int, frame: str) -> Any:
+    """Return the header of a message: its stamp, and its coordinate frame."""
+    return make("std_msgs/Header", make_time(time_ns), frame)
+
 
 MAP = "map"
 TF, CLOCK = "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock"

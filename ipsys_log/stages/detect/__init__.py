@@ -15,7 +15,6 @@ from ipsys_log.geometry.lenses import check_calibration, check_size, same_intrin
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import Video
 from ipsys_log.messages import (
-    FRAME_SKIPPED,
     CameraCalibration,
     Color,
     CompressedVideo,
@@ -40,6 +39,7 @@ from ipsys_log.messages.channels import (
     RIG,
     RUN_EVENTS,
 )
+from ipsys_log.messages.events import skipped_frames
 from ipsys_log.messages.stage import Pieces, Plan, Resets, Stage, StageView
 from ipsys_log.stages.detect.adjustment import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
@@ -325,11 +325,6 @@ def _drawing(time_ns: int, markers: tuple[Marker, ...]) -> ImageAnnotations:
 def usual_corners(cameras: Iterable[str], with_lens: Collection[str]) -> str:
     """Return the corner method that is used if none is named: edges if all cameras have intrinsics."""
     return EDGES if set(cameras) <= set(with_lens) else STOCK
-
-
-def skipped_frames(events: Iterable[Event]) -> set[int]:
-    """Return the log times in ns of the frames that live processing skipped."""
-    return {event.timestamp for event in events if event.kind == FRAME_SKIPPED}
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:

@@ -9,7 +9,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import EVENTS_TOPIC, Event
 from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
 from ipsys_log.plain_text import plain_text
-from ipsys_log.web.operator_seat import OperatorSeat
+from ipsys_log.web.access import OperatorSeat
 
 _LONGEST_TEXT, _LONGEST_NAME = 200, 40
 

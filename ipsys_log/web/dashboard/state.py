@@ -29,14 +29,13 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.player import Player
-from ipsys_log.sinks.played_topics import PlayedScene
+from ipsys_log.sinks.selection import PlayedScene
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.units import NS_PER_S
-from ipsys_log.web.dashboard.floor import describe_floor
+from ipsys_log.web.dashboard.map import Robots, describe_floor
 from ipsys_log.web.dashboard.operator import Operator
 from ipsys_log.web.dashboard.pictures import EVERY_NS, Pictures
-from ipsys_log.web.dashboard.robots import Robots
 from ipsys_log.web.dashboard.status import (
     CameraStatus,
     RecentEvents,

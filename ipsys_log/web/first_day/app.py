@@ -20,12 +20,10 @@ from ipsys_log.first_day.session import Pages, SetupSession
 from ipsys_log.first_day.work import LiveRecording
 from ipsys_log.survey.entry import Fault
 from ipsys_log.survey.live import LiveScene
-from ipsys_log.web.access import MAY_WRITE
+from ipsys_log.web.access import MAY_WRITE, OperatorSeat, answer_claim, operator_of
 from ipsys_log.web.app import build_app
-from ipsys_log.web.dashboard.app import build_dashboard
-from ipsys_log.web.dashboard.sources import dashboard_of_recording
+from ipsys_log.web.dashboard.app import build_dashboard, dashboard_of_recording
 from ipsys_log.web.dashboard.state import Dashboard
-from ipsys_log.web.operator_seat import OperatorSeat, answer_claim, operator_of
 from ipsys_log.web.requests import ERROR_HANDLERS, answer_file, read_json
 
 Body = Mapping[str, Any]

@@ -1,15 +1,19 @@
-"""Result of a joint calibration of a lab as text, table and JSON."""
+"""Expected errors over the floor as text, table and JSON: of a joint calibration, and of a measuring plan."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ipsys_log.analysis.expected_error import FloorGap
-from ipsys_log.report.rows import Rows, cm, counted, mm
+from ipsys_log.report.json_format import plain
+from ipsys_log.report.rows import Rows, cm, counted, means_cm, mm
+from ipsys_log.survey.floor_plan import PlannedFloor
 from ipsys_log.survey.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.units import CM_PER_M, MM_PER_M
+
+if TYPE_CHECKING:
+    from ipsys_log.analysis.joint_plan import PlannedDrive
 
 _MOST_FAULTS = 8
 
@@ -83,9 +87,9 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
     """Return the result as plain data for JSON; an error without a value is None."""
     return {
         "enough": lab.is_enough,
-        "goal_mm": lab.goal_m * MM_PER_M,
-        "mean_mm": lab.mean_m * MM_PER_M,
-        "p95_mm": lab.p95_m * MM_PER_M,
+        "goal_m": lab.goal_m,
+        "mean_m": lab.mean_m,
+        "p95_m": lab.p95_m,
         "run": lab.run,
         "marker_height_m": lab.height_m,
         "calibration_points": len(lab.points_m),
@@ -96,13 +100,13 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
         "faults": [
             {"kind": f.kind, "subject": f.subject, "score": f.score, "text": f.text} for f in lab.faults
         ],
-        "drive": None if lab.gap is None or lab.is_enough else _gap_json(lab.gap),
+        "drive": None if lab.gap is None or lab.is_enough else plain(lab.gap),
         "tape": [
             {
                 "x_m": float(point.point_m[0]),
                 "y_m": float(point.point_m[1]),
                 "cameras": list(point.cameras),
-                "mean_after_mm": point.mean_after_m * MM_PER_M,
+                "mean_after_m": point.mean_after_m,
             }
             for point in lab.points
         ],
@@ -113,28 +117,88 @@ def lab_json(lab: LabCalibration) -> dict[str, Any]:
 def _camera_json(camera: CameraResult) -> dict[str, Any]:
     return {
         "camera": camera.camera,
-        "mean_mm": _finite(camera.mean_m * MM_PER_M),
-        "p95_mm": _finite(camera.p95_m * MM_PER_M),
+        "mean_m": _finite(camera.mean_m),
+        "p95_m": _finite(camera.p95_m),
         "covered": camera.covered,
         "points": camera.sightings[0],
         "moving": camera.sightings[1],
         "residual_px": _finite(camera.rmse_px),
-        "clock_ms": None if camera.clock_s is None else camera.clock_s * 1000,
-        "row_time_us": None if camera.row_time_s is None else camera.row_time_s * 1e6,
+        "clock_s": camera.clock_s,
+        "row_time_s": camera.row_time_s,
         "nominal": camera.nominal,
-        "gaps": [_gap_json(gap) for gap in camera.gaps],
-    }
-
-
-def _gap_json(gap: FloorGap) -> dict[str, Any]:
-    return {
-        "camera": gap.camera,
-        "area_m2": gap.area_m2,
-        "low_m": gap.low_m.tolist(),
-        "high_m": gap.high_m.tolist(),
-        "error_mm": gap.error_m * MM_PER_M,
+        "gaps": plain(camera.gaps),
     }
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def plan_table(found: PlannedFloor) -> Rows:
+    """Return a table of the points to measure next, with their tapes and the error that remains."""
+    places = found.plan.places
+    means = means_cm(places[0].mean_before_m, *(place.mean_after_m for place in places))
+    cells = []
+    for number, place in enumerate(places, 1):
+        x_m, y_m, z_m = place.point_m.tolist()
+        tapes = [f"{name} {cm(value_m, 0)}" for name, value_m in found.distances_m(place.point_m).items()]
+        side = found.side(place.point_m)
+        tape = ", ".join([*tapes, *([side] if side else [])]) or "-"
+        point = (cm(x_m, 0), cm(y_m, 0), f"{z_m * CM_PER_M:g}")
+        change = f"{means[number - 1]} -> {means[number]}"
+        cells.append([str(number), *point, tape, ", ".join(place.cameras), change])
+    columns = (">", ">x cm", ">y cm", ">height cm", "tape cm", "seen by", ">mean error cm")
+    return Rows(f"Next points to measure, for the model {found.model} of run {found.run}", columns, cells)
+
+
+def plan_lines(found: PlannedFloor) -> Iterator[str]:
+    """Yield the effect of the points; and of the drive that reduces the error most, without new points."""
+    places, drive = found.plan.places, found.drive
+    before, after = means_cm(places[0].mean_before_m, places[-1].mean_after_m)
+    subject = "this point" if len(places) == 1 else f"these {len(places)} points"
+    yield f"predicted mean error over the floor: {before} cm now, {after} cm with {subject}"
+    if drive is None:
+        return
+    from ipsys_log.analysis.joint_plan import DRIVE_S  # late: most plans have no drive, and scipy takes 1 s
+
+    if not drive.is_useful:
+        yield "another drive changes little: most of the predicted error is that of the tape"
+        return
+    (x0, y0), (x1, y1) = (
+        [cm(value_m, 0) for value_m in corner_m] for corner_m in (drive.low_m, drive.high_m)
+    )
+    before, after = means_cm(drive.mean_before_m, drive.mean_after_m)
+    where = f"x {x0} to {x1}, y {y0} to {y1} cm (seen by {', '.join(drive.cameras)})"
+    yield f"or drive a robot for {DRIVE_S:.0f} s, in curves, through {where}: {before} -> {after} cm"
+
+
+def plan_json(found: PlannedFloor) -> dict[str, Any]:
+    """Return the plan as plain data; the height of a marker is in ``height_m``."""
+    places = [
+        {
+            "number": number,
+            **dict(zip(("x_m", "y_m", "height_m"), place.point_m.tolist(), strict=True)),
+            "distances_m": found.distances_m(place.point_m),
+            "side": found.side(place.point_m),
+            "cameras": list(place.cameras),
+            "mean_before_m": place.mean_before_m,
+            "mean_after_m": place.mean_after_m,
+        }
+        for number, place in enumerate(found.plan.places, 1)
+    ]
+    return {
+        "model": found.model,
+        "run": found.run,
+        "marker_height_m": found.height_m,
+        "mean_before_m": places[0]["mean_before_m"],
+        "mean_after_m": places[-1]["mean_after_m"],
+        "places": places,
+        **({} if found.drive is None else {"drive": _drive_json(found.drive)}),
+        "notes": list(found.notes),
+    }
+
+
+def _drive_json(drive: PlannedDrive) -> dict[str, Any]:
+    from ipsys_log.analysis.joint_plan import DRIVE_S
+
+    return {**plain(drive), "duration_s": DRIVE_S}

@@ -1,23 +1,92 @@
-"""Pictures of a board from a live camera: a picture is kept when it shows the board in a new pose."""
+"""The calibration board of the setup: its typed fields, and the search for pictures of it."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import simplejpeg
 
 from ipsys_log.arrays import Grey
-from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting, view_board
 from ipsys_log.calibration.image_selection import NEAR, advise, measure_coverage
-from ipsys_log.errors import FrameError
+from ipsys_log.calibration.lens_models import LENS_MODELS, find_lens_model
+from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo
+from ipsys_log.survey.entry import Fault
+
+
+class BoardEntry(NamedTuple):
+    """The options of ``ipsys calibrate`` for a board and a lens, by their names in :func:`api.calibrate`."""
+
+    board: str
+    square_m: float
+    lens: str
+    marker_scale: float
+    dictionary: str
+    inverted: bool
+
+    def parse(self) -> Board:
+        """Return the board.
+
+        Raises
+        ------
+        IpsysError
+            A value is not valid.
+        """
+        return parse_board(self.board, self.square_m, self.marker_scale, self.dictionary, self.inverted)
+
+
+# The fields of the form: key, label, usual text, and the choices if there is a choice.
+BOARD_FIELDS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    ("board", "Inner corners of the chessboard, such as 6x4", "6x4", ()),
+    ("square", "Side of a square, in m", "0.03", ()),
+    ("lens", "Lens distortion model", "fisheye", tuple(LENS_MODELS)),
+    ("marker_scale", "ChArUco: side of a marker, as a share of a square", "0.75", ()),
+    ("dictionary", "ChArUco: dictionary of the markers", "DICT_4X4_50", ()),
+    ("inverted", "ChArUco: black and white exchanged", "no", ("no", "yes")),
+)
+
+
+def parse_board_entry(typed: Mapping[str, str]) -> BoardEntry | Fault:
+    """Return the typed options; or the fault of a field, in the words of the command.
+
+    Parameters
+    ----------
+    typed : texts by field; a missing field has its usual text.
+    """
+    texts = {key: typed.get(key, usual).strip() for key, _, usual, _ in BOARD_FIELDS}
+    try:
+        entry = BoardEntry(
+            texts["board"],
+            _number("square", texts["square"]),
+            texts["lens"],
+            _number("marker_scale", texts["marker_scale"]),
+            texts["dictionary"],
+            texts["inverted"] == "yes",
+        )
+        find_lens_model(entry.lens)
+        entry.parse()
+    except IpsysError as error:
+        option, _, _ = str(error).removeprefix("--").replace("-", "_").partition(" ")
+        return Fault(option if option in texts else "board", str(error))
+    return entry
+
+
+def _number(field: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        option = field.replace("_", "-")
+        raise IpsysError(f"--{option} {text}: is not a number; write 0.03, for example") from error
+
 
 # So many pictures, without advice on further ones, are enough.
 _ENOUGH = 20

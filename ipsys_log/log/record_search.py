@@ -116,8 +116,8 @@ class RecordSearch:
         head = MESSAGE if record.opcode == Opcode.MESSAGE else HEADER
         is_right = self._follows(stop) and not is_near_damage
         inner = None if is_right else self.find(record.offset + head.size, stop)
-        if inner is None:
-            return None
+        if inner is None or inner == self.frame_at:
+            return inner
         position = inner
         while position < stop:
             if not self._follows(position):

@@ -226,7 +226,7 @@ def damage(interval: int, rounds: int, frames: int) -> None:
 
 
 @pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])
-@pytest.mark.parametrize("rounds", [6, pytest.param(250, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rounds", [6, pytest.param(120, marks=pytest.mark.slow)])
 def test_damage_gives_no_wrong_marker(interval: int, rounds: int) -> None:
     """Check that a damaged frame gives an error, no marker, or the right marker."""
     damage(interval, rounds, 0)

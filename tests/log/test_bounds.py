@@ -108,7 +108,7 @@ def start_cpu_s() -> float:
 
 # The most processor time above that of a plain log, in starts of the program: 5 s if a start takes 0.2 s.
 STARTS = 25
-COMMANDS = ("info", "repair", "view", "check", "cat")
+COMMANDS = ("repair", "view", "check")
 
 
 def line(command: str, path: Path) -> list[object]:

@@ -42,8 +42,7 @@ _GRID_STEP_S = 0.025
 _NEAR_STEPS = 10
 # Low points of the grid with a misfit of at most this multiple of the lowest one are refined.
 _LOW_MISFIT = 3.0
-# Residuals of the maps above this share of the spread of the positions are those of unrelated paths
-# (test_paths_of_another_session_do_not_agree).
+# Residuals of the maps above this share of the spread of the positions are those of unrelated paths.
 _LARGEST_MISFIT = 0.02
 # Another offset is a rival of the best one if the ratio of their misfits is less than this
 # (test_path_that_repeats_itself_gives_no_offset).

@@ -31,7 +31,7 @@ import simplejpeg
 from results import Report, command
 from rounds import Row
 
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.messages import (
     LATENCY_TOPIC,
     CompressedImage,

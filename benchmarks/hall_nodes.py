@@ -40,7 +40,8 @@ from ipsys_log import pipeline
 from ipsys_log.analysis.knocks import KnockMonitor
 from ipsys_log.analysis.latency import recorded_latencies, step_times_s
 from ipsys_log.analysis.overlap_stream import OverlapSummary
-from ipsys_log.capture.camera_thread import NODES_RUN, CameraState
+from ipsys_log.capture.camera_thread import NODES_RUN
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.log.dataset import Session

@@ -24,7 +24,6 @@ from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
 from tests.capture.streams import encode, serve
 from tests.ports import free_port
-from tests.tiers import first_fast
 from tests.waiting import wait_until
 
 H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")
@@ -100,9 +99,7 @@ def slow_decoding(patch: pytest.MonkeyPatch, attached: LiveCameras) -> None:
 
 # A recording in real time, on a machine that is too slow for it.
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("codec", "machine"), first_fast(1, [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)])
-)
+@pytest.mark.parametrize(("codec", "machine"), [(H264, slow_search), (H265, slow_decoding)])
 def test_skipped_video_frames_are_equal_in_a_replay(
     codec: tuple[str, ...],
     machine: Machine,

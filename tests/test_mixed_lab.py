@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.frames import Clock, Frame, Open, Say
+from ipsys_log.capture.frames import CameraState, Clock, Frame, Open, Say
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.multiplexer import LiveCameras

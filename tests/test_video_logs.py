@@ -20,7 +20,7 @@ from rerun.chunk import RrdReader
 
 from ipsys_log import pipeline
 from ipsys_log.capture import live_check
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.log.dataset import Session

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from ipsys_log.capture.frames import (
+    CameraState,
     Clock,
     Frame,
     NodeRefusedError,
@@ -45,29 +46,6 @@ _EARLY_S = 0.01
 MAX_FRAMES_WITHOUT_KEYFRAME = 600
 # Shortest time between two reports of missed frames of a camera.
 _NAMED_EVERY_NS = NS_PER_S
-
-
-@dataclass(slots=True)
-class CameraState:
-    """The counts and the properties of the frames of a camera so far.
-
-    ``dropped`` frames arrived, but the log does not hold them. ``missed`` frames were lost before they
-    arrived, by the count of the camera's driver. ``format`` is the format of the frames, such as jpeg or
-    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``first_bytes`` is the size of
-    the first frame, which the log of a node's camera does not hold. ``delay_s`` is the time from exposure to
-    arrival of the last frame, if it has a capture stamp.
-    """
-
-    frames: int = 0
-    bytes: int = 0
-    dropped: int = 0
-    missed: int = 0
-    up: bool = False
-    finished: bool = False
-    format: str | None = None
-    size_px: tuple[int, int] | None = None
-    first_bytes: int = 0
-    delay_s: float | None = None
 
 
 def imported_run(states: Mapping[str, CameraState]) -> str | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.errors import LogError, WriteError, is_full
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import RigCamera

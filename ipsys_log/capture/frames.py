@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
@@ -184,3 +185,26 @@ def device_path(source: str) -> str:
     """
     name = source.partition(":")[2]
     return f"/dev/video{name}" if name.isdecimal() else name
+
+
+@dataclass(slots=True)
+class CameraState:
+    """The counts and the properties of the frames of a camera so far.
+
+    ``dropped`` frames arrived, but the log does not hold them. ``missed`` frames were lost before they
+    arrived, by the count of the camera's driver. ``format`` is the format of the frames, such as jpeg or
+    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``first_bytes`` is the size of
+    the first frame, which the log of a node's camera does not hold. ``delay_s`` is the time from exposure to
+    arrival of the last frame, if it has a capture stamp.
+    """
+
+    frames: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    missed: int = 0
+    up: bool = False
+    finished: bool = False
+    format: str | None = None
+    size_px: tuple[int, int] | None = None
+    first_bytes: int = 0
+    delay_s: float | None = None

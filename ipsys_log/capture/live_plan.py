@@ -6,7 +6,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.camera_thread import CameraState, imported_run
+from ipsys_log.capture.camera_thread import imported_run
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import shlex
 from collections.abc import Callable
 from inspect import cleandoc
 from pathlib import Path
@@ -17,6 +18,7 @@ from ipsys_log.cli.calibrate import calibrate
 from ipsys_log.cli.calibrate_lab import calibrate_lab
 from ipsys_log.cli.camera_poses import align, drift
 from ipsys_log.cli.checks import check, repair, verify
+from ipsys_log.cli.console import remarks, say
 from ipsys_log.cli.contents import cat, info
 from ipsys_log.cli.datasets import catalogue, pack, score
 from ipsys_log.cli.imports import KINDS, import_
@@ -108,7 +110,10 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the name, the command and its words."""
-        return super().resolve_command(ctx, present_words(args))
+        words = present_words(args)
+        if words != args and remarks.is_terminal:
+            say(f"ipsys {args[0]} is an old name until the next release; now: ipsys {shlex.join(words)}")
+        return super().resolve_command(ctx, words)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the first commands with their purpose; the epilog has the others."""

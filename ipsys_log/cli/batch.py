@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.cli.batch_options import DERIVED, EXPORT, FOLDER, LOGS, OUTDATED, RUN, WORKERS
 from ipsys_log.cli.console import console, print_json, remarks, say
-from ipsys_log.cli.options import check_present
+from ipsys_log.cli.options import REQUIRED, AsJson, LogList, Option, check_present, flag, log_argument, option
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.cli.stages import build_command, options_until, replay_options
 
@@ -33,6 +32,67 @@ _REPEAT = " After a failure or an interrupt, repeat the command: it computes onl
 # A task can take minutes: the rate is that of the last half hour.
 _RATE_PERIOD_S = 1800.0
 
+_DERIVED = (
+    "The folder of -o in ipsys batch replay, with the results of logs that cannot be appended to. Each log "
+    "is read together with its derived log. Default: the working folder."
+)
+_LOGS = Annotated[
+    LogList,
+    log_argument(
+        help="Logs, files or URLs, each one on its own. A folder, or a URL that ends with /, stands for all "
+        "logs below it."
+    ),
+]
+_OUTPUT = option(
+    Path | None, "--output,-o", "FOLDER",
+    "The folder for the results of logs that cannot be appended to: URLs and read-only files. Default: the "
+    "working folder.",
+)  # fmt: skip
+# The options of the workers and of the result, which all commands of the group have.
+_WORKERS: dict[str, Option] = {
+    "scheduler": option(
+        str | None, "--scheduler", "ADDRESS",
+        "Use the workers of this Dask scheduler, such as tls://head:8786. Access to a scheduler means code "
+        "execution on its workers, so it must use certificates. Default: processes on this machine.",
+    ),
+    "workers": option(
+        int | None, "--workers", "N", "Worker processes on this machine. Default: one for each core.", min=1
+    ),
+    "memory_limit": option(
+        str | None, "--memory-limit", "SIZE",
+        "Memory of each worker process, such as 2GB. Default: an equal share.",
+    ),
+    "tls_ca": option(Path | None, "--tls-ca", "FILE", "Certificate of the authority, for --scheduler."),
+    "tls_cert": option(Path | None, "--tls-cert", "FILE", "Your certificate, for --scheduler."),
+    "tls_key": option(Path | None, "--tls-key", "FILE", "The key of your certificate, for --scheduler."),
+    "insecure": flag(
+        "--insecure", "Permit a scheduler without certificates: each program that reaches it can run code."
+    ),
+    "table": option(
+        Path | None, "--table", "FILE", "Write the results to a Parquet file: a row for each log."
+    ),
+    "as_json": (AsJson, False),
+}  # fmt: skip
+_EXPORT: dict[str, Option] = {
+    "output": option(
+        Path, "--output,-o", "FOLDER",
+        "The folder for the files, named as the logs. They keep the folders of the logs below the folder or "
+        "pattern that you name.",
+        REQUIRED,
+    ),
+    "format_": option(str, "--format", "NAME", "csv, parquet, tum, kitti, ros2, mp4 or coco.", "csv"),
+    "channel": option(
+        str, "--channel", "NAME",
+        "The table to export: tracks, positions, markers, camera_points, measurements, events, latency or "
+        "truth.",
+        "tracks",
+    ),
+    "run": option(str | None, "--run", "NAME", "Export this run instead of the newest."),
+    "robot": option(str | None, "--robot", "NAME", "Export only this robot."),
+    "derived": option(Path | None, "--derived", "FOLDER", _DERIVED),
+    "overwrite": flag("--overwrite", "Export all logs, also those with a newer file."),
+}  # fmt: skip
+
 
 def add_commands(
     app: typer.Typer, panel: str, wrap: Callable[[Callable[..., None]], Callable[..., None]]
@@ -43,28 +103,31 @@ def add_commands(
         no_args_is_help=True,
     )
 
-    def add(name: str, text: str, work: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> None:
-        options = {"logs": LOGS, **options, **WORKERS}
+    def add(name: str, text: str, work: Callable[..., None], options: dict[str, Option]) -> None:
+        options = {"logs": (_LOGS, REQUIRED), **options, **_WORKERS}
         group.command(name, help=text)(wrap(build_command(name, text, options, work)))
 
+    derived = option(Path | None, "--derived,-o", "FOLDER", _DERIVED)
+    outdated = flag("--outdated", "Replay only logs that hold outdated runs.")
+    run = option(str | None, "--run", "NAME", "Use only this run.")
     text = "Run the missing stages of each log, and append their results to it." + _MORE + _REPEAT
-    add("replay", text, _replay, {**_stage_options(None), "output": FOLDER, "outdated": OUTDATED})
+    add("replay", text, _replay, {**_stage_options(None), "output": _OUTPUT, "outdated": outdated})
     text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
     text += _MORE + _REPEAT
-    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": FOLDER})
+    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _OUTPUT})
     text = "Compute every run of each log again, and compare it byte for byte." + _MORE
-    add("verify", text, _verify, {"run": RUN, "derived": DERIVED})
-    add("check", "Read each log completely and check it." + _MORE, _check, {"derived": DERIVED})
+    add("verify", text, _verify, {"run": run, "derived": derived})
+    add("check", "Read each log completely and check it." + _MORE, _check, {"derived": derived})
     text = (
         "Export each log to a file of its name in a folder, which keeps the folders of the logs."
         + _MORE
         + _REPEAT
     )
-    add("export", text, _export, EXPORT)
+    add("export", text, _export, _EXPORT)
     app.add_typer(group, name="batch", rich_help_panel=panel)
 
 
-def _stage_options(until: str | None) -> dict[str, tuple[Any, Any]]:
+def _stage_options(until: str | None) -> dict[str, Option]:
     left_out = ("logs", "output", "jobs", "as_json")
     return {name: option for name, option in options_until(until).items() if name not in left_out}
 
@@ -132,7 +195,7 @@ def _export(
 
 def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the options of the work, and those of the batch."""
-    of_batch = {"logs", *WORKERS}
+    of_batch = {"logs", *_WORKERS}
     return (
         {name: value for name, value in given.items() if name not in of_batch},
         {name: value for name, value in given.items() if name in of_batch},

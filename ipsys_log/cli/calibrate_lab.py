@@ -16,6 +16,7 @@ from ipsys_log.cli.lab_inputs import (
     Focal,
     SaveNominal,
     cameras_of,
+    lab_of_run,
     load_calibrations,
     load_matching_rig,
     nominal_lenses,
@@ -121,10 +122,9 @@ def calibrate_lab(
         ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.messages.channels import MODEL, RIG
+    from ipsys_log.messages.channels import MODEL
     from ipsys_log.report.files import check_figure_file
     from ipsys_log.runs.graph import writes
-    from ipsys_log.sinks.selection import rig_in_force
     from ipsys_log.survey.lab_calibration import describe_lab
 
     if not 0 < goal_mm <= _MOST_GOAL_MM:
@@ -168,11 +168,10 @@ def calibrate_lab(
     }
     with derive(logs, "fit", output, model=["joint"], lenses=lenses, **options) as (session, outcomes, _):
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
-        recorded = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        in_force = given_rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
+        in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
         with progress_bar() as progress:
             lab = describe_lab(
-                session, run, in_force, {**recorded, **lenses}, (given_rig, lenses), train, goal_mm / 1000,
+                session, run, in_force, all_lenses, (given_rig, lenses), train, goal_mm / 1000,
                 lambda done, total: progress("describe", done, total),
             )  # fmt: skip
         _show(lab, plot, as_json)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
-from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations
+from ipsys_log.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.cli.open_cameras import check_target, prepare_lab, record_now
 from ipsys_log.cli.options import (
     AsJson,
@@ -129,12 +129,11 @@ def _prepare_now(
 
 def _align(logs: Sequence[LogLocation], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
     from ipsys_log.log.dataset import Session
-    from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RIG
+    from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS
     from ipsys_log.report.alignment import read_alignment
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.graph import writes
     from ipsys_log.runs.provenance import newest_run
-    from ipsys_log.sinks.selection import rig_in_force
 
     given_rig = load_rig(options["rig"]) if options["rig"] else None
     lenses = load_calibrations(options["calibration"], lambda: cameras_of(logs))
@@ -144,11 +143,8 @@ def _align(logs: Sequence[LogLocation], options: dict[str, Any], plot: Path | No
     with derive(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
         made = [outcome.run for outcome in outcomes if writes(outcome, CAMERA_POINTS)]
         run = made[-1] if made else str(newest_run(session, CAMERA_POINTS))
-        recorded_lenses = {
-            camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()
-        }
-        in_force = given_rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
-        lab = read_alignment(session, run, in_force, {**recorded_lenses, **lenses})
+        in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
+        lab = read_alignment(session, run, in_force, all_lenses)
     _show(lab, plot, as_json)
 
 

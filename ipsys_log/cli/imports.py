@@ -11,14 +11,25 @@ import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.cli.lab_inputs import load_calibrations, read_lab, say_remark, say_unusual
-from ipsys_log.cli.options import AsJson, Calibrations, RigFile, appended_log_option, log_option, read_files
+from ipsys_log.cli.options import (
+    REQUIRED,
+    AsJson,
+    Calibrations,
+    Option,
+    RigFile,
+    appended_log_option,
+    log_option,
+    option,
+    read_files,
+    with_options,
+)
 from ipsys_log.plain_text import shell_words
 
 _MCAP_MAGIC = b"\x89MCAP"
 _LONGEST_HEADER = 10_000  # bytes
 _START = "2020-01-01T00:00:00Z"
 
-Sources = Annotated[
+_SOURCES = Annotated[
     list[Path],
     typer.Argument(
         metavar="SOURCE",
@@ -27,90 +38,71 @@ Sources = Annotated[
         "folder of the paper's data.",
     ),
 ]
-Kind = Annotated[
-    str | None,
-    typer.Option(
-        "--as",
-        metavar="KIND",
-        help="Kind of the source, if its name and content do not show it: images, videos, ros, truth, "
-        "detections, pairs or imsel (the data of the paper).",
+_NEW_LOG = log_option(help="The log to write. Without --into, tables need --rig, too.")
+_INTO = appended_log_option(
+    help="For truth: the log of the same drive. For detections: a log without images. It gets a run."
+)
+# The options of all kinds.
+_OPTIONS: dict[str, Option] = {
+    "into": (Annotated[Path | None, _INTO], None),
+    "rig": (RigFile, None),
+    "calibration": (Calibrations, None),
+    "rate": option(float | None, "--rate", "HZ", "Images per second, if they have no times. Default: 1."),
+    "times": option(
+        str | None, "--times", "FILE|names",
+        "Times of the images: a CSV file with the columns file (red/0001.jpg) and time, or names if the file "
+        "names are times. A time is in s, ms, us or ns since 1970, or like 2024-05-31T12:30:00.25Z.",
     ),
-]
+    "start": option(
+        str | None, "--start", "TIME", "Start of all videos: s since 1970, or ISO 8601. Default: 2020."
+    ),
+    "camera": option(
+        list[str] | None, "--camera", "NAME=TOPIC",
+        "Import the images of this ROS topic as the camera NAME; repeat it for each camera. Default: all "
+        "topics with images.",
+    ),
+    "robot": option(
+        list[str] | None, "--robot", "NAME",
+        "The robot of a trajectory that names none; repeat it in the order of the files.",
+    ),
+    "run": option(
+        str | None, "--run", "NAME",
+        "For truth: compare with the tracks of this run (default: the newest). For detections: name of the "
+        "new run.",
+    ),
+    "align": option(
+        str | None, "--align", "2d|3d|none",
+        "For truth: estimate rotation and translation on the floor (2d, the default), in space (3d), or "
+        "none.",
+    ),
+    "time_offset": option(
+        str | None, "--time-offset", "S", "For truth: add this to the times, instead of an estimate."
+    ),
+    "time_unit": option(
+        str | None, "--time-unit", "s|ns", "Unit of a time column whose header has none."
+    ),
+    "length_unit": option(
+        str | None, "--length-unit", "m|mm", "Unit of x, y and z whose header has none."
+    ),
+    "as_json": (AsJson, False),
+}  # fmt: skip
 
 
-def import_(
-    sources: Sources,
-    output: Annotated[
-        Path | None, log_option(help="The log to write. Without --into, tables need --rig, too.")
-    ] = None,
-    into: Annotated[
-        Path | None,
-        appended_log_option(
-            help="For truth: the log of the same drive. For detections: a log without images. It gets a run."
+@with_options(
+    {
+        "sources": (_SOURCES, REQUIRED),
+        "output": (Annotated[Path | None, _NEW_LOG], None),
+        "kind": option(
+            str | None,
+            "--as",
+            "KIND",
+            "Kind of the source, if its name and content do not show it: images, videos, ros, truth, "
+            "detections, pairs or imsel (the data of the paper).",
         ),
-    ] = None,
-    kind: Kind = None,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Images per second, if they have no times. Default: 1.")
-    ] = None,
-    times: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|names",
-            help="Times of the images: a CSV file with the columns file (red/0001.jpg) and time, or names "
-            "if the file names are times. A time is in s, ms, us or ns since 1970, or like "
-            "2024-05-31T12:30:00.25Z.",
-        ),
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Start of all videos: s since 1970, or ISO 8601. Default: 2020."),
-    ] = None,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=TOPIC",
-            help="Import the images of this ROS topic as the camera NAME; repeat it for each camera. "
-            "Default: all topics with images.",
-        ),
-    ] = None,
-    robot: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="The robot of a trajectory that names none; repeat it in the order of the files.",
-        ),
-    ] = None,
-    run: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="For truth: compare with the tracks of this run (default: the newest). For detections: name "
-            "of the new run.",
-        ),
-    ] = None,
-    align: Annotated[
-        str | None,
-        typer.Option(
-            metavar="2d|3d|none",
-            help="For truth: estimate rotation and translation on the floor (2d, the default), in space "
-            "(3d), or none.",
-        ),
-    ] = None,
-    time_offset: Annotated[
-        str | None,
-        typer.Option(metavar="S", help="For truth: add this to the times, instead of an estimate."),
-    ] = None,
-    time_unit: Annotated[
-        str | None, typer.Option(metavar="s|ns", help="Unit of a time column whose header has none.")
-    ] = None,
-    length_unit: Annotated[
-        str | None, typer.Option(metavar="m|mm", help="Unit of x, y and z whose header has none.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+        **_OPTIONS,
+    }
+)
+def import_(sources: list[Path], output: Path | None, kind: str | None, **options: Any) -> None:
     """Import recordings, tables or ground truth of other programs into a log.
 
     Images, videos and ROS bags become a recording. Their bytes stay as they are. Without --times, images with
@@ -140,11 +132,6 @@ def import_(
     kind = kind or _find_kind(sources[0])
     if kind not in KINDS:
         raise IpsysError(f"--as {kind}: is not a kind of source; use one of {', '.join(KINDS)}")
-    options: dict[str, Any] = {
-        "into": into, "rig": rig, "calibration": calibration, "rate": rate, "times": times, "start": start,
-        "camera": camera, "robot": robot, "run": run, "align": align, "time_offset": time_offset,
-        "time_unit": time_unit, "length_unit": length_unit, "as_json": as_json,
-    }  # fmt: skip
     _import_as(kind, sources, output, options)
 
 
@@ -369,17 +356,17 @@ def _by_camera(files: list[str]) -> dict[str, Path]:
     return paths
 
 
-def _split_names(options: list[str], kind: str, example: str) -> dict[str, str]:
-    """Return the texts after the equals signs of options such as ``red=red.mp4``, by camera."""
+def _split_names(words: list[str], kind: str, example: str) -> dict[str, str]:
+    """Return the texts after the equals signs of words such as ``red=red.mp4``, by camera."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import check_name
 
     named: dict[str, str] = {}
-    for option in options:
-        camera, equals, text = option.partition("=")
+    for word in words:
+        camera, equals, text = word.partition("=")
         if not equals:
-            raise IpsysError(f"{option}: has no camera name; write {example}")
-        if check_name(camera, f"{option}: camera name") in named:
-            raise IpsysError(f"{option}: camera {camera!r} has two {kind}s; give one")
+            raise IpsysError(f"{word}: has no camera name; write {example}")
+        if check_name(camera, f"{word}: camera name") in named:
+            raise IpsysError(f"{word}: camera {camera!r} has two {kind}s; give one")
         named[camera] = text
     return named

@@ -13,6 +13,7 @@ from ipsys_log.cli.console import say, warn
 
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab
+    from ipsys_log.log.dataset import Session
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Rig
 
@@ -167,6 +168,18 @@ def read_lab(
         if camera.name in assumed:
             say_remark(camera.name, assumed[camera.name])
     return lab, lenses, assumed
+
+
+def lab_of_run(
+    session: Session, run: str, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
+) -> tuple[Rig, dict[str, CameraCalibration]]:
+    """Return the rig and the intrinsics of a run: the given ones, else those of the log."""
+    from ipsys_log.messages.channels import RIG
+    from ipsys_log.sinks.selection import rig_in_force
+
+    recorded = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+    in_force = rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
+    return in_force, {**recorded, **lenses}
 
 
 def load_lab(

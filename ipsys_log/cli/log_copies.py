@@ -10,13 +10,18 @@ import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say
 from ipsys_log.cli.options import (
+    REQUIRED,
     AsJson,
     LogList,
     NewLog,
+    Option,
     Overwrite,
     ReadLogs,
+    flag,
     log_argument,
     log_option,
+    option,
+    with_options,
 )
 from ipsys_log.plain_text import shell_words
 
@@ -26,72 +31,61 @@ if TYPE_CHECKING:
     from ipsys_log.runs.merge import MergeResult
     from ipsys_log.runs.merge_plan import LogOffset
 
+_NEW_LOG = "The log to write, with a name that ends in .mcap."
 _TIME = "UTC, such as '2026-05-04 10:00:00', or seconds from the start of the log."
 
 
+# The options that select a part, as the fields of `CutOptions`.
+_SELECTION: dict[str, Option] = {
+    "start": option(str, "--start", "TIME", f"Keep messages from this time on: {_TIME}", ""),
+    "end": option(str, "--end", "TIME", f"Keep messages before this time: {_TIME}", ""),
+    "topics": option(
+        list[str] | None, "--topics", "PATTERN",
+        "Keep topics of this pattern, such as '/cameras/*'; repeat it for several.",
+    ),
+    "exclude_topics": option(
+        list[str] | None, "--exclude-topics", "PATTERN",
+        "Leave out topics of this pattern; repeat it for several.",
+    ),
+    "cameras": option(
+        list[str] | None, "--cameras,--camera", "NAME", "Keep this camera; repeat it for several."
+    ),
+    "runs": option(list[str] | None, "--runs,--run", "NAME", "Keep this run; repeat it for several."),
+    "exclude_runs": option(
+        list[str] | None, "--exclude-runs,--exclude-run", "NAME",
+        "Leave out this run with its record; repeat it for several.",
+    ),
+    "robots": option(
+        list[str] | None, "--robots,--robot", "NAME",
+        "Keep the frames that show this robot, with their results; repeat it for several.",
+    ),
+    "every": option(
+        int, "--every", "N", "Keep each n-th frame of each camera, with its results.", 1, min=1
+    ),
+}  # fmt: skip
+
+
+@with_options(
+    {
+        "logs": (ReadLogs, REQUIRED),
+        "output": (Annotated[Path | None, log_option(help=_NEW_LOG)], None),
+        **_SELECTION,
+        "compact": flag(
+            "--compact", "Leave out superseded and unfinished runs, and keep everything else of one LOG."
+        ),
+        "dry_run": flag("--dry-run", "With --compact: only list these runs, and write nothing."),
+        "overwrite": (Overwrite, False),
+        "as_json": (AsJson, False),
+    }
+)
 def cut(
-    logs: ReadLogs,
-    output: Annotated[
-        Path | None, log_option(help="The log to write, with a name that ends in .mcap.")
-    ] = None,
-    start: Annotated[
-        str, typer.Option(metavar="TIME", help=f"Keep messages from this time on: {_TIME}")
-    ] = "",
-    end: Annotated[str, typer.Option(metavar="TIME", help=f"Keep messages before this time: {_TIME}")] = "",
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PATTERN",
-            help="Keep topics of this pattern, such as '/cameras/*'; repeat it for several.",
-        ),
-    ] = None,
-    exclude_topics: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN", help="Leave out topics of this pattern; repeat it for several."),
-    ] = None,
-    cameras: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--cameras", "--camera", metavar="NAME", help="Keep this camera; repeat it for several."
-        ),
-    ] = None,
-    runs: Annotated[
-        list[str] | None,
-        typer.Option("--runs", "--run", metavar="NAME", help="Keep this run; repeat it for several."),
-    ] = None,
-    exclude_runs: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--exclude-runs",
-            "--exclude-run",
-            metavar="NAME",
-            help="Leave out this run with its record; repeat it for several.",
-        ),
-    ] = None,
-    robots: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--robots",
-            "--robot",
-            metavar="NAME",
-            help="Keep the frames that show this robot, with their results; repeat it for several.",
-        ),
-    ] = None,
-    every: Annotated[
-        int,
-        typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera, with its results."),
-    ] = 1,
-    compact: Annotated[
-        bool,
-        typer.Option(
-            "--compact", help="Leave out superseded and unfinished runs, and keep everything else of one LOG."
-        ),
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="With --compact: only list these runs, and write nothing.")
-    ] = False,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
+    logs: Sequence[LogLocation],
+    output: Path | None,
+    compact: bool,
+    dry_run: bool,
+    overwrite: bool,
+    as_json: bool,
+    **selection: Any,
 ) -> None:
     """Write a part of a log to a new log: a time range, some topics, cameras, runs, robots or frames.
 
@@ -115,17 +109,8 @@ def cut(
     from ipsys_log.runs.cut_selection import CutOptions
     from ipsys_log.units import format_bytes
 
-    options = CutOptions(
-        start=start,
-        end=end,
-        topics=topics or (),
-        exclude_topics=exclude_topics or (),
-        cameras=cameras or (),
-        runs=runs or (),
-        exclude_runs=exclude_runs or (),
-        robots=robots or (),
-        every=every,
-    )
+    chosen: dict[str, Any] = {name: value for name, value in selection.items() if value is not None}
+    options = CutOptions(**chosen)
     if compact:
         if options.as_text():
             raise IpsysError("--compact: cannot be used with options that select a part; cut again for these")

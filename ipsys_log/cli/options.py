@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -87,20 +88,49 @@ def _refuse(given: object, why: str, option: str = "") -> None:
             raise IpsysError(f"{option}{url}: {why}")
 
 
-def build_option(parameter: StageParameter) -> Any:
+# An option of a command that a table makes: its type with its help, and its default.
+Option = tuple[Any, Any]
+REQUIRED = inspect.Parameter.empty
+
+
+def option(
+    kind: Any, name: str, metavar: str | None, text: str, default: Any = None, **settings: Any
+) -> Option:
+    """Return an option; other names follow the first one after a comma."""
+    names = name.split(",")
+    return Annotated[kind, typer.Option(*names, metavar=metavar, help=text, **settings)], default
+
+
+def flag(name: str, text: str, **settings: Any) -> Option:
+    """Return an option without a value."""
+    return option(bool, name, None, text, False, **settings)
+
+
+def stage_option(parameter: StageParameter) -> Option:
     """Return the option of a parameter of a stage."""
-    return typer.Option(
-        f"--{parameter.name.replace('_', '-')}",
-        metavar=parameter.metavar,
-        min=parameter.least,
-        help=parameter.help,
-    )
+    name = f"--{parameter.name.replace('_', '-')}"
+    least = {"min": parameter.least} if parameter.least is not None else {}
+    return option(parameter.kind, name, parameter.metavar, parameter.help, parameter.default, **least)
 
 
-def annotate(parameter: StageParameter) -> Any:
-    """Return the annotation of a parameter of a stage: its type with its option."""
-    kind = parameter.kind
-    return Annotated[kind, build_option(parameter)]
+def with_options(options: Mapping[str, Option]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of a table, by the names of its parameters."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+
+    def decorate(work: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(work)
+        def command(**given: Any) -> None:
+            work(**given)
+
+        parameters = [
+            inspect.Parameter(name, keyword, default=default, annotation=kind)
+            for name, (kind, default) in options.items()
+        ]
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {name: kind for name, (kind, _) in options.items()}
+        return command
+
+    return decorate
 
 
 def _locations(texts: list[str] | None) -> list[Any]:
@@ -191,8 +221,8 @@ Calibrations = Annotated[
         "log with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
-Corners = Annotated[str | None, build_option(CORNERS)]
-Method = Annotated[str, build_option(METHOD)]
+Corners = stage_option(CORNERS)[0]
+Method = stage_option(METHOD)[0]
 Only = Annotated[
     list[str] | None,
     typer.Option("--camera", metavar="NAME", help="Use only this camera of the rig; repeat it for several."),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.cli.console import console, print_json, say, warn
-from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations
+from ipsys_log.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.cli.options import AsJson, Calibrations, LogList, Logs, RigFile
 from ipsys_log.cli.stages import derive
 
@@ -64,12 +64,11 @@ def plan(
 
         ipsys plan calibration.mcap --places 5 --plot next.png
     """
-    from ipsys_log.messages.channels import MODEL, RIG
+    from ipsys_log.messages.channels import MODEL
     from ipsys_log.report.files import check_figure_file
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.graph import writes
     from ipsys_log.runs.select import copied_run
-    from ipsys_log.sinks.selection import rig_in_force
     from ipsys_log.survey.floor_plan import plan_floor
 
     given_rig = load_rig(rig) if rig else None
@@ -81,11 +80,8 @@ def plan(
     with derive(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if writes(outcome, MODEL)]
         run = fitted[-1] if fitted else str(copied_run(session, model))
-        recorded_lenses = {
-            camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()
-        }
-        in_force = given_rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
-        planned = plan_floor(session, run, in_force, {**recorded_lenses, **lenses}, places, height_m or ())
+        in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
+        planned = plan_floor(session, run, in_force, all_lenses, places, height_m or ())
     _show(planned, plot, as_json)
 
 

@@ -1,7 +1,7 @@
 """Signals that end a command: the time of their effect, and their exit code.
 
 Until the command is known, a signal is only noted (`hold_signals`). Then it interrupts (`allow_interrupt`),
-or it stops the cameras and the command ends in order (`stop_on_signal`). The next signal ends the process at
+or it stops the cameras and the command ends in order (`stop_on_signal`). The next Ctrl-C ends the process at
 once. The first signal of a command that runs until it is stopped gives exit code 0; every other one gives 128
 plus its number, as shells do. A signal that the process inherited as ignored stays ignored (``nohup``).
 """
@@ -12,7 +12,7 @@ import functools
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
@@ -166,9 +166,12 @@ def _interrupt(number: int, _: FrameType | None = None) -> None:
 
 
 def _end_at_once(number: int, _: FrameType | None = None) -> None:
-    """End the process. Processes that it started end with their pipes."""
+    """End the process on Ctrl-C. Processes that it started end with their pipes."""
+    if number != signal.SIGINT:
+        return  # ``timeout`` and closed terminals send their signal twice
     shown = f"{_SHOW_CURSOR if os.isatty(2) else ''}\nipsys: {_AT_ONCE}\n"
-    os.write(2, shown.encode())  # the interrupted thread may hold the lock of sys.stderr
+    with suppress(OSError):
+        os.write(2, shown.encode())  # the interrupted thread may hold the lock of sys.stderr
     os._exit(128 + number)
 
 

@@ -9,7 +9,7 @@ import typer
 
 from ipsys_log.cli.console import console, print_json, progress_bar, say
 from ipsys_log.cli.open_cameras import MODEL, check_target
-from ipsys_log.cli.options import AsJson, Force, NewLog, OneLog, other_log_option
+from ipsys_log.cli.options import AsJson, FittedModels, Force, NewLog, OneLog, other_log_option
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
@@ -17,15 +17,6 @@ if TYPE_CHECKING:
     from ipsys_log.closed_loop.settings import RobotRun
     from ipsys_log.runs.options import Request
 
-Models = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--model",
-        metavar="NAME",
-        help="Model of this log, such as best; repeat it to compare several. The robots get the positions of "
-        "the first. Default: poly, if the log has it.",
-    ),
-]
 Paths = Annotated[
     list[str] | None,
     typer.Option(
@@ -102,7 +93,7 @@ def drive(
             "--model-from", help="The log of the simulated lab with the model, a file or a URL."
         ),
     ],
-    model: Models = None,
+    model: FittedModels = None,
     robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -10,11 +9,23 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.cli.console import console, print_json, print_outcomes, progress_bar, say
 from ipsys_log.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
-from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, annotate, check_present, log_option
+from ipsys_log.cli.options import (
+    REQUIRED,
+    AsJson,
+    Calibrations,
+    Logs,
+    Option,
+    RigFile,
+    check_present,
+    figure_option,
+    flag,
+    log_option,
+    option,
+    stage_option,
+    with_options,
+)
 from ipsys_log.cli.signals import say_kept
 from ipsys_log.stages import ENTRIES, parameters_until
 
@@ -32,63 +43,31 @@ def _stage_lines() -> str:
     return "\n\n".join(f"{entry.name}: {entry.help}" for entry in ENTRIES)
 
 
-# The options of every stage, and of the printed results: type with help, and default.
-_SHARED: dict[str, tuple[Any, Any]] = {
-    "logs": (Logs, inspect.Parameter.empty),
+# The options of every stage, and of the printed results.
+_SHARED: dict[str, Option] = {
+    "logs": (Logs, REQUIRED),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
-    "run": (
-        Annotated[
-            str | None,
-            typer.Option(
-                "--run", metavar="NAME", help="Name of the new run, instead of edges, poly, poly_2 ..."
-            ),
-        ],
-        None,
+    "run": option(
+        str | None, "--run", "NAME", "Name of the new run, instead of edges, poly, poly_2 ..."
     ),
     "output": (
-        Annotated[Path | None, log_option(help="Write the results to a new log, not to the last LOG.")],
-        None,
+        Annotated[Path | None, log_option(help="Write the results to a new log, not to the last LOG.")], None,
     ),
-    "jobs": (
-        Annotated[
-            int | None,
-            typer.Option(
-                "--jobs",
-                metavar="N",
-                min=1,
-                help="Number of processes for detection in long logs (default: the number of cores). The "
-                "results are the same with any number.",
-            ),
-        ],
-        None,
+    "jobs": option(
+        int | None, "--jobs", "N",
+        "Number of processes for detection in long logs (default: the number of cores). The results are the "
+        "same with any number.",
+        min=1,
     ),
     "as_json": (AsJson, False),
-}
-_PRINTS: dict[str, tuple[Any, Any]] = {
-    "plot": (
-        Annotated[
-            Path | None,
-            typer.Option(metavar="FILE", help="Draw the floor and the errors: .png, .pdf, .svg or .jpg."),
-        ],
-        None,
+}  # fmt: skip
+_PRINTS: dict[str, Option] = {
+    "plot": (Annotated[Path | None, figure_option("the floor and the errors")], None),
+    "details": flag(
+        "--details", "Print details, too: errors by camera, every outlier, models by number of points."
     ),
-    "details": (
-        Annotated[
-            bool,
-            typer.Option(
-                "--details",
-                help="Print details, too: errors by camera, every outlier, models by number of points.",
-            ),
-        ],
-        False,
-    ),
-    "plots": (
-        Annotated[
-            Path | None, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")
-        ],
-        None,
-    ),
+    "plots": option(Path | None, "--plots", "DIR", "Write the paper's tables and figures, and more."),
 }
 # The order of options in the help. Parameters that are not in it come after these.
 _ORDER = (
@@ -98,16 +77,8 @@ _ORDER = (
 
 # The end of a help text.
 MORE = "\n\nThe command runs missing stages first."
-_UNTIL = (
-    Annotated[
-        str | None,
-        typer.Option(
-            "--until",
-            metavar="STAGE",
-            help=f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse.",
-        ),
-    ],
-    None,
+_UNTIL = option(
+    str | None, "--until", "STAGE", f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse."
 )
 _REPLAY = f"""
 Run the missing stages of a log, append their results to it, and print the accuracy.
@@ -139,34 +110,26 @@ Examples
 """
 
 
-def options_until(name: str | None) -> dict[str, tuple[Any, Any]]:
+def options_until(name: str | None) -> dict[str, Option]:
     """Return the options of a stage, with the parameters of all stages up to it; None: of all stages."""
     options = dict(_SHARED)
     as_json = options.pop("as_json")
     for parameter in parameters_until(name):
-        options[parameter.name] = annotate(parameter), parameter.default
+        options[parameter.name] = stage_option(parameter)
     ordered = {name: options[name] for name in _ORDER if name in options}
     return {**ordered, **options, "as_json": as_json}
 
 
 def build_command(
-    name: str, text: str, options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]
+    name: str, text: str, options: Mapping[str, Option], work: Callable[..., None]
 ) -> Callable[..., None]:
-    """Return a command with a help text and these options, by name: type with help, and default."""
+    """Return a command with a help text and these options."""
 
     def command(**given: Any) -> None:
         work(**given)
 
-    keyword = inspect.Parameter.KEYWORD_ONLY
     command.__name__, command.__doc__ = name, text
-    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(key, keyword, default=value, annotation=kind)
-            for key, (kind, value) in options.items()
-        ]
-    )
-    command.__annotations__ = {key: kind for key, (kind, _) in options.items()}
-    return command
+    return with_options(options)(command)
 
 
 def _request(logs: Sequence[LogLocation], **given: Any) -> Request:

@@ -12,13 +12,14 @@ import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ipsys_log.cli.console import say
-from ipsys_log.cli.options import LogList, log_argument
+from ipsys_log.cli.options import LogList, Option, flag, log_argument, option
 from ipsys_log.cli.pages import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 # The options of the streams, by the names of `choose_streams`.
 StreamOptions = dict[str, Any]
 
-_PANEL = "Streams of positions"
 _SEEK_S = 5.0
 _TURN_S = 0.1
 _LEFT, _RIGHT = "\x1b[D", "\x1b[C"
@@ -74,83 +74,59 @@ Restamp = Annotated[
 ]
 
 
-def _option(kind: Any, flag: str, metavar: str | None, text: str, **limits: Any) -> Any:
-    return Annotated[kind, typer.Option(flag, metavar=metavar, help=text, rich_help_panel=_PANEL, **limits)]
+_PANEL = "Streams of positions"
+_option, _flag = partial(option, rich_help_panel=_PANEL), partial(flag, rich_help_panel=_PANEL)
 
 
-def _port(flag: str, text: str) -> Any:
-    return _option(int | None, flag, "PORT", text, min=1, max=65535)
+def _port(name: str, text: str) -> Option:
+    return _option(int | None, name, "PORT", text, min=1, max=65535)
 
 
-# The options by their names: the type with help, the default, and the name for `choose_streams`.
-_OPTIONS: dict[str, tuple[Any, Any, str]] = {
-    "udp": (
-        _option(
-            list[str] | None, "--udp", "HOST:PORT",
-            "Send positions as JSON datagrams to this address; repeat it for several. 239.255.0.1:9870 is a "
-            "multicast group. docs/streams.md has receivers in Python and for ESP32.",
-        ), None, "udp",
+_OPTIONS: dict[str, Option] = {
+    "udp": _option(
+        list[str] | None, "--udp", "HOST:PORT",
+        "Send positions as JSON datagrams to this address; repeat it for several. 239.255.0.1:9870 is a "
+        "multicast group. docs/streams.md has receivers in Python and for ESP32.",
     ),
-    "key": (
-        _option(Path | None, "--key", "FILE", "Sign the datagrams with the key in this file (HMAC-SHA256)."),
-        None, "key",
+    "key": _option(
+        Path | None, "--key", "FILE", "Sign the datagrams with the key in this file (HMAC-SHA256)."
     ),
-    "vrpn": (
-        _option(
-            bool, "--vrpn", None,
-            "Serve positions over VRPN on port 3883, as a motion-capture system: for ROS 2, MATLAB, Unity.",
-        ), False, "is_vrpn",
+    "vrpn": _flag(
+        "--vrpn",
+        "Serve positions over VRPN on port 3883, as a motion-capture system: for ROS 2, MATLAB, Unity.",
     ),
-    "vrpn_port": (_port("--vrpn-port", "Serve VRPN on another port."), None, "vrpn"),
-    "mavlink": (
-        _option(
-            list[str] | None, "--mavlink", "ROBOT=HOST:PORT",
-            "Send the pose of a robot to its autopilot (PX4, ArduPilot); repeat it for several. With "
-            "/vision at the end, the message is VISION_POSITION_ESTIMATE instead of ODOMETRY.",
-        ), None, "mavlink",
+    "vrpn_port": _port("--vrpn-port", "Serve VRPN on another port."),
+    "mavlink": _option(
+        list[str] | None, "--mavlink", "ROBOT=HOST:PORT",
+        "Send the pose of a robot to its autopilot (PX4, ArduPilot); repeat it for several. With /vision at "
+        "the end, the message is VISION_POSITION_ESTIMATE instead of ODOMETRY.",
     ),
-    "ros2": (
-        _option(
-            bool, "--ros2", None,
-            "Publish positions to nodes of ROS 2 with rmw_zenoh, without ROS on this machine: /tf, and a "
-            "pose and odometry for each robot.",
-        ), False, "is_ros2",
+    "ros2": _flag(
+        "--ros2",
+        "Publish positions to nodes of ROS 2 with rmw_zenoh, without ROS on this machine: /tf, and a pose "
+        "and odometry for each robot.",
     ),
-    "ros2_port": (
-        _port(
-            "--ros2-port",
-            "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router.",
-        ), None, "ros2",
+    "ros2_port": _port(
+        "--ros2-port",
+        "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router.",
     ),
-    "ros2_domain": (
-        _option(int | None, "--ros2-domain", "ID", "Publish to this domain ID of ROS 2. Default: 0."),
-        None, "ros2_domain",
+    "ros2_domain": _option(
+        int | None, "--ros2-domain", "ID", "Publish to this domain ID of ROS 2. Default: 0."
     ),
-    "foxglove": (
-        _option(
-            bool, "--foxglove", None,
-            "Serve positions to Foxglove on port 8765. The printed address has a new secret at each start.",
-        ), False, "is_foxglove",
+    "foxglove": _flag(
+        "--foxglove",
+        "Serve positions to Foxglove on port 8765. The printed address has a new secret at each start.",
     ),
-    "foxglove_port": (_port("--foxglove-port", "Serve Foxglove on another port."), None, "foxglove"),
-    "rerun": (
-        _option(bool, "--rerun", None, "Show positions in Rerun, in a browser of this machine."),
-        False, "rerun",
+    "foxglove_port": _port("--foxglove-port", "Serve Foxglove on another port."),
+    "rerun": _flag("--rerun", "Show positions in Rerun, in a browser of this machine."),
+    "images": _flag("--images", "Show images, too, in Foxglove and in Rerun."),
+    "host": _option(
+        str | None, "--host", "ADDRESS",
+        "Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. The "
+        "dashboard of --web is then open to the network, too. Default: only this machine.",
     ),
-    "images": (
-        _option(bool, "--images", None, "Show images, too, in Foxglove and in Rerun."), False, "images",
-    ),
-    "host": (
-        _option(
-            str | None, "--host", "ADDRESS",
-            "Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. "
-            "The dashboard of --web is then open to the network, too. Default: only this machine.",
-        ), None, "host",
-    ),
-    "robot": (
-        _option(
-            list[str] | None, "--robot", "NAME", "Send only this robot; repeat it for several. Default: all.",
-        ), None, "robots",
+    "robots": _option(
+        list[str] | None, "--robot", "NAME", "Send only this robot; repeat it for several. Default: all."
     ),
 }  # fmt: skip
 
@@ -162,7 +138,7 @@ def takes_streams(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
-        streams = {name: given.pop(option) for option, (_, _, name) in _OPTIONS.items()}
+        streams = {name: given.pop(name) for name in _OPTIONS}
         command(**given, streams=streams)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
@@ -174,8 +150,8 @@ def _expand(parameter: inspect.Parameter) -> Iterator[inspect.Parameter]:
     if parameter.name != "streams":
         yield parameter
         return
-    for option, (kind, default, _) in _OPTIONS.items():
-        yield inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+    for name, (kind, default) in _OPTIONS.items():
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
 def choose_streams(
@@ -188,8 +164,8 @@ def choose_streams(
     rig : the rig of a file, never of a log: a log opens no socket.
     folder : the folder of the rig file.
     has_page : the command also serves a page at the address of ``host``.
-    options : fields of `StreamSettings`, and ``is_vrpn``, ``is_ros2`` and ``is_foxglove`` for the usual
-        port; None, False and empty lists are missing.
+    options : fields of `StreamSettings`; for a server, whether it is wanted, and its port as ``vrpn_port``.
+        None, False and empty lists are missing.
 
     Raises
     ------
@@ -200,8 +176,8 @@ def choose_streams(
     from ipsys_log.sinks.streams.settings import PORTS, settings_of_rig
 
     for name, port in PORTS.items():
-        if options.pop(f"is_{name}", False):
-            options[name] = options.get(name) or port
+        wanted = port if options.pop(name) else None
+        options[name] = options.pop(f"{name}_port") or wanted
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in options.items()

@@ -55,7 +55,13 @@ Examples
 
 
 def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: FoxgloveLayout = None) -> None:
-    """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun."""
+    """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun.
+
+    Examples
+
+        ipsys view monday.mcap                             # the newest run
+        ipsys view monday.mcap --run poly --save monday.rrd
+    """
     from ipsys_log.extras import check_installed
     from ipsys_log.log.dataset import Session
 

@@ -10,8 +10,7 @@ from collections import Counter, deque
 from collections.abc import Collection, Generator, Iterator
 from types import NoneType
 
-from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.frames import Clock, Say
+from ipsys_log.capture.frames import CameraState, Clock, Say
 from ipsys_log.capture.simulated import FrameTiming
 from ipsys_log.closed_loop.settings import RobotRun
 from ipsys_log.closed_loop.steering import Steering

@@ -163,6 +163,12 @@ class ChunkContents:
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """The first and the last log time; None without messages."""
+        times = [time_ns for rows in self.entries.values() for time_ns, _ in rows]
+        return (min(times), max(times)) if times else None
+
     def in_order(self) -> list[tuple[int, int]]:
         """Return the offset and the channel id of each message, in the order of the file."""
         return sorted((offset, key) for key, rows in self.entries.items() for _, offset in rows)

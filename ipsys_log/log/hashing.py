@@ -14,7 +14,9 @@ from functools import cache
 
 from mcap import records as mcap
 
-from ipsys_log.log.records import to_bytes
+from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.records import HEADER, parse, to_bytes, walk
 
 Buffer = bytes | memoryview
 WORTH_COMBINING = 32 << 10  # bytes: for shorter data, a second read costs less
@@ -118,7 +120,19 @@ def metadata_of_hashes(hashes: dict[str, ChannelHash], offset: int) -> bytes:
     return to_bytes(mcap.Metadata(METADATA_NAME, values)) if len(values) > 1 else b""
 
 
-def hashes_from_metadata(record: mcap.Metadata, offset: int) -> dict[str, ChannelHash]:
+def stored_hashes(view: LogBytes, contents: Contents) -> dict[str, ChannelHash]:
+    """Return the hashes that writers stored in the log, the newest per topic."""
+    hashes: dict[str, ChannelHash] = {}
+    for index in sorted(contents.metadata, key=lambda record: record.offset):
+        if index.name == METADATA_NAME and index.offset + HEADER.size <= contents.data_end:
+            record_at = next(walk(view, index.offset, contents.data_end))
+            body = view.read(record_at.offset + HEADER.size, record_at.length - HEADER.size)
+            record = parse(mcap.Metadata.read, view, record_at, body)
+            hashes |= _hashes_in(record, index.offset)
+    return hashes
+
+
+def _hashes_in(record: mcap.Metadata, offset: int) -> dict[str, ChannelHash]:
     """Return the hashes in `record` at `offset`; none if the record was moved, or is not from ipsys."""
     hashes: dict[str, ChannelHash] = {}
     if record.name != METADATA_NAME or record.metadata.get("offset") != str(offset):

@@ -113,16 +113,15 @@ class PartCopier:
         head = parse_chunk_head(view, part.start)[1]
         data = unpack(view, part.start, head, is_crc_checked=False)
         inside = parse_chunk_contents(view, part.start, data)
-        times = [time_ns for rows in inside.entries.values() for time_ns, _ in rows]
+        span = inside.span_ns
         for channel_id in inside.entries:
             self._define(channel_id)
         keeps_definitions = all(map(self.writer.defines, inside.schemas.values())) and all(
             map(self.writer.defines, inside.channels.values())
         )
-        if not (part.is_proved and times and keeps_definitions and self.is_new):
+        if not (part.is_proved and span and keeps_definitions and self.is_new):
             self._write_all(part, data, inside, None if head.compression else head.data_offset)
             return
-        span = min(times), max(times)
         record = chunk_head(*span, head.uncompressed_size, head.crc, head.compression, head.data_size)
         record += view.read(head.data_offset, head.data_size)
         indexes, offsets = index_records(inside.entries, part.start + len(record))

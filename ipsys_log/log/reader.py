@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from mcap import records as mcap
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError, UnreadError
@@ -31,13 +30,13 @@ from ipsys_log.log.chunk_messages import (
 from ipsys_log.log.chunks import has_wrong_crc
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
 from ipsys_log.log.file_check import FileCheck, check_file
-from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
+from ipsys_log.log.hashing import ChannelHash, stored_hashes
 from ipsys_log.log.journal import attach_journal
 from ipsys_log.log.known_contents import contents_of, open_remote
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import PendingChunk, in_log_order
-from ipsys_log.log.records import HEADER, ChunkRef, parse, walk
+from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.summary import NoFooterError
 from ipsys_log.log.survey import Watch
 from ipsys_log.plain_text import shell_words
@@ -342,18 +341,6 @@ def _positions(rows: Rows, chunk_offsets: Rows | int, place: int) -> Rows:
     positions[:, 0], positions[:, 1] = rows[:, 0], chunk_offsets
     positions[:, 2], positions[:, 3] = rows[:, 1], place
     return positions
-
-
-def stored_hashes(view: LogBytes, contents: Contents) -> dict[str, ChannelHash]:
-    """Return the hashes that writers stored in the log, the newest per topic."""
-    hashes: dict[str, ChannelHash] = {}
-    for index in sorted(contents.metadata, key=lambda record: record.offset):
-        if index.name == METADATA_NAME and index.offset + HEADER.size <= contents.data_end:
-            record_at = next(walk(view, index.offset, contents.data_end))
-            body = view.read(record_at.offset + HEADER.size, record_at.length - HEADER.size)
-            record = parse(mcap.Metadata.read, view, record_at, body)
-            hashes |= hashes_from_metadata(record, index.offset)
-    return hashes
 
 
 def _open(path: LogLocation) -> tuple[LogBytes, Contents]:

@@ -54,6 +54,7 @@ _CANDIDATE = re.compile(
     rb"|\x0f\x04\0{7}|[\x03\x04\x05\x07\x09\x0c].{3}\0{5})",
     re.DOTALL,
 )
+_SECTOR_BYTES = 512
 _OVERLAP = 64  # bytes: longer than each candidate
 _DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA))
 _IN_CHUNK = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE))
@@ -109,16 +110,20 @@ class RecordSearch:
         """Return the offset of the first of other records within this one, if its length is wrong.
 
         The length is right if a plausible record follows; near damage, this may be chance. Records within
-        this one prove the contrary if they lead to its end or beyond: a stray copy of a sector ends before.
+        this one prove the contrary if they lead to its end, or further than a stray copy of a sector.
         """
         stop = record.offset + record.length
         head = MESSAGE if record.opcode == Opcode.MESSAGE else HEADER
         is_right = self._follows(stop) and not is_near_damage
         inner = None if is_right else self.find(record.offset + head.size, stop)
-        position = inner or stop
+        if inner is None or inner == self.frame_at:
+            return inner
+        position = inner
         while position < stop:
             if not self._follows(position):
                 return None
+            if position - inner > _SECTOR_BYTES:
+                break
             position += HEADER.size + HEADER.unpack(self.view.read(position, HEADER.size))[1]
         return inner if self._follows(position) else None
 
@@ -209,10 +214,11 @@ class RecordSearch:
             for record in walk(view, start, view.size):
                 if record.opcode == Opcode.FOOTER and record.length == FOOTER.size:
                     summary = FOOTER.unpack(view.read(record.offset, FOOTER.size))[2]
-                    stop = record.offset + record.length + len(MAGIC)
-                    is_end = view.read(stop - len(MAGIC), min(len(MAGIC), view.size - stop + 8)) == MAGIC
-                    # A stray copy has another offset of its summary.
-                    return stop if is_end and (summary in (0, start) or stop == view.size) else None
+                    stop = record.offset + record.length
+                    following = view.read(stop, min(2 * len(MAGIC), view.size - stop))
+                    # After a stray copy without summary, neither the file ends nor another log begins.
+                    is_mine = summary == start and following.startswith(MAGIC)
+                    return stop + len(MAGIC) if is_mine or following in (MAGIC, 2 * MAGIC) else None
                 if record.opcode not in _IN_SUMMARY and record.opcode < PRIVATE:
                     return None
         except UnreadError:

@@ -174,6 +174,10 @@ def _replace(storage: Storage, view: FileBytes, survey: Survey) -> tuple[PartCop
             copier.define_all()
             copier.copy(survey.parts)
         _check_new(path, new)
+        if not os.path.samestat(os.fstat(view.fd), path.stat()):
+            raise LogError(
+                f"{path}: another program has replaced the log in the meantime; run the command again"
+            )
         shutil.copymode(path, new)
         damaged_file = _free_name(path)
         if not damaged_file.exists():

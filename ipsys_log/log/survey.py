@@ -292,7 +292,7 @@ class Survey:
         if was_sound:
             add_record(view, self.contents, self._unchunked, self._counts, record)
             self._counts[record.offset] = {key: len(rows) for key, rows in inside.entries.items()}
-            start_ns, end_ns = _span_of(inside) or (head.start_ns, head.end_ns)
+            start_ns, end_ns = inside.span_ns or (head.start_ns, head.end_ns)
             self.contents.chunks[-1] = self.contents.chunks[-1]._replace(
                 start_ns=start_ns, end_ns=end_ns,  # those in its head may be wrong
                 index_length=end - stop if is_complete else 0, index_offsets=offsets if is_complete else {},
@@ -327,9 +327,8 @@ class Survey:
         for channel in inside.channels.values():
             self._define(offset, channel, trust)
         self._check_channels(offset, inside.entries.keys())
-        span = _span_of(inside)
-        if span is not None:
-            self._cover(*span)
+        if inside.span_ns is not None:
+            self._cover(*inside.span_ns)
 
     def _define(self, offset: int, record: mcap.Schema | mcap.Channel, trust: int) -> None:
         """Add a definition in the data section; it must agree with others of its id."""
@@ -399,8 +398,3 @@ class Survey:
 def reason_of(error: LogError) -> str:
     """Return the text of a fault without the path and the advice."""
     return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]
-
-
-def _span_of(inside: ChunkContents) -> tuple[int, int] | None:
-    times = [time_ns for rows in inside.entries.values() for time_ns, _ in rows]
-    return (min(times), max(times)) if times else None

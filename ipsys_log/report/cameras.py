@@ -15,8 +15,8 @@ from rich.text import Text
 from ipsys_log.analysis.differences import Comparison
 from ipsys_log.analysis.latency import Percentiles
 from ipsys_log.analysis.overlap_stream import OverlapSummary
-from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
 from ipsys_log.plain_text import plain_text

@@ -11,7 +11,7 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.errors import FrameError
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import decode_keyframe, is_keyframe

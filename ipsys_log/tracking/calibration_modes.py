@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.model_kinds import joint_models
 from ipsys_log.arrays import Array
 from ipsys_log.messages import CameraModel, Model, Rig
-from ipsys_log.models.table import AppliedModel
+from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.tracking.bias_modes import FLATTEST, BiasModes, CameraNodes, Grid, NodeModes, reduce_modes
 
 if TYPE_CHECKING:
@@ -39,7 +38,11 @@ def calibration_modes(model: Model, rig: Rig | None, count: int = MODES) -> Bias
     -------
     BiasModes : without modes if the model has no covariance.
     """
-    joints = joint_models(model)
+    joints: Mapping[str, JointModel] = {}
+    if reads_corners(model.name):
+        from ipsys_log.joint.payload import restore_joint
+
+        joints = restore_joint(model)
     grid = _grid(model, joints)
     if grid is None:
         return BiasModes.none()

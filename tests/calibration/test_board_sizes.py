@@ -52,13 +52,7 @@ def seen(pictures: list[Grey], board: str, insist: bool = False) -> SearchResult
 
 # Margin, width and phase of the stripes are in squares. The stripe beside the paper is dark above, or on both
 # sides, or the stripes almost continue the squares.
-STRIPES = [
-    (0.2, 1.0, -1.2),
-    *(
-        pytest.param(s, marks=pytest.mark.slow)
-        for s in [(0.1, 1.0, -0.5), (0.3, 2.0, -1.3), (0.1, 2.0, -1.1)]
-    ),
-]
+STRIPES = [(0.2, 1.0, -1.2), (0.1, 2.0, -1.1)]
 
 
 # A search over a rendered set of images.
@@ -75,11 +69,10 @@ def test_board_over_stripes_right_size_gives_the_lens(stripes: tuple[float, floa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stripes", STRIPES[:2])
-@pytest.mark.parametrize("stated", ["8x7", pytest.param("9x6", marks=pytest.mark.slow)])
-def test_board_over_stripes_wrong_size_is_refused(stripes: tuple[float, float, float], stated: str) -> None:
+@pytest.mark.parametrize("stated", ["8x7", "9x6"])
+def test_board_over_stripes_wrong_size_is_refused(stated: str) -> None:
     with pytest.raises(IpsysError, match=r"give --board 8x6"):
-        seen(striped(*stripes)[:4], stated)
+        seen(striped(*STRIPES[0])[:4], stated)
 
 
 def slow(true: tuple[int, int], stated: str) -> object:
@@ -89,9 +82,8 @@ def slow(true: tuple[int, int], stated: str) -> object:
 @pytest.mark.parametrize(
     ("true", "stated"),
     [
-        ((8, 6), "5x6"), ((8, 6), "7x5"), ((8, 6), "9x7"), slow((8, 6), "7x6"), slow((8, 6), "8x5"),
-        slow((8, 6), "4x3"), slow((8, 6), "9x6"), slow((8, 6), "8x7"), slow((8, 6), "9x5"),
-        slow((8, 6), "charuco:9x7"), slow((6, 6), "5x6"), slow((6, 6), "7x6"), slow((6, 5), "5x4"),
+        ((8, 6), "5x6"), ((8, 6), "7x5"), ((8, 6), "9x7"),
+        slow((8, 6), "4x3"), slow((8, 6), "9x5"), slow((8, 6), "charuco:9x7"), slow((6, 6), "7x6"),
     ],
 )  # fmt: skip
 def test_chessboard_of_other_size_is_named_at_once(true: tuple[int, int], stated: str) -> None:

@@ -16,7 +16,6 @@ from ipsys_log.calibration.solve import find_start
 from ipsys_log.calibration.two_cameras import TwoCameras, find_two_cameras
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen
-from tests.tiers import first_fast
 
 # Cameras of the same type differ less, those with another lens more.
 OTHER = (650.0, 650.0, 310.0, 250.0, -0.25, 0.08, 0.001, -0.001, 0.02)
@@ -57,11 +56,10 @@ def agreement(groups: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
 
 
 @pytest.mark.parametrize("name", list(TRUTH))
-@pytest.mark.parametrize("shared_px", first_fast(1, [0.15, 0.0]))
-def test_pictures_of_one_camera_are_not_split(name: str, shared_px: float) -> None:
+def test_pictures_of_one_camera_are_not_split(name: str) -> None:
     """The corners of an image share errors, as on a curved board."""
     for seed, pictures in ((0, 8), (1, 16), (2, 24)):
-        corners = seen(name, np.random.default_rng(seed), pictures, shared_px=shared_px)
+        corners = seen(name, np.random.default_rng(seed), pictures, shared_px=0.15)
         assert split(name, corners) is None
 
 

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.calibration.solve import solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen
-from tests.tiers import first_fast
 
 # A lens with decentred elements: the fisheye model has no terms for it.
 DECENTERED = (600.0, 600.0, 330.0, 230.0, -0.25, 0.1, 0.004, -0.006, -0.02)
@@ -29,7 +28,7 @@ def squared_errors(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", first_fast(1, ["fisheye", "pinhole", "pinhole8"]))
+@pytest.mark.parametrize("name", ["fisheye", "pinhole8"])
 def test_few_pictures_errors_are_as_stated(name: str) -> None:
     """Seven images may agree by chance; the error of a jackknife of seven is then up to 6 sigma."""
     errors = squared_errors(name, name, 7, range(100, 130))
@@ -39,10 +38,9 @@ def test_few_pictures_errors_are_as_stated(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pictures", [7, 20])
-def test_lens_of_other_kind_errors_are_as_stated(pictures: int) -> None:
+def test_lens_of_other_kind_errors_are_as_stated() -> None:
     """With the jackknife only, the mean is 3 to 4 for 20 images."""
-    errors = squared_errors("pinhole", "fisheye", pictures, range(100, 120), DECENTERED)
+    errors = squared_errors("pinhole", "fisheye", 20, range(100, 120), DECENTERED)
     assert 0.3 < errors.mean() < 2.0, errors.mean(axis=0)
     assert (errors < 4).mean() >= 0.9
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.cli.open_cameras import open_cameras, prepare_lab
 from ipsys_log.log.dataset import Session
@@ -165,7 +165,7 @@ def test_advice_needs_a_large_recording_or_a_small_disk(tmp_path: Path) -> None:
     advice = DiskRoom(tmp_path, 10**12, 25e6).advise(cameras, {"red": jpeg})
     assert advice is not None
     assert "JPEG quality or H.264" in advice
-    assert "ipsys measure" in advice
+    assert "--points-only" in advice
     short = DiskRoom(tmp_path, 10**8, 1e6).advise(cameras, {"red": video})
     assert short is not None
     assert "JPEG" not in short

@@ -16,8 +16,8 @@ import pytest
 import simplejpeg
 
 from ipsys_log.capture import multiplexer as attached_module
-from ipsys_log.capture.camera_thread import CameraState, imported_run
-from ipsys_log.capture.frames import Clock, Frame, NodeRefusedError, Open, Say, SourceError
+from ipsys_log.capture.camera_thread import imported_run
+from ipsys_log.capture.frames import CameraState, Clock, Frame, NodeRefusedError, Open, Say, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing

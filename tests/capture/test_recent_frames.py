@@ -14,7 +14,7 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import check_independent_frames
 from ipsys_log.capture.multiplexer import LiveCameras
@@ -156,7 +156,7 @@ def test_fewer_large_frames_are_kept_but_all_events(log: Noted) -> None:
 
 def test_recent_frames_of_a_video_cannot_be_kept() -> None:
     with pytest.raises(
-        IpsysError, match="camera white sends h264, but ipsys measure can keep short parts only of MJPEG"
+        IpsysError, match="camera white sends h264, but --points-only can keep short parts only of MJPEG"
     ):
         check_independent_frames({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
 

@@ -106,8 +106,8 @@ def test_old_and_present_name_give_the_same_result(ipsys: Ipsys, replayed_lab: P
     old, present = ipsys("runs", replayed_lab, "--json"), ipsys("info", replayed_lab, "--runs", "--json")
     assert old == present
     both = json.loads(ipsys("info", replayed_lab, "--runs", "--sizes", "--json").out)
-    assert both["runs"] == json.loads(present.out)
-    assert [both["sizes"]] == [json.loads(ipsys("du", replayed_lab, "--json").out)]
+    assert both["runs"] == json.loads(present.out)["rows"]
+    assert both["sizes"] == json.loads(ipsys("du", replayed_lab, "--json").out)["rows"]
 
 
 def test_folder_with_the_name_of_a_kind_is_a_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -219,7 +219,7 @@ def test_bad_input_is_one_line(
     bare = tmp_path / "bare.mcap"
     with Session([weeks[1]]) as session:
         write_log(bare, session.messages(["/rig"]))
-    assert "has no detected markers; to detect them: ipsys detect" in error(weeks[0], bare)
+    assert "has no detected markers; to detect them: ipsys replay" in error(weeks[0], bare)
     hidden = tmp_path / "hidden.mcap"
     write_log(hidden, simulate_week(own, replace(WEEKS, references=((2.4, 20.0, 0.0, 0.0, 0.0),)), 1))
     assert "no camera sees a reference marker" in error(hidden, weeks[2], "--model-from", fitted)

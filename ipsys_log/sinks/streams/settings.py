@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import chain
 from math import pi
 from pathlib import Path
@@ -42,7 +42,7 @@ class Stream(InlineSink, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StreamSettings:
-    """The streams to open, as in `RigStream`.
+    """The streams to open: the fields of `RigStream`, and those of the command line.
 
     Attributes
     ----------
@@ -86,19 +86,9 @@ def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
     """Return the settings of a rig file; the path of its key is relative to the folder of the file."""
     if stream is None:
         return StreamSettings()
-    return StreamSettings(
-        stream.host,
-        stream.udp,
-        None if stream.key is None else folder / stream.key,
-        stream.vrpn,
-        stream.mavlink,
-        pi / 2 if stream.north_rad is None else stream.north_rad,
-        stream.robots,
-        STALE_S if stream.stale_s is None else stream.stale_s,
-        stream.ros2,
-        stream.ros2_domain or 0,
-        stream.foxglove,
-    )
+    given = {field.name: getattr(stream, field.name) for field in fields(stream)}
+    given["key"] = None if stream.key is None else folder / stream.key
+    return StreamSettings(**{name: value for name, value in given.items() if value is not None})
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.analysis.overlap_stream import OverlapSummary
-from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import (

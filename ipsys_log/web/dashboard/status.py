@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.analysis.latency import latency_percentiles, step_times_s
-from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom
+from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.messages import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
 from ipsys_log.messages.events import OPERATOR_KINDS

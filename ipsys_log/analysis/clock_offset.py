@@ -42,8 +42,7 @@ _GRID_STEP_S = 0.025
 _NEAR_STEPS = 10
 # Low points of the grid with a misfit of at most this multiple of the lowest one are refined.
 _LOW_MISFIT = 3.0
-# Residuals of the maps above this share of the spread of the positions are those of unrelated paths
-# (test_paths_of_another_session_do_not_agree).
+# Residuals of the maps above this share of the spread of the positions are those of unrelated paths.
 _LARGEST_MISFIT = 0.02
 # Another offset is a rival of the best one if the ratio of their misfits is less than this
 # (test_path_that_repeats_itself_gives_no_offset).
@@ -137,26 +136,15 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
         raise FitError("no marker moves in the images of both")
     equal_s = first_start_s - second_start_s  # the offset since the starts, of clocks that are equal
     candidates_s = [equal_s + step * _REFINED_S for step in range(-_NEAR_STEPS, _NEAR_STEPS + 1)]
-    candidates_s += _search(pairs)
+    # Cameras without a common field of view have no common instants at the right offset.
+    for cameras in sorted({pair.cameras for pair in pairs}):
+        candidates_s += search_offsets_s([pair.path for pair in pairs if pair.cameras == cameras])
     fits = [fit for near_s in candidates_s if (fit := _refine(pairs, near_s)) is not None]
     if not fits and not any(_degrees(_on_grid(pairs, near_s).values()) for near_s in candidates_s):
         raise FitError("their common markers have too few common instants")
     offset_s, sigma_s = _unique(pairs, sorted(fits, key=lambda fit: fit.misfit))
     markers = tuple(sorted({pair.marker_id for pair in pairs}))
     return ClockOffset(equal_s - offset_s, sigma_s, markers)
-
-
-def _search(pairs: Sequence[_Pair]) -> list[float]:
-    """Return the offsets at which the speeds agree best, for each two cameras.
-
-    Cameras without a common field of view have no common instants at the right offset.
-    """
-    views = sorted({pair.cameras for pair in pairs})
-    return [
-        offset_s
-        for cameras in views
-        for offset_s in search_offsets_s([pair.path for pair in pairs if pair.cameras == cameras])
-    ]
 
 
 def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> tuple[float, float]:
@@ -193,15 +181,10 @@ def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> tuple[float, float]
         )
     if best is None:
         raise FitError("the paths of their common markers agree at no offset")
-    if any(_contradicts(fit, best[0]) for fit in blurred):
+    rivals = [fit for fit in blurred if abs(fit.offset_s - best[0].offset_s) >= _REFINED_S]
+    if any(fit.instants >= _RIVAL_SHARE * best[0].instants for fit in rivals):
         raise FitError("the paths of their common markers agree at several offsets")
     return best[0].offset_s, best[1]
-
-
-def _contradicts(blurred: _Fit, best: _Fit) -> bool:
-    """Return whether a fit with a large sigma is a rival: at another offset, with similarly many instants."""
-    is_apart = abs(blurred.offset_s - best.offset_s) >= _REFINED_S
-    return is_apart and blurred.instants >= _RIVAL_SHARE * best.instants
 
 
 def _since_start(paths: Iterable[MarkerPath]) -> tuple[list[MarkerPath], float]:

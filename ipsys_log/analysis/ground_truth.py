@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.pairs import TimedPoints, still_interval
 from ipsys_log.analysis.tape import RiggedMeasurement
-from ipsys_log.arrays import Array
+from ipsys_log.arrays import Array, Indices
 from ipsys_log.geometry.time_brackets import bracket_times
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
@@ -123,10 +123,9 @@ def track_errors(
         known = ground_truth.get(marker_id)
         if known is None:
             continue
-        # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
-        times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-        truth = bracket_times(known.times_ns, times_ns, LONGEST_GAP_NS)
-        offsets_m = track.points_m[::-1][last] - truth.mix(known.points_m)
+        rows = last_poses(track)
+        truth = bracket_times(known.times_ns, track.times_ns[rows], LONGEST_GAP_NS)
+        offsets_m = track.points_m[rows] - truth.mix(known.points_m)
         offsets.append(offsets_m[truth.is_known])
     rows_m = np.vstack([np.zeros((0, 3)), *offsets])
     if not len(rows_m):
@@ -136,6 +135,14 @@ def track_errors(
     space, floor = _statistics(rows_m[counts]) if counts.any() else whole
     others = None if counts.all() else _statistics(rows_m[~counts])
     return TrackErrors(space, floor, int(counts.sum()), len(rows_m), others, whole)
+
+
+def last_poses(track: TimedPoints) -> Indices:
+    """Return the rows of a track with the last pose of each instant, in order of time.
+
+    Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
+    """
+    return len(track.times_ns) - 1 - np.unique(track.times_ns[::-1], return_index=True)[1]
 
 
 def _statistics(offsets_m: Array) -> tuple[ErrorStatistics, ErrorStatistics]:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.ground_truth import gather_tracks
+from ipsys_log.analysis.ground_truth import gather_tracks, last_poses
 from ipsys_log.analysis.pairs import TimedPoints
 from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.time_brackets import bracket_times
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     FINISHED,
@@ -181,18 +182,11 @@ def _robot(
 
 
 def _errors_m(track: TimedPoints, true: TimedPoints) -> Array:
-    """Return rows of time in ns and error on the floor in m, at the instants of the ground truth.
-
-    The last pose of an instant counts: it uses all cameras.
-    """
-    last = {int(time_ns): row for time_ns, row in zip(track.times_ns, track.points_m, strict=True)}
-    known = {int(time_ns): row for time_ns, row in zip(true.times_ns, true.points_m, strict=True)}
-    rows = [
-        (time_ns, float(np.linalg.norm((row - known[time_ns])[:2])))
-        for time_ns, row in last.items()
-        if time_ns in known
-    ]
-    return np.array(rows, dtype=np.float64).reshape(-1, 2)
+    """Return rows of time in ns and error on the floor in m, at the instants of the ground truth."""
+    rows = last_poses(track)
+    truth = bracket_times(true.times_ns, track.times_ns[rows], 0)
+    errors_m = np.linalg.norm((track.points_m[rows] - truth.mix(true.points_m))[:, :2], axis=1)
+    return np.column_stack([track.times_ns[rows], errors_m])[truth.is_known]
 
 
 def _waypoint(

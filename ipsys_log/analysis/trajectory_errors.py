@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.ground_truth import LONGEST_GAP_NS, TrackedPath
+from ipsys_log.analysis.ground_truth import LONGEST_GAP_NS, TrackedPath, last_poses
 from ipsys_log.arrays import Array
 from ipsys_log.geometry.time_brackets import TimeBrackets, bracket_times
 from ipsys_log.messages import ErrorStatistics
@@ -110,15 +110,14 @@ def pool_trajectories(trajectories: Sequence[TrajectoryErrors]) -> TrajectoryErr
 def _errors_of(
     track: TrackedPath, truth: TrackedPath, deltas: Sequence[tuple[float, str]]
 ) -> TrajectoryErrors | None:
-    # Tracks of earlier versions have a pose of each camera at an instant; the last one uses all cameras.
-    times_ns, last = np.unique(track.positions.times_ns[::-1], return_index=True)
+    rows = last_poses(track.positions)
+    times_ns = track.positions.times_ns[rows]
     brackets = bracket_times(truth.positions.times_ns, times_ns, LONGEST_GAP_NS)
     is_known = brackets.is_known
     if not is_known.any():
         return None
-    points_m, headings_rad = (
-        values[::-1][last][is_known] for values in (track.positions.points_m, track.headings_rad)
-    )
+    rows = rows[is_known]
+    points_m, headings_rad = track.positions.points_m[rows], track.headings_rad[rows]
     times_ns, true_m = times_ns[is_known], brackets.mix(truth.positions.points_m)[is_known]
     true_rad = _mix_headings(brackets, truth.headings_rad)[is_known]
     has_headings = np.isfinite(headings_rad) & np.isfinite(true_rad)

@@ -22,8 +22,8 @@ _LARGEST_TURN_SIGMA_RAD = np.radians(2.0)
 _LARGEST_OFFSET_SIGMA_S = 0.1
 # A larger median residual, as a share of the extent of the path, shows that the paths differ.
 _LARGEST_SHARE = 0.2
-# Two offsets are alike if their median residuals differ by less than this factor and this length
-# (test_repeated_path_needs_a_time_offset). The length is for residuals near 0, as of a simulated truth.
+# Two offsets are alike if their median residuals differ by less than this factor and this length. The length
+# is for residuals near 0, as of a simulated truth.
 _ALIKE = 1.5
 _ALIKE_M = 1e-3
 

@@ -101,7 +101,10 @@ class PartCopier:
     def _copy_index(self, opcode: int, start: int, stop: int, data: Iterable[bytes]) -> None:
         """Copy an attachment, or metadata of other programs: ours are hashes of the old log."""
         contents = Contents()
-        add_record(self.view, contents, ChunkContents(), {}, RecordAt(opcode, start, stop - start))
+        try:
+            add_record(self.view, contents, ChunkContents(), {}, RecordAt(opcode, start, stop - start))
+        except LogError:  # its name is damaged: only the old log keeps it
+            return
         if contents.attachments:
             self.writer.copy_record(contents.attachments[0], data)
         elif contents.metadata[0].name != METADATA_NAME:

@@ -101,7 +101,10 @@ class PartCopier:
     def _copy_index(self, opcode: int, start: int, stop: int, data: Iterable[bytes]) -> None:
         """Copy an attachment, or metadata of other programs: ours are hashes of the old log."""
         contents = Contents()
-        add_record(self.view, contents, ChunkContents(), {}, RecordAt(opcode, start, stop - start))
+        try:
+            add_record(self.view, contents, ChunkContents(), {}, RecordAt(opcode, start, stop - start))
+        except LogError:  # its name is damaged: only the old log keeps it
+            return
         if contents.attachments:
             self.writer.copy_record(contents.attachments[0], data)
         elif contents.metadata[0].name != METADATA_NAME:
@@ -141,6 +144,8 @@ class PartCopier:
 
     def _write_all(self, part: Part, data: bytes, inside: ChunkContents, at: int | None = None) -> None:
         """Write the messages of a chunk, whose uncompressed data begin at the offset `at` in the file."""
+        if at is None and self._is_lost(part, part.start, part.end):
+            return
         for offset, channel_id in inside.in_order():
             stop = offset + HEADER.size + HEADER.unpack_from(data, offset)[1]
             span = None if at is None else (at + offset, at + stop)
@@ -152,12 +157,9 @@ class PartCopier:
     def _write(
         self, part: Part, record: bytes, span: tuple[int, int] | None, topic: str | None = None
     ) -> None:
-        """Write the message of a Message record, which lies in the bytes `span` of the file.
-
-        In a log without an end, a sector of zeros never reached the disk: such a message is left out.
-        """
+        """Write the message of a Message record, which lies in the bytes `span` of the file."""
         _, _, channel_id, _, time_ns, published_ns = MESSAGE.unpack_from(record)
-        if not part.is_proved and not self.survey.finished and span and self._has_hole(*span):
+        if span and self._is_lost(part, *span):
             return
         if topic is None:
             self._define(channel_id)
@@ -168,8 +170,14 @@ class PartCopier:
             self.unchecked += 1
             self._unproved.append((time_ns, topic))
 
-    def _has_hole(self, start: int, stop: int) -> bool:
-        """Return whether one of the sectors of these bytes of the file has only zeros."""
+    def _is_lost(self, part: Part, start: int, stop: int) -> bool:
+        """Return whether a sector of these bytes of the file never reached the disk, and so has only zeros.
+
+        This is so only in a log without an end.
+        """
+        is_doubtful = not part.is_proved or (part.kind == Kind.RECORDS and part.start >= self.survey.end)
+        if self.survey.finished or not is_doubtful:
+            return False
         first, last = start - start % _SECTOR_BYTES, min(stop - stop % -_SECTOR_BYTES, self.view.size)
         data = self.view.read(first, last - first)
         sectors = (data[at : at + _SECTOR_BYTES] for at in range(0, len(data), _SECTOR_BYTES))

@@ -116,16 +116,18 @@ class RecordSearch:
         head = MESSAGE if record.opcode == Opcode.MESSAGE else HEADER
         is_right = self._follows(stop) and not is_near_damage
         inner = None if is_right else self.find(record.offset + head.size, stop)
-        if inner is None or inner == self.frame_at:
-            return inner
-        position = inner
-        while position < stop:
+        while inner is not None and inner != self.frame_at and not self._leads_to(inner, stop):
+            inner = self.find(inner + 1, stop)
+        return inner
+
+    def _leads_to(self, start: int, stop: int) -> bool:
+        """Return whether records from `start` on lead to `stop`, or further than a sector."""
+        position = start
+        while position < min(stop, start + _SECTOR_BYTES + 1):
             if not self._follows(position):
-                return None
-            if position - inner > _SECTOR_BYTES:
-                break
+                return False
             position += HEADER.size + HEADER.unpack(self.view.read(position, HEADER.size))[1]
-        return inner if self._follows(position) else None
+        return self._follows(position)
 
     def _follows(self, stop: int) -> bool:
         """Return whether the log ends at `stop`, or the head of a plausible record is there."""

@@ -29,11 +29,11 @@ from results import Report, command
 from rounds import Row
 from scenes import CACHE, drawn
 
-from ipsys_log.batch.execution import run_batch
-from ipsys_log.batch.log_work import check_log, replay_log
-from ipsys_log.batch.tasks import BatchTask, LogResult, perform
-from ipsys_log.batch.workers import Workers, WorkerSettings, open_workers
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.api.batch.execution import run_batch
+from ipsys_log.api.batch.log_work import check_log, replay_log
+from ipsys_log.api.batch.tasks import BatchTask, LogResult, perform
+from ipsys_log.api.batch.workers import Workers, WorkerSettings, open_workers
+from ipsys_log.capture.simulation.settings import LabSettings
 
 __all__ = ["Spent", "lap", "measure", "ratios"]
 

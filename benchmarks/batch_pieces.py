@@ -29,10 +29,10 @@ from results import Report, command
 from rounds import Row
 from scenes import CACHE, drawn, lengthened
 
-from ipsys_log.batch.log_work import replay_log
-from ipsys_log.batch.tasks import BatchTask
-from ipsys_log.batch.workers import Workers, WorkerSettings, open_workers
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.api.batch.log_work import replay_log
+from ipsys_log.api.batch.tasks import BatchTask
+from ipsys_log.api.batch.workers import Workers, WorkerSettings, open_workers
+from ipsys_log.capture.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 
@@ -47,8 +47,8 @@ Lap = Callable[[Path], Spent]
 
 def replay_with_jobs(path: Path) -> Spent:
     """Detect with two local processes, without Dask."""
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.pipeline import replay
 
     begin_s = time.perf_counter()
     replay([path], Request(), until="detect", jobs=2)

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ipsys_log.report.figures import figure_bytes, style_axes
-from ipsys_log.report.styles import REST, camera_styles, model_styles
+from ipsys_log.app.report.figures import figure_bytes, style_axes
+from ipsys_log.app.report.styles import REST, camera_styles, model_styles
 
 __all__ = ["draw_errors"]
 

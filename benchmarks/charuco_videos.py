@@ -31,12 +31,18 @@ from threadpoolctl import threadpool_limits
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, find_board
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.geometry.poses import make_pose
-from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.hand_held import fit_hand_held, predict_errors
-from ipsys_log.joint.observations import Body, CalibrationPoint, CameraPrior, Observations, Sightings
-from ipsys_log.joint.settings import JointSettings
+from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.hand_held import fit_hand_held, predict_errors
+from ipsys_log.calibration.joint.observations import (
+    Body,
+    CalibrationPoint,
+    CameraPrior,
+    Observations,
+    Sightings,
+)
+from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.poses import make_pose
 
 __all__ = ["BoardVideos", "measure", "read_videos"]
 

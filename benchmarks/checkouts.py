@@ -29,8 +29,8 @@ def _replay(package: Path, log: Path, until: str | None) -> Turn:
         del sys.modules[name]
     sys.path.insert(0, str(package))
     from ipsys_log import __file__ as found
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.pipeline import replay
 
     assert Path(found).is_relative_to(package), found
 
@@ -46,7 +46,7 @@ def measure(options: argparse.Namespace) -> Report:
     """Replay the same logs with both checkouts."""
     from scenes import drawn
 
-    from ipsys_log.simulation.settings import LabSettings
+    from ipsys_log.capture.simulation.settings import LabSettings
 
     images = drawn(LabSettings(stations=6, drive_s=0.2 if options.smoke else 3.0))
     works = {

@@ -31,6 +31,10 @@ import simplejpeg
 from results import Report, command
 from rounds import Row
 
+from ipsys_log.app.web.dashboard.app import build_dashboard
+from ipsys_log.app.web.dashboard.operator import Operator
+from ipsys_log.app.web.dashboard.state import Dashboard, DashboardSetting
+from ipsys_log.app.web.server import serve_app
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.messages import (
     LATENCY_TOPIC,
@@ -47,10 +51,6 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.sinks.sink import FanOut
-from ipsys_log.web.dashboard.app import build_dashboard
-from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
-from ipsys_log.web.server import serve_app
 
 __all__ = ["measure"]
 

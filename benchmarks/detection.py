@@ -24,7 +24,7 @@ from results import Report, command
 from rounds import Contender, Timing, race, ratio_row
 from scenes import Truth, blocks, drawn, truth, with_restarts
 
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.capture.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 

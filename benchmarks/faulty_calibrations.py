@@ -14,10 +14,10 @@ import numpy as np
 from fault_trials import Fault, Outcome, Trial, cases_folder
 from numpy.typing import ArrayLike, NDArray
 
-from ipsys_log.geometry.lenses import project
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.messages.channels import CAMERA_POINTS
+from ipsys_log.vision.lenses import project
 
 __all__ = ["FAULTS"]
 

@@ -12,11 +12,11 @@ import numpy as np
 from fault_trials import Fault, Outcome, Trial, cases_folder
 from pymavlink.dialects.v20 import common
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
 from ipsys_log.messages.channels import SMOOTHED_TRACKS
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 
 if TYPE_CHECKING:
     from tests.sinks.autopilots import Reading

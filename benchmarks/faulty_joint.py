@@ -13,8 +13,8 @@ from fault_trials import Fault, Outcome, Trial, cases_folder
 from geometric_labs import sight
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.poses import make_pose, rotation
-from ipsys_log.geometry.trilateration import multilaterate
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
@@ -28,9 +28,9 @@ from ipsys_log.messages import (
     Run,
 )
 from ipsys_log.messages.channels import MARKERS, POSITIONS
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.units import MM_PER_M, NS_PER_S
+from ipsys_log.messages.units import MM_PER_M, NS_PER_S
+from ipsys_log.vision.poses import make_pose, rotation
+from ipsys_log.vision.trilateration import multilaterate
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import MARKERS_RUN, geometric_rig, simulate_session
 

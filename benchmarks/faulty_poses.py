@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import find_board
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.geometry.lenses import undistort
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
@@ -27,9 +28,8 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, POSITIONS
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.units import MM_PER_M
+from ipsys_log.messages.units import MM_PER_M
+from ipsys_log.vision.lenses import undistort
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

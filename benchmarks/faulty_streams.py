@@ -16,14 +16,14 @@ import numpy as np
 from fault_trials import Fault, Outcome, Trial, cases_folder
 from scenes import drawn
 
-from ipsys_log.images.decode import decode_colour
-from ipsys_log.images.jpeg import read_header
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import CompressedImage, Message
 from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.vision.decode import decode_colour
+from ipsys_log.vision.jpeg import read_header
 
 __all__ = ["FAULTS"]
 

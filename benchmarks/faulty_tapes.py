@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from fault_trials import Fault, Outcome, Trial, cases_folder
 
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers, Measurement, Message, Positions, Rig, Tracks
 from ipsys_log.messages.channels import POSITIONS
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

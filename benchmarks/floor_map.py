@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).resolve().parent.parent))
 
-from ipsys_log.analysis.floor_grid import GRID_M
-from ipsys_log.report.figures import figure_bytes, style_axes
-from ipsys_log.report.styles import shorten
-from ipsys_log.simulation.settings import FLOOR_M
+from ipsys_log.app.report.figures import figure_bytes, style_axes
+from ipsys_log.app.report.styles import shorten
+from ipsys_log.capture.simulation.settings import FLOOR_M
+from ipsys_log.statistics.floor_grid import GRID_M
 from tests.geometric.floor_error import SightingErrors
 
 __all__ = ["draw_floor_map"]

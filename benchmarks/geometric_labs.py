@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from rendered_labs import rendered_lab
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
-from ipsys_log.geometry.lenses import in_image, project
-from ipsys_log.geometry.poses import transform
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.model import build_models
-from ipsys_log.joint.observations import Observations
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import build_models
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Measurement, Message, Pair, Rig
-from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.vision.lenses import in_image, project
+from ipsys_log.vision.poses import transform
 from tests.geometric.corner_noise import (
     WHITE_SHARE,
     corner_covariances,

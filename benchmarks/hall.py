@@ -27,13 +27,13 @@ from results import Report, command
 from rounds import Row
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.analysis.expected_error import mean_lengths
-from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.observations import Observations
-from ipsys_log.joint.payload import joint_payload
-from ipsys_log.joint.start import PlacedCamera, place_cameras
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.payload import joint_payload
+from ipsys_log.calibration.joint.start import PlacedCamera, place_cameras
+from ipsys_log.capture.simulation.settings import hall_settings
 from ipsys_log.log.codec import encode
-from ipsys_log.simulation.settings import hall_settings
+from ipsys_log.statistics.expected_error import mean_lengths
 from tests.geometric.floor_error import (
     KnownSightings,
     SightingErrors,

@@ -36,24 +36,24 @@ from results import Report, command
 from rounds import Row
 from stream_server import free_ports, write_lens
 
-from ipsys_log import pipeline
-from ipsys_log.analysis.knocks import KnockMonitor
-from ipsys_log.analysis.latency import recorded_latencies, step_times_s
-from ipsys_log.analysis.overlap_stream import OverlapSummary
 from ipsys_log.capture.camera_thread import NODES_RUN
 from ipsys_log.capture.frames import CameraState
+from ipsys_log.capture.knocks import KnockMonitor
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
+from ipsys_log.capture.simulation.settings import hall_settings, parse_grid
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log, write_message
+from ipsys_log.engine.stream import run
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import FRAME_SKIPPED, Latency, RigNodes, Tracks
 from ipsys_log.messages.channels import EVENTS, MARKERS, TRACKS
-from ipsys_log.rig.file import rig_toml
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log, write_message
-from ipsys_log.runs.stream import run
-from ipsys_log.simulation.settings import hall_settings, parse_grid
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.rig_file import rig_toml
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.statistics.latency import recorded_latencies, step_times_s
+from ipsys_log.statistics.overlap_stream import OverlapSummary
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import MARKERS_RUN, simulate_session
 

@@ -28,15 +28,15 @@ from results import Report, command
 from rounds import Contender, Row, Timing, Turn, race
 from scenes import CACHE, drawn, lengthened
 
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.workers import available_cores
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.workers import available_cores
-from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["Memory", "measure"]
 
@@ -93,8 +93,8 @@ def _crc(logs: Sequence[Path], _copy: Path) -> None:
 
 
 def _cut(logs: Sequence[Path], part: Path) -> None:
-    from ipsys_log.runs.cut import cut
-    from ipsys_log.runs.cut_selection import CutOptions
+    from ipsys_log.tools.cut import cut
+    from ipsys_log.tools.cut_selection import CutOptions
 
     with LogReader(logs[0]) as reader:
         start_ns, end_ns = reader.start_ns or 0, reader.end_ns or 0
@@ -103,14 +103,14 @@ def _cut(logs: Sequence[Path], part: Path) -> None:
 
 
 def _compact(logs: Sequence[Path], copy: Path) -> None:
-    from ipsys_log.runs.compact import compact
+    from ipsys_log.tools.compact import compact
 
     compact(logs[0], copy)
 
 
 def _merge(logs: Sequence[Path], merged: Path) -> None:
-    from ipsys_log.runs.merge import merge
-    from ipsys_log.runs.merge_plan import LogOffset
+    from ipsys_log.tools.merge import merge
+    from ipsys_log.tools.merge_plan import LogOffset
 
     merge(logs, merged, [LogOffset() for _ in logs])
 
@@ -126,7 +126,7 @@ def _view(logs: Sequence[Path], recording: Path) -> None:
 
 
 def _check(logs: Sequence[Path], _copy: Path) -> None:
-    from ipsys_log.soundness.check import check_logs
+    from ipsys_log.tools.soundness.check import check_logs
 
     check_logs([logs[0]], lambda _stage, _done, _total: None)
 

@@ -25,10 +25,10 @@ from fault_trials import Trial
 from results import Report
 from scenes import CACHE
 
+from ipsys_log.capture.simulation.lab import simulate
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Measurement, Message
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.lab import simulate
-from ipsys_log.simulation.settings import LabSettings
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

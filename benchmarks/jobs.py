@@ -32,12 +32,12 @@ from results import Report, command
 from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE, drawn, lengthened
 
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.simulation.settings import LabSettings
 
 if TYPE_CHECKING:
-    from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan
+    from ipsys_log.engine.pieces import Piece, PieceFrames, PiecePlan
 
 __all__ = ["measure"]
 
@@ -55,8 +55,8 @@ class _Turn(NamedTuple):
 
 
 def _detection(path: Path, jobs: int, one_core: bool = False) -> Turn:
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.pipeline import replay
 
     target = path.with_name(f"jobs_{jobs}.mcap")
     if one_core:  # of this process, which is new in each round
@@ -100,7 +100,7 @@ def _compute_share(line: Connection, path: Path, number: int, processes: int) ->
     """Compute one share of the pieces of a log when the line says so."""
     import cv2
 
-    from ipsys_log.runs.pieces import compute_piece
+    from ipsys_log.engine.pieces import compute_piece
 
     cv2.setNumThreads(1)
     with Session([path]) as session:
@@ -115,9 +115,9 @@ def _compute_share(line: Connection, path: Path, number: int, processes: int) ->
 
 
 def _detection_plan(session: Session) -> PiecePlan:
-    from ipsys_log.runs.graph import Task, plan_stage, writer_of
-    from ipsys_log.runs.options import Request
-    from ipsys_log.runs.pieces import plan_pieces
+    from ipsys_log.engine.graph import Task, plan_stage, writer_of
+    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.pieces import plan_pieces
 
     task = plan_stage(writer_of(MARKERS), session, Request().options(None), {})
     assert isinstance(task, Task)
@@ -180,8 +180,8 @@ def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report)
 def _latency(path: Path, report: Report) -> None:
     from ipsys_log.messages.channels import CALIBRATIONS, RIG
     from ipsys_log.messages.stage import Resets
+    from ipsys_log.messages.units import NS_PER_S
     from ipsys_log.stages.detect import EDGES, Detect
-    from ipsys_log.units import NS_PER_S
 
     resets = Resets(NS_PER_S // 2)
     times_ms: dict[bool, list[float]] = {True: [], False: []}

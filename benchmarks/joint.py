@@ -6,7 +6,7 @@
     python benchmarks/joint.py --coverage --labs 200     # are the covariances of joint those of its errors?
 
 Most labs have no images: markers have the noise that detect has in rendered labs (see
-ipsys_log/simulation/corner_noise.py). Some labs are rendered, to confirm this. Each lab has another seed, and
+tests/geometric/corner_noise.py). Some labs are rendered, to confirm this. Each lab has another seed, and
 all calibrations get the same labs. The error over the floor is defined in tests/geometric/floor_error.py.
 The script prints a table, and writes JSON with -o.
 """

@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import ipsys_log as ipsys
-from ipsys_log.report.advice import HEIGHT_NOTE, label
-from ipsys_log.report.pack_scores import ranked_scores
+from ipsys_log.app.report.advice import HEIGHT_NOTE, label
+from ipsys_log.app.report.pack_scores import ranked_scores
 
 __all__ = ["leaderboard", "table_lines"]
 

@@ -26,13 +26,13 @@ from rounds import Row
 from scenes import drawn
 from stream_server import Served, loops_of, serve
 
-from ipsys_log import pipeline
-from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage
 from ipsys_log.messages.channels import EVENTS
-from ipsys_log.runs.options import Request
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.statistics.latency import latency_percentiles, recorded_latencies, step_times_s
 
 __all__ = ["measure"]
 

@@ -19,20 +19,20 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.calibration_points import measured
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.analysis.cross_validation import Study, cross_validate, gather_points, labelled_subsets
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings
-from ipsys_log.analysis.point_evaluation import evaluate_model
-from ipsys_log.analysis.tape import RiggedMeasurement
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.view import LogView
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Pair
 from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.models.table import MODELS
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.view import LogView
+from ipsys_log.statistics.accuracy import error_statistics
+from ipsys_log.statistics.calibration_points import measured
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.statistics.cross_validation import Study, cross_validate, gather_points, labelled_subsets
+from ipsys_log.statistics.pairs import build_pairs, gather_sightings
+from ipsys_log.statistics.point_evaluation import evaluate_model
+from ipsys_log.statistics.tape import RiggedMeasurement
 
 # Best was selected with other folds.
 FIRST_SEED = 1000

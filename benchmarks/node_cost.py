@@ -26,8 +26,8 @@ from rounds import Row
 from scenes import drawn
 from stream_server import Served, free_ports, loops_of, serve
 
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.log.dataset import Session
-from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 

@@ -26,11 +26,11 @@ from ipsys_log import __version__
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
+from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.simulation.lab import EPOCH_NS
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests.geometric.session import MARKERS_RUN
 
 __all__ = ["play"]

@@ -187,9 +187,9 @@ def one_by_one(
 
 
 def threaded(path: Path, ranges: Sequence[tuple[int, int]]) -> Turn:
-    """Return the ipsys turn as in :func:`ipsys_log.pipeline.replay`: a thread for each camera."""
+    """Return the ipsys turn as in :func:`ipsys_log.live_runs.pipeline.replay`: a thread for each camera."""
     # Imported late: it imports the whole package, and the other contenders start without the package.
-    from ipsys_log.runs.stream import in_threads, run, wire
+    from ipsys_log.engine.stream import in_threads, run, wire
 
     cv2.setNumThreads(1)
     session, rig, lenses = _opened(path)

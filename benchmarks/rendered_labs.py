@@ -8,13 +8,13 @@ from pathlib import Path
 
 from scenes import drawn
 
+from ipsys_log.capture.simulation.calibration_points import plan_points
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Message
 from ipsys_log.messages.channels import CALIBRATIONS, MARKERS, MEASUREMENTS, RIG
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
-from ipsys_log.simulation.calibration_points import plan_points
-from ipsys_log.simulation.settings import LabSettings
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 
 __all__ = ["rendered_lab"]

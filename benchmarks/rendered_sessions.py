@@ -15,17 +15,17 @@ from pathlib import Path
 
 from scenes import simulator_key
 
-from ipsys_log.geometry.marker_cells import MovingMarker, PlacedMarker
+from ipsys_log.capture.simulation.calibration_points import place_marker
+from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.lab import moving_marker
+from ipsys_log.capture.simulation.render import encode_jpeg, render
+from ipsys_log.capture.simulation.settings import Purpose, random_stream
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Markers, Message, Rig
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.calibration_points import place_marker
-from ipsys_log.simulation.floor import FloorView, prepare_view
-from ipsys_log.simulation.lab import moving_marker
-from ipsys_log.simulation.render import encode_jpeg, render
-from ipsys_log.simulation.settings import Purpose, random_stream
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect import STAGE, FrameDetector
-from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker
 from tests.geometric.lab import GeometricLab
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns, still_times_ns

@@ -28,8 +28,8 @@ from results import Report, command
 from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE, drawn, lengthened
 
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages.channels import CALIBRATIONS, RIG
-from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 
@@ -38,8 +38,8 @@ _CAMERAS = 3
 
 
 def _whole(path: Path, jobs: int = 1, until: str | None = None) -> Turn:
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.pipeline import replay
 
     target = path.with_name("replayed.mcap")
 
@@ -61,8 +61,8 @@ def _whole(path: Path, jobs: int = 1, until: str | None = None) -> Turn:
 
 
 def _detection(path: Path) -> Turn:
+    from ipsys_log.engine.stream import in_threads, run, wire
     from ipsys_log.log.dataset import Session
-    from ipsys_log.runs.stream import in_threads, run, wire
     from ipsys_log.stages import detect
 
     stage = wire(detect.STAGE, "bench", {}, detect.Detect(detect.EDGES))
@@ -76,7 +76,7 @@ def _detection(path: Path) -> Turn:
 
 
 def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report) -> None:
-    from ipsys_log.runs.workers import available_cores
+    from ipsys_log.engine.workers import available_cores
 
     jobs = max(available_cores(), 2)
     contenders = [

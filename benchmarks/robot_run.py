@@ -26,14 +26,14 @@ from results import Report, command
 from rounds import Row
 from scenes import drawn
 
-from ipsys_log.analysis.robot_run import RobotRunResult, read_robot_run
-from ipsys_log.closed_loop.run import drive_robots
-from ipsys_log.closed_loop.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab
+from ipsys_log.app.report.robot_run import robot_run_json
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs.pipeline import replay
+from ipsys_log.live_runs.robot_runs.run import drive_robots
+from ipsys_log.live_runs.robot_runs.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab
 from ipsys_log.log.dataset import Session
-from ipsys_log.pipeline import replay
-from ipsys_log.report.robot_run import robot_run_json
-from ipsys_log.runs.options import Request
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.tools.robot_run import RobotRunResult, read_robot_run
 
 __all__ = ["measure"]
 

@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log import simulation
-from ipsys_log.geometry.marker_cells import project_corners
+from ipsys_log.capture import simulation
+from ipsys_log.capture.simulation.calibration_points import SimulatedPose, place_marker
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.lab import simulate
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message
 from ipsys_log.messages.channels import TRUTH
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.calibration_points import SimulatedPose, place_marker
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.lab import simulate
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.vision.marker_cells import project_corners
 
 __all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "simulator_key", "truth", "with_restarts"]
 

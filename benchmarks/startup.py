@@ -21,7 +21,7 @@ from results import Report, command
 from rounds import Row
 from scenes import CACHE, drawn, lengthened
 
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.capture.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.rig.file import rig_toml
+from ipsys_log.messages.rig_file import rig_toml
 
 __all__ = ["Served", "free_ports", "loops_of", "serve", "write_lens"]
 

@@ -27,13 +27,13 @@ from stream_clients import CLIENTS
 from stream_costs import ROBOT, cost_rows, hand_over_rows
 from stream_server import free_ports, loops_of, serve
 
-from ipsys_log import pipeline
-from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Latency, Tracks
 from ipsys_log.messages.channels import EVENTS, TRACKS
-from ipsys_log.runs.options import Request
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.statistics.latency import latency_percentiles, recorded_latencies, step_times_s
 
 __all__ = ["measure"]
 

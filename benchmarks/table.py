@@ -20,8 +20,8 @@ from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE
 
 import ipsys_log as ipsys
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Message, Rig, Track, Tracks
-from ipsys_log.runs.output import write_log
 
 __all__ = ["measure"]
 

@@ -43,9 +43,9 @@ from track_errors import (
     summarize_labs,
 )
 
+from ipsys_log.calibration.joint.payload import JOINT
+from ipsys_log.capture.simulation.pace import Stops
 from ipsys_log.errors import FitError
-from ipsys_log.joint.payload import JOINT
-from ipsys_log.simulation.pace import Stops
 
 __all__ = ["measure"]
 

@@ -1,13 +1,14 @@
 """Indoor positioning with cheap cameras: everything is a channel in a log.
 
-``import ipsys_log as ipsys`` gives the Python API below; :mod:`ipsys_log.api` describes it. All other
-modules are private until 1.0. The command is ``ipsys``; the pipeline is in :mod:`ipsys_log.pipeline`.
+``import ipsys_log as ipsys`` gives the Python API below; :mod:`ipsys_log.api.python_api` describes it. All
+other modules are private until 1.0. The command is ``ipsys``; the pipeline is in
+:mod:`ipsys_log.live_runs.pipeline`.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ipsys_log.api import (
+    from ipsys_log.api.python_api import (
         CalibrationResult,
         Comparison,
         Export,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
         verify,
     )
     from ipsys_log.errors import IpsysError
-    from ipsys_log.joint.fitted_corners import FittedCornerModel
+    from ipsys_log.models.fitted_corners import FittedCornerModel
 
 __all__ = [
     "CalibrationResult",
@@ -87,13 +88,13 @@ def __getattr__(name: str) -> Any:
 
         return IpsysError
     if name == "FittedCornerModel":
-        from ipsys_log.joint.fitted_corners import FittedCornerModel
+        from ipsys_log.models.fitted_corners import FittedCornerModel
 
         return FittedCornerModel
     if name in __all__:
-        from ipsys_log import api
+        from ipsys_log.api import python_api
 
-        return getattr(api, name)
+        return getattr(python_api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

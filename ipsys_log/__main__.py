@@ -1,5 +1,5 @@
 """``python -m ipsys_log`` is ``ipsys``."""
 
-from ipsys_log.cli import main
+from ipsys_log.app.cli import main
 
 main()

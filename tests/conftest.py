@@ -25,16 +25,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # A program under test compiles the package once, as after an installation, and not in each process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+from ipsys_log.app.cli import main
+from ipsys_log.capture.simulation.lab import simulate
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.capture.video_files import open_video
-from ipsys_log.cli import main
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Measurement, Message
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.lab import simulate
-from ipsys_log.simulation.settings import LabSettings
 from tests.capture.streams import encode
 from tests.live_recordings import record_every_frame
 from tests.s3_server import open_bucket, serve_s3

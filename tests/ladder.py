@@ -7,7 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.poses import invert_pose, make_pose, rotation
+from ipsys_log.vision.poses import invert_pose, make_pose, rotation
 
 Array = NDArray[np.float64]
 

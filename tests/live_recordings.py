@@ -9,20 +9,20 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from ipsys_log import pipeline
-from ipsys_log.analysis.differences import Comparison
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
     CompressedImage,
     Message,
 )
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
+from ipsys_log.tools.differences import Comparison
+from ipsys_log.tools.verify import verify
 from tests.playing import SteppedClock, cameras, playing
 
 # Slow enough for a busy machine.

@@ -17,12 +17,12 @@ import pytest
 
 import ipsys_log as ipsys
 from ipsys_log import IpsysError
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.data_frames import TABLES
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Position, Positions, RigCamera, Track, Tracks
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS, TRACKS, Channel
-from ipsys_log.rig.file import rig_toml
-from ipsys_log.runs.output import write_log
+from ipsys_log.messages.rig_file import rig_toml
 from tests.conftest import ROOT
 from tests.live_recordings import lenses
 
@@ -44,13 +44,13 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_package_has_the_names_of_the_api() -> None:
-    from ipsys_log import api
+    from ipsys_log.api import python_api as api
 
     assert set(ipsys.__all__) == {*api.__all__, "FittedCornerModel", "IpsysError"}
 
 
 def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
-    from ipsys_log.tracker import Tracker
+    from ipsys_log.live_runs.tracker import Tracker
 
     tracker = Tracker(lambda _: [])
     tracks = [Message("/runs/poly/tracks", n, n, Tracks(n, ())) for n in range(1000)]
@@ -86,7 +86,7 @@ def test_log_lists_cameras_runs_and_channels(replayed: Path) -> None:
 
 
 def test_text_in_html_is_escaped() -> None:
-    from ipsys_log.opened_log import Listing, _RunRow
+    from ipsys_log.api.opened_log import Listing, _RunRow
 
     listing = Listing([_RunRow("<script>", "detect", "current", ())])
     assert "<script>" not in listing._repr_html_()
@@ -134,8 +134,8 @@ def test_table_equals_the_decoded_messages(replayed: Path, name: str, channel: C
 
 
 def test_missing_values_are_nan_or_na(tmp_path: Path) -> None:
+    from ipsys_log.engine.output import write_log
     from ipsys_log.messages import Rig
-    from ipsys_log.runs.output import write_log
 
     path = tmp_path / "x.mcap"
     tracks = Tracks(

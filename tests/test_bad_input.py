@@ -18,7 +18,7 @@ import pytest
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Distance, Measurement, Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
-from ipsys_log.units import format_time
+from ipsys_log.messages.units import format_time
 from tests.changed_logs import rewrite
 from tests.conftest import Ipsys
 from tests.tiers import first_fast
@@ -362,7 +362,7 @@ def test_a_bug_keeps_its_traceback(ipsys: Ipsys, lab: Path, monkeypatch: pytest.
     def broken(*_: object) -> None:
         raise KeyError("a bug")
 
-    monkeypatch.setattr("ipsys_log.pipeline.check_inputs", broken)
+    monkeypatch.setattr("ipsys_log.live_runs.pipeline.check_inputs", broken)
     with pytest.raises(KeyError, match="a bug"):
         ipsys("replay", lab)
 
@@ -402,7 +402,7 @@ def test_the_real_command_too(tmp_path: Path) -> None:
 
 
 def test_frame_is_never_decoded_to_a_wrong_image() -> None:
-    from ipsys_log.images.decode import decode_grey
+    from ipsys_log.vision.decode import decode_grey
 
     with pytest.raises(ValueError, match="no picture"):
         decode_grey(CompressedImage(0, "a", b"GIF89a...", "gif"))

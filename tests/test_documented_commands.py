@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import typer
 
-from ipsys_log.cli.app import app
+from ipsys_log.app.cli.app import app
 from tests.conftest import ROOT
 from tests.site_pages import staging
 

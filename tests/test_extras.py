@@ -36,7 +36,7 @@ class Without:
         return None if name.partition(".")[0] in hidden else self._finder.find_spec(name, path, target)
 
 sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
-from ipsys_log.cli import main
+from ipsys_log.app.cli import main
 
 results = []
 for command in commands:
@@ -179,7 +179,7 @@ def test_commands_need_only_their_own_extra(folder: Path) -> None:
 
 def test_measuring_page_needs_no_extra_for_figures() -> None:
     hidden = [name for name in HIDDEN if name not in ("starlette", "uvicorn", "anyio", "h11")]
-    program = WITHOUT.replace("from ipsys_log.cli import main", "import ipsys_log.web.server")
+    program = WITHOUT.replace("from ipsys_log.app.cli import main", "import ipsys_log.app.web.server")
     arguments = json.dumps([hidden, []])
     subprocess.run(
         [sys.executable, "-c", program, arguments], cwd=ROOT, check=True, stdout=subprocess.DEVNULL

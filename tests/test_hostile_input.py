@@ -19,14 +19,13 @@ import pytest
 import scipy.io
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from ipsys_log.analysis.pairs import gather_sightings
 from ipsys_log.calibration.images import _decode
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.exchange.image_folders import find_times, parse_time
 from ipsys_log.exchange.imsel import read_mat
-from ipsys_log.geometry.lenses import check_calibration
-from ipsys_log.images.decode import check_encoded, decode_grey, decode_rows
+from ipsys_log.live_runs.survey.checks import next_id
+from ipsys_log.live_runs.survey.sheet import read_sheet
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -41,9 +40,10 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.rig.file import check_rig, load_rig
-from ipsys_log.survey.checks import next_id
-from ipsys_log.survey.sheet import read_sheet
+from ipsys_log.messages.rig_file import check_rig, load_rig
+from ipsys_log.statistics.pairs import gather_sightings
+from ipsys_log.vision.decode import check_encoded, decode_grey, decode_rows
+from ipsys_log.vision.lenses import check_calibration
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.log.bombs import jpeg_head

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     FRAME_SKIPPED,
@@ -19,9 +20,8 @@ from ipsys_log.messages import (
     Event,
 )
 from ipsys_log.messages.channels import POSITIONS
-from ipsys_log.runs.options import Request
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect import Detect
-from ipsys_log.units import NS_PER_S
 from tests.live_recordings import RATE_HZ, again, go_live, lenses, sent, slow
 from tests.playing import SteppedClock, cameras, playing
 

@@ -13,13 +13,18 @@ from typing import Any
 
 import pytest
 
-from ipsys_log import pipeline
-from ipsys_log.analysis.calibration_points import find_pairs
-from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import Recording
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import append_messages, write_log
+from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs import pipeline
+from ipsys_log.live_runs.survey.checks import check_entry, withdrawal_of
+from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
+from ipsys_log.live_runs.survey.live import LiveScene
+from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
@@ -35,16 +40,11 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, RECORD
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import append_messages, write_log
-from ipsys_log.runs.verify import diff, verify
-from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.stages.detect import FrameDetector
-from ipsys_log.survey.checks import check_entry, withdrawal_of
-from ipsys_log.survey.entry import TypedEntry, parse_entry
-from ipsys_log.survey.live import LiveScene
-from ipsys_log.survey.scene import observe_marker
+from ipsys_log.statistics.calibration_points import find_pairs
+from ipsys_log.statistics.calibration_points import measured as measured_places
+from ipsys_log.tools.verify import diff, verify
 from tests.conftest import Ipsys
 from tests.live_recordings import again, attached_in_steps, attached_to, sent, settings_of
 from tests.playing import WAIT_LIMIT_S, cameras, playing

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CAMERA_MOVED, Event, Markers, ReferenceMarker
 from ipsys_log.messages.channels import EVENTS, MARKERS
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.verify import verify
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.tools.verify import verify
 from tests.live_recordings import lenses, sent
 from tests.playing import SteppedClock, cameras, playing
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Latency
 from ipsys_log.messages.channels import LATENCY, MODEL, POSITIONS, TRACKS
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.verify import verify
+from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys
 from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing

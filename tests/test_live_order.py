@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import POSITIONS
-from ipsys_log.runs.options import Request
 from tests.live_recordings import RATE_HZ, again, sent, settings_of
 from tests.playing import SteppedClock, cameras, playing
 

@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.network import open_network
-from ipsys_log.images.video import Video, is_keyframe
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedVideo, Message, RigCamera
 from ipsys_log.messages.channels import RUN_EVENTS
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
+from ipsys_log.tools.verify import verify
+from ipsys_log.vision.video import Video, is_keyframe
 from tests.capture.streams import encode, serve
 from tests.ports import free_port
 from tests.waiting import wait_until

@@ -22,17 +22,17 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
-from ipsys_log.analysis.pairs import active_measurements
-from ipsys_log.cli.dialog import ask_places
+from ipsys_log.app.cli.dialog import ask_places
+from ipsys_log.engine.options import Request
 from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.live_runs.survey.checks import check_entry, withdrawal_of
+from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
+from ipsys_log.live_runs.survey.from_log import open_finished_log
+from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Pair
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
-from ipsys_log.runs.options import Request
-from ipsys_log.survey.checks import check_entry, withdrawal_of
-from ipsys_log.survey.entry import TypedEntry, parse_entry
-from ipsys_log.survey.from_log import open_finished_log
-from ipsys_log.survey.scene import observe_marker
+from ipsys_log.statistics.pairs import active_measurements
 from tests.changed_logs import rewrite
 from tests.conftest import Ipsys, Unmeasured, data_section
 from tests.test_bad_input import refused

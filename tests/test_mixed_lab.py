@@ -12,21 +12,21 @@ from typing import Any
 
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.frames import CameraState, Clock, Frame, Open, Say
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
+from ipsys_log.engine.graph import STAGES, Task, plan_stage
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.pieces import plan_pieces
+from ipsys_log.engine.provenance import imported_inputs
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraPoints, Markers, Message, RigCamera
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS
-from ipsys_log.runs.graph import STAGES, Task, plan_stage
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.pieces import plan_pieces
-from ipsys_log.runs.provenance import imported_inputs
 from tests.conftest import Ipsys
 from tests.live_recordings import RATE_HZ, again, lenses, sent
 from tests.playing import SteppedClock, cameras, playing

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import typer
 
-from ipsys_log.cli.app import app
+from ipsys_log.app.cli.app import app
 from tests.conftest import ROOT
 from tests.shared_files import make_once
 
@@ -112,7 +112,7 @@ _DRIVER = """
 import contextlib, io, sys
 from pathlib import Path
 import ipsys_log
-from ipsys_log.cli import main
+from ipsys_log.app.cli import main
 
 print(ipsys_log.__file__)
 for line in sys.stdin:

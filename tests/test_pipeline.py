@@ -15,8 +15,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.engine.execute import run_stage
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.stream import in_threads, run
 from ipsys_log.errors import LogError
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -28,12 +32,8 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, MODEL, POSITIONS, TRACKS
-from ipsys_log.pipeline import replay
-from ipsys_log.rig.file import load_rig
-from ipsys_log.runs.execute import run_stage
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.stream import in_threads, run
+from ipsys_log.messages.rig_file import load_rig
+from ipsys_log.statistics.pairs import active_measurements
 from tests.conftest import ROOT, Ipsys, data_section
 from tests.wiring import wired
 
@@ -296,9 +296,9 @@ def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) 
 
 
 def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, replayed_lab: Path) -> None:
+    from ipsys_log.engine.output import write_messages
     from ipsys_log.log.writer import LogWriter
     from ipsys_log.messages import Measurement
-    from ipsys_log.runs.output import write_messages
 
     with Session([replayed_lab]) as session:
         withdrawn = next(m for m in session.payloads(["/measurements"]) if "train" in m.splits)
@@ -387,7 +387,7 @@ def test_log_that_is_replaced_between_stages_gets_nothing(
         Path(shutil.copy(paper, tmp_path / "new.mcap")).rename(log)
         return outcome
 
-    monkeypatch.setattr("ipsys_log.runs.replay.run_stage", run_and_replace)
+    monkeypatch.setattr("ipsys_log.engine.replay.run_stage", run_and_replace)
     with pytest.raises(LogError, match=r"another program has replaced the log .* is missing\)"):
         replay([log], Request(models=("rigid",)), "evaluate")
     assert log.read_bytes() == paper.read_bytes()

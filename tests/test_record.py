@@ -16,11 +16,11 @@ from typing import IO
 
 import pytest
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, image_topic
 from ipsys_log.messages.channels import EVENTS
-from ipsys_log.rig.file import load_rig
-from ipsys_log.runs.output import write_log
+from ipsys_log.messages.rig_file import load_rig
 from tests.capture.streams import encode, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
 from tests.ports import free_port
@@ -173,8 +173,8 @@ import os, sys, time
 from contextlib import contextmanager
 from pathlib import Path
 from ipsys_log import pipeline
-from ipsys_log.cli import open_cameras
-from ipsys_log.cli.signals import InterruptError, interruptible, runs_until_stopped
+from ipsys_log.app.cli import open_cameras
+from ipsys_log.app.cli.signals import InterruptError, interruptible, runs_until_stopped
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.journal import Disk
 from ipsys_log.messages import RigCamera
@@ -249,7 +249,7 @@ def test_second_interrupt_ends_a_hanging_command(what: str, ipsys: Ipsys, tmp_pa
 
 ENDING = """
 import signal, time
-from ipsys_log.cli import open_cameras
+from ipsys_log.app.cli import open_cameras
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.frames import Clock
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Markers, Message
-from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session

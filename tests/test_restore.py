@@ -13,7 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log import pipeline
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_message
+from ipsys_log.live_runs import pipeline
+from ipsys_log.live_runs.restore import finish_runs
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import ChunkRef
@@ -21,11 +24,8 @@ from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import FRAME_SKIPPED, Message, Tracks
 from ipsys_log.messages.channels import EVENTS, MARKERS
-from ipsys_log.restore import finish_runs
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_message
-from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
+from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys, fill_disk, small_disk
 from tests.live_recordings import go_live, slow
 from tests.tiers import first_fast

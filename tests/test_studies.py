@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import scipy.io
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Model, Rig, RigMarker
 from ipsys_log.messages.channels import MODEL, POSITIONS
-from ipsys_log.rig.file import rig_toml
-from ipsys_log.runs.output import write_log
+from ipsys_log.messages.rig_file import rig_toml
 from tests import labs
 from tests.conftest import Ipsys
 
@@ -110,9 +110,9 @@ def test_model_with_known_heights_needs_them_in_the_rig(ipsys: Ipsys, tmp_path: 
 
 
 def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
-    from ipsys_log.analysis.camera_models import fit_model
     from ipsys_log.messages import CameraPoint, CameraPoints
-    from ipsys_log.models.locate_step import LocatePoints
+    from ipsys_log.models.locate_points import LocatePoints
+    from ipsys_log.statistics.camera_models import fit_model
 
     rng = np.random.default_rng(0)
     world, camera = labs.places(rng, 40), labs.camera(rng)

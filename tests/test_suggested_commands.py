@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from ipsys_log.cli.app import app
+from ipsys_log.app.cli.app import app
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.reader import LogReader
 from ipsys_log.plain_text import shell_words

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import ipsys_log as ipsys
+from ipsys_log.api.sampled_track import times_in_ns
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Message, Run, Track, Tracks
 from ipsys_log.messages.channels import RECORD, SMOOTHED_TRACKS, TRACKS, Channel
-from ipsys_log.runs.output import write_log
-from ipsys_log.sampled_track import times_in_ns
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 20_000_000

@@ -18,20 +18,20 @@ import pytest
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
-from ipsys_log import pipeline
 from ipsys_log.capture import live_check
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
-from ipsys_log.images.video import is_keyframe
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
+from ipsys_log.live_runs.survey.from_log import open_finished_log
+from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Markers, Message
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.runs.options import Request
 from ipsys_log.sinks.rerun.live import LiveView, Write
 from ipsys_log.sinks.rerun.recording import write_recording
 from ipsys_log.sinks.sink import LiveQueue
-from ipsys_log.survey.from_log import open_finished_log
-from ipsys_log.survey.live import LiveScene
+from ipsys_log.vision.video import is_keyframe
 
 Grey = NDArray[np.uint8]
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import typer
 
-from ipsys_log.cli.app import app
+from ipsys_log.app.cli.app import app
 from tests.conftest import ROOT
 
 # Such a sentence starts without a subject; with a question mark, it is a question.
@@ -162,7 +162,7 @@ def test_pages_are_plain() -> None:
 
 def test_comments_of_the_example_rig_are_plain() -> None:
     """The example is the first file that a new user reads."""
-    comments = re.findall(r"# .*", (_PACKAGE / "rig/lab.toml").read_text(encoding="utf-8"))
+    comments = re.findall(r"# .*", (_PACKAGE / "messages/lab.toml").read_text(encoding="utf-8"))
     assert len(comments) > 40
     assert faults(" ".join(comment.lstrip("# ") for comment in comments), _OPENING, _PAGE_PHRASES) == []
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from ipsys_log.engine.stream import WiredStage, wire
 from ipsys_log.messages.channels import Channel
 from ipsys_log.messages.stage import Plan, Stage, StageView, Step
-from ipsys_log.runs.stream import WiredStage, wire
 
 
 def wired(

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ipsys_log.arrays import Grey
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import BoardSighting, BoardView, view_board
 from ipsys_log.calibration.board_size import check_charuco_size, check_chessboard_size, describe_other_board
 from ipsys_log.calibration.chessboard import fits_in
 from ipsys_log.calibration.image_selection import ExcludedSighting
 from ipsys_log.errors import IpsysError
+from ipsys_log.messages.arrays import Grey
 
 # Up to this number of images, the search is thorough. More images come from a video, which has enough images.
 _THOROUGH = 100

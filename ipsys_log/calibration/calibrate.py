@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipsys_log.arrays import Array
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import BoardSighting
 from ipsys_log.calibration.board_search import NotSeenError, SearchResult, check_sizes, search_images
@@ -33,6 +32,7 @@ from ipsys_log.calibration.two_cameras import (
 )
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.messages.arrays import Array
 
 MIN_IMAGES = 5
 # Fewer images are refused even with --force.

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ipsys_log.arrays import Grey
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.images.decode import check_encoded, read_image_size
-from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
-from ipsys_log.rig.file import check_name
+from ipsys_log.messages.arrays import Grey
+from ipsys_log.messages.rig_file import check_name
+from ipsys_log.vision.decode import check_encoded, read_image_size
+from ipsys_log.vision.video import Video
 
 # Largest number of images to examine in a long recording, evenly spread.
 MAX_EXAMINED_IMAGES = 400

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array
 from ipsys_log.calibration.bundle_adjustment import (
     USUAL_BENDING_M,
     Corners,
@@ -26,6 +25,7 @@ from ipsys_log.calibration.bundle_adjustment import (
 )
 from ipsys_log.calibration.image_selection import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
+from ipsys_log.messages.arrays import Array
 
 # Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms
 # are per square of the distance from the principal point.

@@ -9,7 +9,6 @@ from dataclasses import replace
 from types import TracebackType
 
 from ipsys_log.capture.recorder import Source, Target, write_each
-from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     FRAME_SKIPPED,
@@ -20,6 +19,7 @@ from ipsys_log.messages import (
     Message,
     SkippedVideo,
 )
+from ipsys_log.vision.video import is_keyframe
 
 # Number of frames of a camera that may wait for the search; older frames are skipped.
 _SEARCHED = 3

@@ -12,7 +12,8 @@ from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
 from ipsys_log.capture.frames import Clock, Open, Say
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.geometry.lenses import scale_intrinsics
+from ipsys_log.engine.output import record_message
+from ipsys_log.engine.provenance import NODE_FORMAT
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import (
     ASSUMED_MODEL,
@@ -27,8 +28,7 @@ from ipsys_log.messages import (
     Run,
     calibration_topic,
 )
-from ipsys_log.runs.output import record_message
-from ipsys_log.runs.provenance import NODE_FORMAT
+from ipsys_log.vision.lenses import scale_intrinsics
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,14 +10,14 @@ from types import TracebackType
 import cv2
 import numpy as np
 
-from ipsys_log.analysis.knocks import KnockMonitor
+from ipsys_log.capture.knocks import KnockMonitor
 from ipsys_log.capture.recorder import Source
 from ipsys_log.errors import FrameError
-from ipsys_log.images.decode import decode_grey
-from ipsys_log.images.video import decode_keyframe, is_keyframe
 from ipsys_log.messages import CAMERA_MOVED, CompressedImage, CompressedVideo, Message, Rig
 from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
+from ipsys_log.vision.decode import decode_grey
+from ipsys_log.vision.video import decode_keyframe, is_keyframe
 
 _EVERY_S = 1.0
 # Mean grey level of a dark image, and standard deviation of the grey levels behind a lens cap.

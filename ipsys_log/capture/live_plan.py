@@ -9,6 +9,11 @@ from typing import Any, NamedTuple
 from ipsys_log.capture.camera_thread import imported_run
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
+from ipsys_log.engine.execute import LiveRun, copy_messages
+from ipsys_log.engine.graph import Task, copy_model, is_of_model, stages_until
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.select import wanted_models
+from ipsys_log.engine.stream import WiredStage, wire
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.messages.channels import (
@@ -22,11 +27,6 @@ from ipsys_log.messages.channels import (
 )
 from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import model_run, needs_height
-from ipsys_log.runs.execute import LiveRun, copy_messages
-from ipsys_log.runs.graph import Task, copy_model, is_of_model, stages_until
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.select import wanted_models
-from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
 
 

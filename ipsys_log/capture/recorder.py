@@ -19,6 +19,7 @@ from ipsys_log.capture.disk import (
     reserve,
 )
 from ipsys_log.capture.frames import Clock, Say
+from ipsys_log.engine.output import serialize, write_message
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked
@@ -32,7 +33,6 @@ from ipsys_log.messages import (
     Message,
 )
 from ipsys_log.plain_text import shell_words
-from ipsys_log.runs.output import serialize, write_message
 
 # After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0

@@ -14,15 +14,15 @@ from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings
+from ipsys_log.capture.simulation.board import board_cells
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.floor import Check
+from ipsys_log.capture.simulation.live_lab import LIVE_SETTINGS, Film, board_film, lab_film, next_missing
+from ipsys_log.capture.simulation.pixel_shares import exposure_interval
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
-from ipsys_log.simulation.board import board_cells
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.floor import Check
-from ipsys_log.simulation.live_lab import LIVE_SETTINGS, Film, board_film, lab_film, next_missing
-from ipsys_log.simulation.pixel_shares import exposure_interval
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000

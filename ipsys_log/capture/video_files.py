@@ -16,7 +16,6 @@ import simplejpeg
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
 from ipsys_log.extras import check_installed
-from ipsys_log.images.decode import MAX_PIXELS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
@@ -29,7 +28,8 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.decode import MAX_PIXELS
 
 if TYPE_CHECKING:
     from av.container import InputContainer

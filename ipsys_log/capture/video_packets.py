@@ -11,7 +11,7 @@ import simplejpeg
 
 from ipsys_log.capture.frames import Frame, SourceError
 from ipsys_log.extras import check_installed
-from ipsys_log.images.decode import MAX_PIXELS
+from ipsys_log.vision.decode import MAX_PIXELS
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -11,11 +11,11 @@ import numpy as np
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_formats import read_calibration
-from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import ASSUMED_MODEL, EVENTS_TOPIC, CameraCalibration, Event, Message
+from ipsys_log.vision.lenses import check_calibration
 
 
 def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:

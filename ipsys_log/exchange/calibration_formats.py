@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_texts import ParsedText, line_of, parse_text, read_text
-from ipsys_log.geometry.lenses import DISTORTION_MODELS, check_calibration
 from ipsys_log.log.contents import parse_foreign_camera
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.lenses import DISTORTION_MODELS, check_calibration
 
 _WIDEST_PX = 65_535
 _MOST_NUMBERS = 100

@@ -20,14 +20,14 @@ from typing import IO, Any, NamedTuple
 import cv2
 import numpy as np
 
+from ipsys_log.engine.options import Progress
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.images.decode import decode_grey
-from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Marker, Markers, Message, RawImage
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.runs.options import Progress
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.decode import decode_grey
+from ipsys_log.vision.video import Video
 
 ANNOTATIONS = "annotations.json"
 _STEP = "pictures"

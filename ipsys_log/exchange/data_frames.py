@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.codec import schema_name
@@ -42,6 +41,7 @@ from ipsys_log.messages.channels import (
     TRUTH,
     Channel,
 )
+from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ipsys_log.engine.output import append_run, open_target
+from ipsys_log.engine.provenance import check_run_name, fingerprint, free_name
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import announce_assumed
 from ipsys_log.exchange.csv_rows import NamedRow, read_rows
@@ -30,10 +32,8 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.messages.channels import MARKERS, RIG, RUN_EVENTS
+from ipsys_log.messages.rig_file import check_name
 from ipsys_log.plain_text import shell_words
-from ipsys_log.rig.file import check_name
-from ipsys_log.runs.output import append_run, open_target
-from ipsys_log.runs.provenance import check_run_name, fingerprint, free_name
 from ipsys_log.stages.detect.reports import LensInUse, Reports
 
 _RUN = "imported"

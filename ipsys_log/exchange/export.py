@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.data_frames import read_table_parts
 from ipsys_log.extras import check_installed
+from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,11 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ipsys_log.analysis.ground_truth import gather_tracks
-from ipsys_log.analysis.pairs import TimedPoints
-from ipsys_log.analysis.path_pairs import PathPair
-from ipsys_log.analysis.truth_alignment import Residuals, TruthAlignment, align_truth, residuals_of
-from ipsys_log.analysis.truth_fit import ALIGNMENTS, RigidMotion
+from ipsys_log.engine.output import append_run, open_target
+from ipsys_log.engine.provenance import fingerprint, free_name, newest_run, read_channels
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.ground_truth_files import (
     LENGTH_UNITS,
@@ -23,13 +20,16 @@ from ipsys_log.exchange.ground_truth_files import (
     TruthUnits,
     read_truth_files,
 )
+from ipsys_log.exchange.truth_alignment import Residuals, TruthAlignment, align_truth, residuals_of
+from ipsys_log.exchange.truth_fit import ALIGNMENTS, RigidMotion
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, TRUTH_TOPIC, Message, Rig, Run, Track, Tracks
 from ipsys_log.messages.channels import RIG, TRACKS, TRUTH
-from ipsys_log.rig.file import check_robots
-from ipsys_log.runs.output import append_run, open_target
-from ipsys_log.runs.provenance import fingerprint, free_name, newest_run, read_channels
-from ipsys_log.units import NS_PER_S, format_time
+from ipsys_log.messages.rig_file import check_robots
+from ipsys_log.messages.units import NS_PER_S, format_time
+from ipsys_log.statistics.ground_truth import gather_tracks
+from ipsys_log.statistics.pairs import TimedPoints
+from ipsys_log.statistics.path_pairs import PathPair
 
 _RUN = "truth"
 _MARKER_PREFIX = "marker_"

@@ -9,12 +9,12 @@ from types import MappingProxyType
 from ipsys_log.capture.devices import check_sources
 from ipsys_log.capture.lab import Lab
 from ipsys_log.capture.simulated import intrinsics_of
+from ipsys_log.capture.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
-from ipsys_log.rig.file import load_rig, rig_toml
-from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
+from ipsys_log.messages.rig_file import load_rig, rig_toml
 from ipsys_log.stages.detect.stock import marker_detector
 
 # The beginning of the rig file of the simulated lab.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from ipsys_log.engine.provenance import fingerprint
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.csv_rows import NamedRow, read_rows
 from ipsys_log.messages import (
@@ -23,9 +24,8 @@ from ipsys_log.messages import (
     WorldPoint,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, RECORD
-from ipsys_log.rig.file import check_name
-from ipsys_log.runs.provenance import fingerprint
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.rig_file import check_name
+from ipsys_log.messages.units import NS_PER_S
 
 _RUN = "imported"
 _CAMERA_AXES = ("xc_m", "yc_m", "zc_m")

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.atomic_files import replacement_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
+from ipsys_log.log.atomic_files import replacement_of
 
 # The type of each column by its name: a plain type, or the columns of the items of a list.
 Columns = Mapping[str, "str | Columns"]

@@ -16,10 +16,9 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from ipsys_log.engine.options import Progress
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.exchange.bag_bounds import bound_reader, check_files, unpack_message
-from ipsys_log.geometry.lenses import check_calibration, same_intrinsics
-from ipsys_log.images.decode import RAW_ENCODINGS
 from ipsys_log.log.contents import parse_foreign_camera
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, convert_ros, read_ros2
 from ipsys_log.messages import (
@@ -32,7 +31,8 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.runs.options import Progress
+from ipsys_log.vision.decode import RAW_ENCODINGS
+from ipsys_log.vision.lenses import check_calibration, same_intrinsics
 
 _STEP = "bag"
 _Reader = Reader1 | Reader2

@@ -102,7 +102,7 @@ class RigNodes:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The lab, as in ``lab.toml`` and in the channel ``/rig`` (see :mod:`ipsys_log.rig.file`)."""
+    """The lab, as in ``lab.toml`` and in the channel ``/rig`` (see :mod:`ipsys_log.messages.rig_file`)."""
 
     name: str
     dictionary: str

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
+from ipsys_log.messages.arrays import Array
 
 
 def column_sigmas(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array
+from ipsys_log.messages.arrays import Array
 from ipsys_log.models.rays import CameraRays, directions
 
 # Prior standard deviation of the terms of the depth correction.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ipsys_log.arrays import Array
+from ipsys_log.messages.arrays import Array
 
 
 def regressors(points: Array) -> Array:

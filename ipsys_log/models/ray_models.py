@@ -9,11 +9,11 @@ import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.lenses import intersect_height
+from ipsys_log.messages.arrays import Array
 from ipsys_log.models.depths import LEAST_NOISE, depth_terms, fit_depths
 from ipsys_log.models.rays import CalibrationPoints, CameraRays, directions, fit_rays
+from ipsys_log.vision.lenses import intersect_height
 
 
 class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]

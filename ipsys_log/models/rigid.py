@@ -8,8 +8,8 @@ import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError
+from ipsys_log.messages.arrays import Array
 
 
 def rigid_transform(points: Array, targets: Array) -> tuple[Array, Array]:

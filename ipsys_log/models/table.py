@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraModel
+from ipsys_log.messages.arrays import Array
 from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
@@ -101,7 +101,7 @@ MODELS = (
     "best",
 )
 
-# Models of the corners of markers. The fit estimates all cameras together, see ipsys_log.joint.
+# Models of the corners of markers. The fit estimates all cameras together, see ipsys_log.calibration.joint.
 CORNER_MODELS = ("joint",)
 
 

@@ -13,14 +13,12 @@ from typing import BinaryIO, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 
-from ipsys_log.analysis.floor_cameras import read_floor_cameras
-from ipsys_log.atomic_files import replacement_of
+from ipsys_log.engine.options import Progress
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.posed_camera import PosedCamera
+from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Message, Tracks
 from ipsys_log.messages.channels import MODEL, TRACKS
-from ipsys_log.runs.options import Progress
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.poses import PoseSource
@@ -32,6 +30,8 @@ from ipsys_log.sinks.streams.ros2_messages import (
     text_of,
     type_hash,
 )
+from ipsys_log.statistics.floor_cameras import read_floor_cameras
+from ipsys_log.vision.posed_camera import PosedCamera
 
 _STEP = "bag"
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"

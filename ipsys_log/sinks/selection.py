@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ipsys_log.engine.provenance import newest_run
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
@@ -34,9 +35,8 @@ from ipsys_log.messages.channels import (
     TRACKS,
     TRUTH,
 )
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import shell_words
-from ipsys_log.runs.provenance import newest_run
-from ipsys_log.units import NS_PER_S
 
 _FADE_STEPS = 3
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from types import NoneType, TracebackType
 from typing import Protocol, runtime_checkable
 
-from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
+from ipsys_log.vision.video import is_keyframe
 
 # Limits of a sink's queue: above the first limit images are dropped, above the second all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200

@@ -1,7 +1,7 @@
 """Stages of the pipeline, in one table: each reads and writes channels. A stage uses no files and no clocks.
 
 The table has the part of each row that the command line needs: name, help and parameters. This module loads
-no stage, so that the help of a command appears at once; :mod:`ipsys_log.runs.graph` loads the rows.
+no stage, so that the help of a command appears at once; :mod:`ipsys_log.engine.graph` loads the rows.
 """
 
 from __future__ import annotations

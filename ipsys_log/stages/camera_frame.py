@@ -8,20 +8,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ipsys_log.analysis.marker_sizes import SizeTest
-from ipsys_log.analysis.marker_tilts import MarkerTilts, SeenMarkers
-from ipsys_log.arrays import Array
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
-from ipsys_log.geometry.markers import (
-    camera_point,
-    camera_point_slopes,
-    check_covariance,
-    heading,
-    pixel_slopes,
-    whiten,
-)
-from ipsys_log.geometry.square_pose import calibration_covariances, fit_squares, is_convex, reprojection_px
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -33,9 +20,22 @@ from ipsys_log.messages import (
     Message,
     Rig,
 )
+from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView
+from ipsys_log.statistics.marker_sizes import SizeTest
+from ipsys_log.statistics.marker_tilts import MarkerTilts, SeenMarkers
+from ipsys_log.vision.lenses import check_calibration, check_size, undistort
+from ipsys_log.vision.markers import (
+    camera_point,
+    camera_point_slopes,
+    check_covariance,
+    heading,
+    pixel_slopes,
+    whiten,
+)
+from ipsys_log.vision.square_pose import calibration_covariances, fit_squares, is_convex, reprojection_px
 
 PERIMETER = "perimeter"
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ipsys_log.analysis.calibration_points import find_pairs, held_out_ids, measured, split_parameters
-from ipsys_log.analysis.cross_validation import FOLDS, Study, labelled_subsets
-from ipsys_log.analysis.ground_truth import gather_tracks, true_points
-from ipsys_log.analysis.model_kinds import JOINT_READS, model_kind
-from ipsys_log.analysis.point_evaluation import can_evaluate, can_refit
 from ipsys_log.messages import Evaluation, Model
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_read
+from ipsys_log.statistics.calibration_points import find_pairs, held_out_ids, measured, split_parameters
+from ipsys_log.statistics.cross_validation import FOLDS, Study, labelled_subsets
+from ipsys_log.statistics.ground_truth import gather_tracks, true_points
+from ipsys_log.statistics.model_kinds import JOINT_READS, model_kind
+from ipsys_log.statistics.point_evaluation import can_evaluate, can_refit
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ipsys_log.analysis.calibration_points import has_measurements, measured, split_ids, split_parameters
-from ipsys_log.analysis.model_kinds import JOINT_READS, model_kind
 from ipsys_log.messages import Model
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView
 from ipsys_log.models.table import MODEL_PARTS, model_run
+from ipsys_log.statistics.calibration_points import has_measurements, measured, split_ids, split_parameters
+from ipsys_log.statistics.model_kinds import JOINT_READS, model_kind
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:

@@ -23,8 +23,8 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import POSES, POSITIONS, TRACKS
 from ipsys_log.messages.stage import Plan, Stage, StageView
-from ipsys_log.tracking.frame_reader import FrameReader
-from ipsys_log.tracking.track_messages import (
+from ipsys_log.models.tracking.frame_reader import FrameReader
+from ipsys_log.models.tracking.track_messages import (
     TRACK_READS,
     LateFrames,
     make_track,
@@ -32,7 +32,7 @@ from ipsys_log.tracking.track_messages import (
     track_reads,
     tracked_part,
 )
-from ipsys_log.tracking.tracks import Pose, RobotTracks, TrackSettings
+from ipsys_log.models.tracking.tracks import Pose, RobotTracks, TrackSettings
 
 
 class Fuse:

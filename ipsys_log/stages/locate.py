@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ipsys_log.analysis.model_kinds import model_kind
 from ipsys_log.messages import Model
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, POSITIONS, RIG, RUN_EVENTS
 from ipsys_log.messages.stage import Plan, Stage, StageView, model_read
+from ipsys_log.statistics.model_kinds import model_kind
 
 
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:

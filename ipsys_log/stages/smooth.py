@@ -9,8 +9,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Tracks
 from ipsys_log.messages.channels import EVENTS, POSITIONS, RIG, SMOOTHED_TRACKS
 from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, Timed
-from ipsys_log.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
-from ipsys_log.tracking.track_messages import (
+from ipsys_log.models.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
+from ipsys_log.models.tracking.track_messages import (
     TRACK_READS,
     LateFrames,
     make_track,

@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ipsys_log.analysis.intrinsics_test import find_contradicted_inputs
-from ipsys_log.geometry.lenses import in_image, project
-from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig, RigMarker
+from ipsys_log.statistics.intrinsics_test import find_contradicted_inputs
+from ipsys_log.vision.lenses import in_image, project
+from ipsys_log.vision.markers import marker_corners
 
 FISHEYE = CameraCalibration(
     0,

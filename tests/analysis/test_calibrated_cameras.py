@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.calibrated_cameras import CalibratedCamera, describe_cameras
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.poses import invert_pose
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.model import build_models
-from ipsys_log.joint.observations import Observations
-from ipsys_log.joint.payload import joint_payload
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.model import build_models
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.payload import joint_payload
+from ipsys_log.statistics.calibrated_cameras import CalibratedCamera, describe_cameras
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.poses import invert_pose
 from tests.joint.small_lab import Truth, make_lab
 
 NOISE_PX = 0.02

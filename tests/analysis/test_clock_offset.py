@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.clock_offset import MarkerPath, estimate_clock_offset
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Markers
+from ipsys_log.tools.clock_offset import MarkerPath, estimate_clock_offset
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi, norm
 
-from ipsys_log.analysis import consistency
-from ipsys_log.analysis.consistency import score, usual_covariances
 from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.statistics import consistency
+from ipsys_log.statistics.consistency import score, usual_covariances
 
 Array = NDArray[np.float64]
 

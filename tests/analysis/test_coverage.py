@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.coverage import cover_floor
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.posed_camera import PosedCamera
-from ipsys_log.geometry.poses import look_down, pose_facing_up, transform
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras, sees
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, Floor
-from ipsys_log.simulation.cameras import Camera, mount_cameras, sees
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.statistics.coverage import cover_floor
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import look_down, pose_facing_up, transform
 
 Array = NDArray[np.float64]
 

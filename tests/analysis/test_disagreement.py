@@ -9,14 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.disagreement import (
-    CameraPositions,
-    compare_cameras,
-    divide_floor,
-    divide_time,
-    read_disagreement,
-)
-from ipsys_log.analysis.overlap_stream import OverlapStream, OverlapSummary
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     IMPORTED,
@@ -28,8 +21,15 @@ from ipsys_log.messages import (
     Rig,
     Run,
 )
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.statistics.disagreement import (
+    CameraPositions,
+    compare_cameras,
+    divide_floor,
+    divide_time,
+    read_disagreement,
+)
+from ipsys_log.statistics.overlap_stream import OverlapStream, OverlapSummary
 from tests.conftest import Ipsys
 
 STEP_NS = NS_PER_S // 30

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.drift import DriftBaseline, MeanCorners, Motion, build_baseline, estimate_motion
-from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
-from ipsys_log.geometry.lenses import intersect_height, project, undistort
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.posed_camera import PosedCamera
-from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Floor
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.statistics.drift import DriftBaseline, MeanCorners, Motion, build_baseline, estimate_motion
+from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
+from ipsys_log.vision.lenses import intersect_height, project, undistort
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation, transform
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.capture.simulation.cameras import sees
+from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, CameraPoints, Marker, Markers, Message, Positions, Rig
-from ipsys_log.models.locate_step import LocatePoints
-from ipsys_log.simulation.cameras import sees
-from ipsys_log.simulation.settings import FLOOR_M, LabSettings
+from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
 from tests.geometric.floor_error import (
     KnownSightings,
     Locator,

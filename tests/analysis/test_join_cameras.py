@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.alignment import align_camera, join_cameras
-from ipsys_log.analysis.stationary import StationaryMarker
-from ipsys_log.geometry.posed_camera import PosedCamera
-from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, rotation, transform
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.statistics.alignment import align_camera, join_cameras
+from ipsys_log.statistics.stationary import StationaryMarker
+from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import invert_pose, look_down, make_pose, rotation, transform
 
 Array = NDArray[np.float64]
 

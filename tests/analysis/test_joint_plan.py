@@ -10,19 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ipsys_log.analysis.expected_error import (
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners
+from ipsys_log.calibration.joint.model import JointModel, build_models
+from ipsys_log.errors import IpsysError
+from ipsys_log.statistics.expected_error import (
     ExpectedErrors,
     VisibleMarkers,
     expect_errors,
     see_markers,
 )
-from ipsys_log.analysis.floor_grid import FloorGrid
-from ipsys_log.analysis.joint_plan import choose_drive, plan_joint_points
-from ipsys_log.analysis.taped_points import choose_points, mean_error, posterior_root, some_modes
-from ipsys_log.errors import IpsysError
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.locate import edge_motion, linearise_corners
-from ipsys_log.joint.model import JointModel, build_models
+from ipsys_log.statistics.floor_grid import FloorGrid
+from ipsys_log.statistics.joint_plan import choose_drive, plan_joint_points
+from ipsys_log.statistics.taped_points import choose_points, mean_error, posterior_root, some_modes
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 
 GRID = FloorGrid.over(np.zeros(2), np.array([4.8, 4.8]), 0.2)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.outliers import LeaveOneOut, find_outliers
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
-from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, Suspect, WorldPoint
 from ipsys_log.models.table import create
+from ipsys_log.statistics.outliers import LeaveOneOut, find_outliers
+from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.statistics.tape import RiggedMeasurement, world_point
 
 Array = NDArray[np.float64]
 

@@ -8,15 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.pairs import (
-    active_measurements,
-    build_pairs,
-    gather_sightings,
-    split,
-    still_interval,
-    valid_measurements,
-)
-from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import (
@@ -31,6 +22,15 @@ from ipsys_log.messages import (
     RigMarker,
     WorldPoint,
 )
+from ipsys_log.statistics.pairs import (
+    active_measurements,
+    build_pairs,
+    gather_sightings,
+    split,
+    still_interval,
+    valid_measurements,
+)
+from ipsys_log.statistics.tape import RiggedMeasurement
 
 S, MS = 1_000_000_000, 1_000_000
 RIG = Rig(

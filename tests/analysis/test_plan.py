@@ -10,17 +10,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ellipe
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.analysis.plan import FittedCamera, MeasurementPlan, mean_length, plan_points
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.poses import invert_pose, look_down, pose_facing_up, transform
-from ipsys_log.geometry.trilateration import tape_covariance
+from ipsys_log.live_runs.survey.floor_plan import view_of_model
 from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.survey.floor_plan import view_of_model
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.statistics.plan import FittedCamera, MeasurementPlan, mean_length, plan_points
+from ipsys_log.vision.lenses import undistort
+from ipsys_log.vision.poses import invert_pose, look_down, pose_facing_up, transform
+from ipsys_log.vision.trilateration import tape_covariance
 
 Array = NDArray[np.float64]
 

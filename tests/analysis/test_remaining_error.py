@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.remaining_error import with_remaining_error
+from ipsys_log.statistics.accuracy import error_statistics
+from ipsys_log.statistics.remaining_error import with_remaining_error
 
 
 def covered_share(points: int, cameras: int, model_m: float, tape_m: float) -> float:

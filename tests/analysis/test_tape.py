@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points, reference_points, world_point
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, WorldPoint
+from ipsys_log.statistics.tape import RiggedMeasurement, find_weak_points, reference_points, world_point
+from ipsys_log.vision.trilateration import trilaterate
 
 POINTS = (
     ReferencePoint("A", 1.2192, 2.4384),

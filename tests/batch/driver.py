@@ -12,10 +12,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.batch import execution
-from ipsys_log.batch.execution import run_batch
-from ipsys_log.batch.tasks import BatchTask
-from ipsys_log.batch.workers import WorkerSettings, open_workers
+from ipsys_log.api.batch import execution
+from ipsys_log.api.batch.execution import run_batch
+from ipsys_log.api.batch.tasks import BatchTask
+from ipsys_log.api.batch.workers import WorkerSettings, open_workers
 from ipsys_log.errors import IpsysError
 from tests.batch.piece_works import compute_and_note, replay_pieces
 from tests.batch.works import PATIENCE_S, replay_and_note

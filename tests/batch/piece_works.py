@@ -13,11 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.batch.log_work import replay_log
-from ipsys_log.batch.tasks import LogResult, compute_alone
+from ipsys_log.api.batch.log_work import replay_log
+from ipsys_log.api.batch.tasks import LogResult, compute_alone
+from ipsys_log.engine import pieces
+from ipsys_log.engine.pieces import Piece, PieceResult, PieceRun
 from ipsys_log.log.location import LogLocation
-from ipsys_log.runs import pieces
-from ipsys_log.runs.pieces import Piece, PieceResult, PieceRun
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, is_first
 
 NOTES = "IPSYS_TEST_NOTES"

@@ -14,15 +14,15 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from ipsys_log.batch.log_work import plan_exports
-from ipsys_log.batch.tasks import BatchTask, LogResult, perform
-from ipsys_log.batch.workers import WorkerSettings, most_tasks, open_workers
-from ipsys_log.cli import batch as batch_command
-from ipsys_log.cli.signals import Interrupted
+from ipsys_log.api.batch.log_work import plan_exports
+from ipsys_log.api.batch.tasks import BatchTask, LogResult, perform
+from ipsys_log.api.batch.workers import WorkerSettings, most_tasks, open_workers
+from ipsys_log.app.cli import batch as batch_command
+from ipsys_log.app.cli.signals import Interrupted
+from ipsys_log.app.report.batch import write_results
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.log_files import expand_folders
-from ipsys_log.report.batch import write_results
 from tests.conftest import ROOT, Ipsys
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
@@ -86,7 +86,7 @@ def test_workers_of_a_scheduler_get_absolute_paths(
         given.append((task, paths))
         return [LogResult(str(path), "computed") for path in paths]
 
-    monkeypatch.setattr("ipsys_log.cli.batch._collect", collect)
+    monkeypatch.setattr("ipsys_log.app.cli.batch._collect", collect)
     for model in ("model.mcap", "http://127.0.0.1:1/model.mcap"):
         logs = ("a.mcap", "http://127.0.0.1:1/b.mcap")
         done = ipsys("batch", "replay", *logs, "--model-from", model, "--scheduler", "tls://127.0.0.1:1")
@@ -251,7 +251,7 @@ def test_interrupt_says_what_workers_of_a_scheduler_do(
     def interrupt(*_: object) -> None:
         raise Interrupted(130, "interrupted")
 
-    monkeypatch.setattr("ipsys_log.batch.workers.open_workers", open_none)
+    monkeypatch.setattr("ipsys_log.api.batch.workers.open_workers", open_none)
     monkeypatch.setattr(batch_command, "say", interrupt)
     log = Path(shutil.copy(ROOT / "sample_logs/paper_lab.mcap", tmp_path))
     with pytest.raises(Interrupted) as interrupted:

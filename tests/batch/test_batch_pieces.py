@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from ipsys_log import api
-from ipsys_log.batch.execution import MOST_ENDED_WORKERS
+from ipsys_log.api import python_api as api
+from ipsys_log.api.batch.execution import MOST_ENDED_WORKERS
 from tests.batch.piece_works import NOTES, PARAMETERS, UNTIL
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, one_worker_killed
 from tests.conftest import ROOT

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.batch.execution import MOST_ENDED_WORKERS, DaskPieces, run_batch
-from ipsys_log.batch.tasks import (
+from ipsys_log.api.batch.execution import MOST_ENDED_WORKERS, DaskPieces, run_batch
+from ipsys_log.api.batch.tasks import (
     BatchTask,
     LogResult,
     OtherSoftwareError,
@@ -24,9 +24,9 @@ from ipsys_log.batch.tasks import (
     compute_alone,
     perform,
 )
-from ipsys_log.batch.workers import Workers
+from ipsys_log.api.batch.workers import Workers
+from ipsys_log.engine.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 from ipsys_log.errors import IpsysError, WriteError
-from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'ipsys_log[batch]'")
 
@@ -113,7 +113,7 @@ def run(
 ) -> dict[str, Any]:
     workers = Workers(scheduler, "tls://here", "", window)
     with monkeypatch.context() as patch:
-        patch.setattr("ipsys_log.batch.execution.SimpleQueue", _queue_of(scheduler))
+        patch.setattr("ipsys_log.api.batch.execution.SimpleQueue", _queue_of(scheduler))
         results = list(run_batch(workers, BatchTask(lambda path: LogResult("", "")), paths))
     assert sorted(result.log for result in results) == sorted(map(str, paths))
     return {Path(result.log).name: result for result in results}
@@ -175,7 +175,7 @@ def compute(scheduler: Scheduler, count: int, window: int, shown: list[tuple[int
     plan = PiecePlan(_RUN, PieceFrames(("red",), none, none), [Piece("red", n, n + 1) for n in range(count)])
     workers = Workers(scheduler, "tls://here", "", window)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ipsys_log.batch.execution.SimpleQueue", _queue_of(scheduler))
+        patch.setattr("ipsys_log.api.batch.execution.SimpleQueue", _queue_of(scheduler))
         results: Any = DaskPieces(workers, lambda done, total: shown.append((done, total))).compute(plan)
         return [piece.start_ns for piece in results]
 

@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 
-from ipsys_log import api
-from ipsys_log.batch.log_work import check_log, export_log, replay_log, verify_log
-from ipsys_log.batch.tasks import BatchTask, LogResult, compute_alone, perform
+from ipsys_log.api import python_api as api
+from ipsys_log.api.batch.log_work import check_log, export_log, replay_log, verify_log
+from ipsys_log.api.batch.tasks import BatchTask, LogResult, compute_alone, perform
+from ipsys_log.engine import pieces
+from ipsys_log.engine.pieces import PiecePlan, PieceResult
+from ipsys_log.engine.provenance import fingerprint
 from ipsys_log.exchange.parquet_rows import read_rows
 from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.runs import pieces
-from ipsys_log.runs.pieces import PiecePlan, PieceResult
-from ipsys_log.runs.provenance import fingerprint
 from tests.batch.piece_works import PARAMETERS, UNTIL
 from tests.batch.works import batch
 from tests.changed_logs import rewrite

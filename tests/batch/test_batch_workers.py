@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ipsys_log import api
-from ipsys_log.batch.execution import MOST_ENDED_WORKERS
-from ipsys_log.batch.log_work import replay_log
+from ipsys_log.api import python_api as api
+from ipsys_log.api.batch.execution import MOST_ENDED_WORKERS
+from ipsys_log.api.batch.log_work import replay_log
 from ipsys_log.exchange.parquet_rows import read_rows
-from ipsys_log.soundness.finding import BROKEN
+from ipsys_log.tools.soundness.finding import BROKEN
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, read_json, wait_for
 from tests.conftest import ROOT, small_disk
 

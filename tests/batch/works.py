@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.batch.log_work import replay_log
-from ipsys_log.batch.tasks import LogResult
+from ipsys_log.api.batch.log_work import replay_log
+from ipsys_log.api.batch.tasks import LogResult
 from tests.waiting import wait_until
 
 # A generous limit: a wait ends with an event.

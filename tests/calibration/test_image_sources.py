@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.images import find_sources
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RIG_TOPIC, Message, RawImage, Rig
-from ipsys_log.runs.output import write_log
 
 S = 1_000_000_000
 # Rows of different grey levels: a wrong step or order of channels gives another picture.

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.app.cli.open_cameras import open_cameras, prepare_lab
+from ipsys_log.app.report.cameras import LiveStatus
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
-from ipsys_log.cli.open_cameras import open_cameras, prepare_lab
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Rig, RigCamera
-from ipsys_log.report.cameras import LiveStatus
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests.conftest import Ipsys, small_disk
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2)

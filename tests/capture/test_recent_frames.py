@@ -11,15 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log import pipeline
-from ipsys_log.analysis.calibration_points import find_pairs
-from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import check_independent_frames
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recent_frames import RecentFrames
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs import pipeline
+from ipsys_log.live_runs.survey.checks import check_entry, withdrawal_of
+from ipsys_log.live_runs.survey.entry import parse_entry
+from ipsys_log.live_runs.survey.live import LiveScene
+from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
@@ -39,14 +44,9 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.view import LogView
-from ipsys_log.survey.checks import check_entry, withdrawal_of
-from ipsys_log.survey.entry import parse_entry
-from ipsys_log.survey.live import LiveScene
-from ipsys_log.survey.scene import observe_marker
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.statistics.calibration_points import find_pairs
+from ipsys_log.statistics.calibration_points import measured as measured_places
 from tests import labs
 from tests.capture.test_recorder import Noted
 from tests.conftest import Ipsys

@@ -17,17 +17,17 @@ from ipsys_log.calibration.lens_models import find_lens_model
 from ipsys_log.capture import simulated
 from ipsys_log.capture.frames import Clock, Frame
 from ipsys_log.capture.simulated import open_simulated, parse_source
+from ipsys_log.capture.simulation.board import POSES
+from ipsys_log.capture.simulation.calibration_points import place_marker
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.floor import prepare_view
+from ipsys_log.capture.simulation.live_lab import board_film, image_index, lab_film, plan_live_lab
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import project_corners
-from ipsys_log.images.decode import decode_grey
 from ipsys_log.messages import CompressedImage, RigCamera
-from ipsys_log.simulation.board import POSES
-from ipsys_log.simulation.calibration_points import place_marker
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.floor import prepare_view
-from ipsys_log.simulation.live_lab import board_film, image_index, lab_film, plan_live_lab
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.stock import detect_markers
-from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.decode import decode_grey
+from ipsys_log.vision.marker_cells import project_corners
 from tests.playing import WAIT_LIMIT_S
 
 SMALL = {"width": 960, "height": 540, "rate_hz": 20.0}

@@ -14,17 +14,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ipsys_log import api
-from ipsys_log.catalogue.table import update_catalogue
+from ipsys_log.api import python_api as api
+from ipsys_log.api.catalogue.table import update_catalogue
+from ipsys_log.engine import output
+from ipsys_log.engine.graph import VERSIONS
+from ipsys_log.engine.output import append_messages
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.parquet_rows import Columns, read_rows, write_rows
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Event, Message
 from ipsys_log.messages.channels import EVALUATION, EVENTS_TOPIC
-from ipsys_log.runs import output
-from ipsys_log.runs.graph import VERSIONS
-from ipsys_log.runs.output import append_messages
 from tests.conftest import ROOT, Ipsys
 
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
@@ -284,7 +284,7 @@ def test_rows_of_parquet_come_back(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_outdated_runs_are_replayed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ipsys_log.batch.log_work import replay_log
+    from ipsys_log.api.batch.log_work import replay_log
 
     log = Path(shutil.copy(PAPER_LAB, tmp_path / "log.mcap"))
     options: dict[str, Any] = {"outdated": True, "models": ("rigid",)}

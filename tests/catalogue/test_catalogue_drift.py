@@ -8,11 +8,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from ipsys_log import api
-from ipsys_log.catalogue.row import Baseline
-from ipsys_log.catalogue.table import update_catalogue
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.api import python_api as api
+from ipsys_log.api.catalogue.row import Baseline
+from ipsys_log.api.catalogue.table import update_catalogue
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.geometric.weeks import Knock, WeekSettings, simulate_week

@@ -14,8 +14,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.marker_cells import PlacedMarker
-from ipsys_log.geometry.poses import look_down, pose_facing_up
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.floor import prepare_view
+from ipsys_log.capture.simulation.lab import EPOCH_NS
+from ipsys_log.capture.simulation.render import encode_jpeg, render
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import (
     RIG_TOPIC,
     CompressedImage,
@@ -27,12 +31,8 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.floor import prepare_view
-from ipsys_log.simulation.lab import EPOCH_NS
-from ipsys_log.simulation.render import encode_jpeg, render
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.vision.marker_cells import PlacedMarker
+from ipsys_log.vision.poses import look_down, pose_facing_up
 from tests.changed_logs import rewrite
 from tests.conftest import Ipsys, data_section
 from tests.ladder import follow

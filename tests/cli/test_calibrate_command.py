@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.images import find_sources
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
-from ipsys_log.runs.output import write_log
 from tests.calibration.boards_seen import (
     chessboard_pattern,
     fisheye_rays,

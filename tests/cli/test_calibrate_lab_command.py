@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint.hypotheses import fit_hypotheses
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.payload import restore_joint
+from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.calibration_files import read_intrinsics
-from ipsys_log.joint.hypotheses import fit_hypotheses
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.payload import restore_joint
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Distance, Markers, Measurement, Message, Rig
 from ipsys_log.messages.channels import MODEL
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import FLOOR_M, LabSettings
 from tests.conftest import Ipsys
 from tests.geometric.floor_error import KnownSightings, compute_errors, grid_nodes, summarize
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
@@ -45,7 +45,7 @@ def session_log(lab: GeometricLab, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def fitted_log(session_log: Path) -> Path:
-    from ipsys_log import api
+    from ipsys_log.api import python_api as api
 
     path = Path(shutil.copy(session_log, session_log.with_name("fitted.mcap")))
     api.replay(path, models=["joint"], until="fit")
@@ -230,8 +230,8 @@ def test_the_fit_of_calibrate_lab_runs_once(
         fits.append(1)
         return fit_hypotheses(*arguments, **options)
 
-    monkeypatch.setattr("ipsys_log.analysis.joint_calibration.fit_hypotheses", count)
-    monkeypatch.setattr("ipsys_log.analysis.joint_calibration._LAST_FIT", [])
+    monkeypatch.setattr("ipsys_log.statistics.joint_calibration.fit_hypotheses", count)
+    monkeypatch.setattr("ipsys_log.statistics.joint_calibration._LAST_FIT", [])
     log = Path(shutil.copy(session_log, tmp_path / "lab.mcap"))
     assert ipsys("calibrate-lab", log, "--goal-mm", "20").code == 0
     assert len(fits) == 1

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import typer.main
 
-from ipsys_log import pipeline
-from ipsys_log.cli.app import app, present_words
+from ipsys_log.app.cli.app import app, present_words
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.rig.file import check_rig, load_rig
-from ipsys_log.runs.options import Request
+from ipsys_log.messages.rig_file import check_rig, load_rig
 from tests.conftest import ROOT, Ipsys
 
 
@@ -239,7 +239,8 @@ def print_of(program: str) -> str:
 def test_help_imports_no_heavy_library() -> None:
     """The help and the shell completion appear at once."""
     program = (
-        "import sys, ipsys_log.cli.app; print(sorted({'numpy', 'cv2', 'rerun', 'mcap'} & sys.modules.keys()))"
+        "import sys, ipsys_log.app.cli.app; "
+        "print(sorted({'numpy', 'cv2', 'rerun', 'mcap'} & sys.modules.keys()))"
     )
     assert print_of(program) == "[]"
 
@@ -247,7 +248,7 @@ def test_help_imports_no_heavy_library() -> None:
 def test_pipeline_imports_no_library_that_only_models_need() -> None:
     """A command without a model, such as record, starts in less than half the time without scikit-learn."""
     program = (
-        "import sys, ipsys_log.pipeline, ipsys_log.restore, ipsys_log.runs.verify\n"
+        "import sys, ipsys_log.live_runs.pipeline, ipsys_log.live_runs.restore, ipsys_log.tools.verify\n"
         "unwanted = {'sklearn', 'scipy', 'pandas', 'matplotlib', 'fsspec', 'aiohttp'}\n"
         "print(sorted(unwanted & sys.modules.keys()))"
     )
@@ -259,7 +260,7 @@ def test_replay_that_is_done_imports_no_library_of_models(lab: Path) -> None:
     pipeline.replay([lab], Request(models=("poly",)), "fit")
     program = (
         "import sys; from pathlib import Path; from ipsys_log import pipeline\n"
-        "from ipsys_log.runs.options import Request\n"
+        "from ipsys_log.engine.options import Request\n"
         f"(*_, fit) = pipeline.replay([Path({str(lab)!r})], Request(models=('poly',)), 'fit')\n"
         "print(fit.fresh, sorted({'sklearn', 'pandas', 'matplotlib'} & sys.modules.keys()))"
     )

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from ipsys_log.app.report.log_texts import message_json, message_line
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.contents import RawMessage, Schema, StoredChannel
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CameraPoint, CameraPoints, Message
-from ipsys_log.report.log_texts import message_json, message_line
-from ipsys_log.runs.output import write_log
 from tests.conftest import ROOT, Ipsys
 
 PAPER, SMALL = ROOT / "sample_logs/paper_lab.mcap", ROOT / "sample_logs/small_lab.mcap"

@@ -7,9 +7,9 @@ from threading import Thread
 import pytest
 from rich.console import Console
 
-from ipsys_log.cli import pages
-from ipsys_log.cli.pages import _print_addresses
-from ipsys_log.web.server import PageServer, ServerExceptions, qr_code
+from ipsys_log.app.cli import pages
+from ipsys_log.app.cli.pages import _print_addresses
+from ipsys_log.app.web.server import PageServer, ServerExceptions, qr_code
 
 VIEW, OPERATE = "http://10.0.0.7:8000/?key=abc", "http://10.0.0.7:8000/?key=def"
 
@@ -20,7 +20,7 @@ def printed(
     """Return the lines of the output and those of the remarks."""
     shown, said = Console(width=width, record=True), Console(width=200, record=True)
     monkeypatch.setattr(pages, "console", shown)
-    monkeypatch.setattr("ipsys_log.cli.console.remarks", said)
+    monkeypatch.setattr("ipsys_log.app.cli.console.remarks", said)
     _print_addresses(PageServer(url, Thread(), ServerExceptions(), view_url), is_secret)
     return shown.export_text().splitlines(), said.export_text().splitlines()
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.floor_cameras import floor_grid, shift_floor_map
-from ipsys_log.geometry.posed_camera import PosedCamera
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.payload import restore_joint
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.payload import restore_joint
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Floor, Model
 from ipsys_log.messages.channels import MODEL
-from ipsys_log.rig.file import rig_toml
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.messages.rig_file import rig_toml
+from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
+from ipsys_log.vision.posed_camera import PosedCamera
 from tests.conftest import Ipsys
 from tests.geometric.floor_error import compute_errors, grid_nodes
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

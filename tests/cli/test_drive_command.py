@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.closed_loop.settings import PROGRAM
+from ipsys_log.live_runs.robot_runs.settings import PROGRAM
 from ipsys_log.log.dataset import Session
 from tests.conftest import Ipsys
 

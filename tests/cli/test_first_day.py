@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from ipsys_log.cli.app import EXAMPLES, app, panels
+from ipsys_log.app.cli.app import EXAMPLES, app, panels
 from ipsys_log.log.dataset import Session
 from tests.conftest import Ipsys
 

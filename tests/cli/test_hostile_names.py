@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Message, Run
 from ipsys_log.plain_text import plain_text
-from ipsys_log.runs.output import write_log
 from tests.conftest import ROOT, Ipsys
 
 ESCAPE = "\x1b[31m\x9b2J\x07\u202ered[/bold]:smile:"

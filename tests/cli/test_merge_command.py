@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.shifted_times import shift_times
 from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session

@@ -17,7 +17,7 @@ from ipsys_log.capture.nodes import centre
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigNodes
-from ipsys_log.rig.file import load_rig, rig_toml
+from ipsys_log.messages.rig_file import load_rig, rig_toml
 from tests.capture.nodes.lab_of_nodes import make_certificates
 from tests.conftest import Ipsys
 from tests.ports import free_port

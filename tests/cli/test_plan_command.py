@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Measurement, Message, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys, data_section
 

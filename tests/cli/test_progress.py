@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.cli.console import progress_lines
+from ipsys_log.app.cli.console import progress_lines
 from tests.conftest import Ipsys
 from tests.publish.packs import SCORED, write_card, write_points_log
 

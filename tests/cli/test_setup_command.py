@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.first_day.jobs import Job
-from ipsys_log.web.first_day.app import SetupApp
-from ipsys_log.web.server import PageServer
+from ipsys_log.app.first_day.jobs import Job
+from ipsys_log.app.web.first_day.app import SetupApp
+from ipsys_log.app.web.server import PageServer
 from tests.conftest import Ipsys
 from tests.playing import WAIT_LIMIT_S
 

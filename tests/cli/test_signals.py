@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.atomic_files import replacement_of
-from ipsys_log.cli.signals import InterruptError, interruptible, writes_nothing
+from ipsys_log.app.cli.signals import InterruptError, interruptible, writes_nothing
+from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.reader import LogReader
 from tests.conftest import ROOT, SIGNALS, Ipsys
 from tests.test_record import wait_for
@@ -26,7 +26,7 @@ LIMIT_S = 240
 # A program that runs the command line, and sends a signal to itself at the n-th opened file or module.
 AT_EVENT = """
 import os, sys
-from ipsys_log.cli import main, signals
+from ipsys_log.app.cli import main, signals
 
 number, position = int(sys.argv.pop(1)), int(sys.argv.pop(1))
 hold, events, ready = signals.hold_signals, 0, False

@@ -12,7 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.cli.app import panels
+from ipsys_log.app.cli.app import panels
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.live_lab import LIVE_SETTINGS, image_index, lab_film, plan_live_lab
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
@@ -25,11 +28,8 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.rig.file import load_rig
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.live_lab import LIVE_SETTINGS, image_index, lab_film, plan_live_lab
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.rig_file import load_rig
+from ipsys_log.messages.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.test_measure_now import Lab, measuring
 

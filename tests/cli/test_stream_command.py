@@ -22,11 +22,11 @@ from pathlib import Path
 import pytest
 
 import ipsys_log
-from ipsys_log.cli.stream import press, read_keys
+from ipsys_log.app.cli.stream import press, read_keys
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigMarker, RigStream
 from ipsys_log.messages.channels import RIG, TRACKS
-from ipsys_log.rig.file import load_rig, rig_toml
+from ipsys_log.messages.rig_file import load_rig, rig_toml
 from tests.conftest import Ipsys
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed, open_sockets

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.differences import Extent, explain_no_overlap
-from ipsys_log.cli.signals import Interrupted, note_kept, say_kept
+from ipsys_log.app.cli.signals import Interrupted, note_kept, say_kept
+from ipsys_log.capture.simulation.lab import simulate
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Positions
 from ipsys_log.messages.channels import RIG
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.lab import simulate
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.tools.differences import Extent, explain_no_overlap
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused

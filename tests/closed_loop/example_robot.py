@@ -6,7 +6,7 @@ import importlib
 import sys
 from types import ModuleType
 
-from ipsys_log.closed_loop.settings import PROGRAM
+from ipsys_log.live_runs.robot_runs.settings import PROGRAM
 
 FOLDER = PROGRAM.parent
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from ipsys_log.closed_loop.ports import Ports, find_ports
-from ipsys_log.closed_loop.wheels import Wheels
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.robot_runs.ports import Ports, find_ports
+from ipsys_log.live_runs.robot_runs.wheels import Wheels
 
 
 def test_port_that_is_free_only_for_udp_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:

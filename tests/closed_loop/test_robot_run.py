@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.robot_run import RobotRunResult, read_robot_run
-from ipsys_log.closed_loop.run import ROBOT_RUN, drive_robots
-from ipsys_log.closed_loop.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
 from ipsys_log.exchange.data_frames import read_table
+from ipsys_log.live_runs.robot_runs.run import ROBOT_RUN, drive_robots
+from ipsys_log.live_runs.robot_runs.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, RobotPath, WheelCommand
 from ipsys_log.messages.channels import COMMANDS, EVENTS, IMAGES, PATHS, TRACKS, TRUTH
-from ipsys_log.runs.options import Request
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.tools.robot_run import RobotRunResult, read_robot_run
 from tests.conftest import Ipsys
 from tests.shared_files import make_once
 

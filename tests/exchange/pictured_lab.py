@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import (
     CameraCalibration,
     CompressedImage,
@@ -25,8 +26,7 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
 STEP_NS = NS_PER_S // 10

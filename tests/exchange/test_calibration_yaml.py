@@ -22,8 +22,8 @@ from ipsys_log.exchange.calibration_files import (
     read_intrinsics,
     ros_yaml,
 )
-from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.lenses import same_intrinsics
 
 COEFFICIENTS = {
     "kannala_brandt": (-0.1305, 0.0119, -0.0310, 1 / 3),

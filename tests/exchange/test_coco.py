@@ -13,10 +13,10 @@ import pytest
 
 import ipsys_log as ipsys
 from ipsys_log import IpsysError
-from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, RawImage
 from ipsys_log.messages.channels import IMAGES, MARKERS
+from ipsys_log.vision.video import Video
 from tests.conftest import ROOT, Ipsys
 from tests.exchange.pictured_lab import CORNERS, RUN, START_NS, STEP_NS, PicturedLab, image
 

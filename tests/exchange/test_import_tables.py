@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 
 import ipsys_log as ipsys_api
 from ipsys_log import IpsysError
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.detection_tables import DetectionOptions, import_detections
 from ipsys_log.exchange.pair_tables import pair_messages, read_pairs
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RIG_TOPIC, CameraCalibration, Rig, RigCamera, RigMarker
 from ipsys_log.messages.channels import MODEL
-from ipsys_log.rig.file import rig_toml
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.rig_file import rig_toml
+from ipsys_log.messages.units import NS_PER_S
 from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S

@@ -16,7 +16,7 @@ from ipsys_log.exchange.import_truth import ImportedTruth, TruthOptions, import_
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, Run, Track, Tracks
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests.conftest import Ipsys, data_section
 from tests.exchange.driven_lab import LAB, ROBOTS, START_NS, OtherSystem, instants_ns, path_of, write_lab
 
@@ -239,7 +239,7 @@ def test_repeated_path_needs_a_time_offset(log: Path, tmp_path: Path) -> None:
 
 
 def import_tracks(path: Path, times_ns: np.ndarray, lap_s: np.ndarray) -> None:
-    from ipsys_log.runs.output import write_log
+    from ipsys_log.engine.output import write_log
     from tests.exchange.driven_lab import tracked
 
     angle = 2 * np.pi * lap_s / 10
@@ -249,7 +249,7 @@ def import_tracks(path: Path, times_ns: np.ndarray, lap_s: np.ndarray) -> None:
 
 def test_log_without_tracks_needs_offset_and_no_alignment(tmp_path: Path, ipsys: Ipsys) -> None:
     (tmp_path / "a.csv").write_text(csv_text(*_MOVING))
-    from ipsys_log.rig.file import rig_toml
+    from ipsys_log.messages.rig_file import rig_toml
 
     (tmp_path / "lab.toml").write_text(rig_toml(LAB))
     arguments = [

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import ipsys_log as ipsys_api
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import TRUTH_TOPIC
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import Ipsys
 from tests.exchange.driven_lab import OtherSystem
 from tests.geometric.lab import GeometricSettings, build_lab

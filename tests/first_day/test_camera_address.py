@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.first_day.camera_address import parse_camera_address
-from ipsys_log.first_day.camera_choice import add_camera
+from ipsys_log.app.first_day.camera_address import parse_camera_address
+from ipsys_log.app.first_day.camera_choice import add_camera
+from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.messages import Rig, RigCamera
+from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.plain_text import hide_password
-from ipsys_log.rig.file import load_rig
-from ipsys_log.survey.entry import Fault
 
 RIG = Rig(
     "lab",

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ipsys_log.app.first_day.camera_choice import list_options, propose_names, take_picture
 from ipsys_log.capture.frames import Clock, Frame, Say
 from ipsys_log.capture.usb_bus import UsbCamera
-from ipsys_log.first_day.camera_choice import list_options, propose_names, take_picture
 from ipsys_log.messages import Rig, RigCamera
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.app.first_day.jobs import Job, Jobs
+from ipsys_log.app.first_day.lab_folder import LabFolder
+from ipsys_log.app.first_day.work import fit_and_evaluate
 from ipsys_log.errors import IpsysError
-from ipsys_log.first_day.jobs import Job, Jobs
-from ipsys_log.first_day.lab_folder import LabFolder
-from ipsys_log.first_day.work import fit_and_evaluate
 
 
 def test_second_job_is_refused_until_the_first_ends() -> None:

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log import api
+from ipsys_log.api import python_api as api
+from ipsys_log.app.first_day.lab_folder import LabFolder
+from ipsys_log.app.first_day.outlier_points import exclude_outlier, find_outlier_points
+from ipsys_log.app.first_day.steps import Status, read_progress
+from ipsys_log.app.report.accuracy import Accuracy
+from ipsys_log.engine.output import write_messages
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
-from ipsys_log.first_day.lab_folder import LabFolder
-from ipsys_log.first_day.outlier_points import exclude_outlier, find_outlier_points
-from ipsys_log.first_day.steps import Status, read_progress
+from ipsys_log.live_runs.survey.exclusion import place_in_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Distance, Evaluation, Measurement, Suspect
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.runs.output import write_messages
-from ipsys_log.survey.exclusion import place_in_log
 
 
 def write_points(path: Path, ids: list[str], begin_ns: int) -> Path:

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.errors import IpsysError
-from ipsys_log.first_day.camera_choice import list_options, save_cameras, set_calibration
-from ipsys_log.first_day.rig_entry import (
+from ipsys_log.app.first_day.camera_choice import list_options, save_cameras, set_calibration
+from ipsys_log.app.first_day.rig_entry import (
     check_rig_entry,
     example_rig,
     rig_fields,
     rig_warnings,
     save_rig_entry,
 )
+from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
-from ipsys_log.rig.file import load_rig
+from ipsys_log.messages.rig_file import load_rig
 
 FAULTS = [
     ("name", " ", "the field is empty"),

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ipsys_log.app.first_day.rig_text import replace_tables, replace_values, write_rig
 from ipsys_log.errors import IpsysError
-from ipsys_log.first_day.rig_text import replace_tables, replace_values, write_rig
 from ipsys_log.messages import Floor, Rig, RigCamera, RigMarker
-from ipsys_log.rig.file import example_toml, load_rig, rig_toml
+from ipsys_log.messages.rig_file import example_toml, load_rig, rig_toml
 
 CAMERAS = (RigCamera("red", source="usb:/dev/video0", width=1920), RigCamera("left", source="sim:black"))
 

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log import api
+from ipsys_log.api import python_api as api
+from ipsys_log.app.first_day.camera_choice import save_cameras, set_calibration
+from ipsys_log.app.first_day.lab_folder import LabFolder
+from ipsys_log.app.first_day.rig_entry import save_rig_entry
+from ipsys_log.app.first_day.steps import Status, read_progress
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
-from ipsys_log.first_day.camera_choice import save_cameras, set_calibration
-from ipsys_log.first_day.lab_folder import LabFolder
-from ipsys_log.first_day.rig_entry import save_rig_entry
-from ipsys_log.first_day.steps import Status, read_progress
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.survey.checks import withdrawal_of
-from ipsys_log.survey.from_log import open_finished_log
+from ipsys_log.live_runs.survey.checks import withdrawal_of
+from ipsys_log.live_runs.survey.from_log import open_finished_log
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.test_record import lens_yaml

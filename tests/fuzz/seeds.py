@@ -38,7 +38,7 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.rig.file import rig_toml
+from ipsys_log.messages.rig_file import rig_toml
 from tests.exchange.ros_rows import WRITERS, compressed, info, raw
 from tests.log.bombs import Attack, message
 

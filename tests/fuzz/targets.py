@@ -17,23 +17,23 @@ from urllib.parse import quote
 
 from hypothesis import strategies as st
 
+from ipsys_log.app.web.app import build_app
 from ipsys_log.calibration import images as calibration_pictures
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.exchange.image_folders import find_times
 from ipsys_log.exchange.imsel import read_mat
 from ipsys_log.exchange.ros_bags import find_bag_cameras, read_bag
-from ipsys_log.images.decode import decode_grey, decode_rows
-from ipsys_log.images.video import Video
+from ipsys_log.live_runs.survey.sheet import read_sheet
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage, CompressedVideo
-from ipsys_log.rig.file import load_rig
-from ipsys_log.survey.sheet import read_sheet
-from ipsys_log.web.app import build_app
+from ipsys_log.messages.rig_file import load_rig
+from ipsys_log.vision.decode import decode_grey, decode_rows
+from ipsys_log.vision.video import Video
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
 from tests.web.test_measuring_page import Recording

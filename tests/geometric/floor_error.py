@@ -13,15 +13,15 @@ from typing import Protocol
 
 import numpy as np
 
-from ipsys_log.analysis.expected_error import WHOLE_PRINT
-from ipsys_log.analysis.floor_grid import GRID_M, WALL_M
-from ipsys_log.arrays import Array, Mask
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import in_image, project, undistort
-from ipsys_log.geometry.markers import camera_point
-from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration, Model
+from ipsys_log.messages.arrays import Array, Mask
 from ipsys_log.models.table import AppliedModel
+from ipsys_log.statistics.expected_error import WHOLE_PRINT
+from ipsys_log.statistics.floor_grid import GRID_M, WALL_M
+from ipsys_log.vision.lenses import in_image, project, undistort
+from ipsys_log.vision.markers import camera_point
+from ipsys_log.vision.poses import transform
 
 # From poses (n, 4), which are x, y, height above the floor and heading, and a side in m: the corners of
 # squares, (n, 4, 3) in world m.

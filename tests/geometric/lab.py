@@ -8,16 +8,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ipsys_log.arrays import Array
+from ipsys_log.capture.simulation.calibration_points import SimulatedPose
+from ipsys_log.capture.simulation.cameras import Camera, aim_cameras, mount_cameras
+from ipsys_log.capture.simulation.drive import Drive, plan_drive
+from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.simulation.calibration_points import SimulatedPose
-from ipsys_log.simulation.cameras import Camera, aim_cameras, mount_cameras
-from ipsys_log.simulation.drive import Drive, plan_drive
-from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.arrays import Array
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import transform
 from tests.geometric.points import choose_points
 from tests.geometric.smooth_fields import SmoothField, SmoothSignal
 

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.arrays import Times
+from ipsys_log.capture.simulation.calibration_points import SimulatedPose, measure
+from ipsys_log.capture.simulation.cameras import Camera
+from ipsys_log.capture.simulation.lab import EPOCH_NS, ROBOT_HEIGHT_SIGMA_M, build_rig
 from ipsys_log.messages import (
     IMPORTED,
     MEASUREMENTS_TOPIC,
@@ -26,11 +28,9 @@ from ipsys_log.messages import (
     Tracks,
     calibration_topic,
 )
+from ipsys_log.messages.arrays import Times
 from ipsys_log.messages.channels import MARKERS, RECORD
-from ipsys_log.simulation.calibration_points import SimulatedPose, measure
-from ipsys_log.simulation.cameras import Camera
-from ipsys_log.simulation.lab import EPOCH_NS, ROBOT_HEIGHT_SIGMA_M, build_rig
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, PlacedMarkers
 from tests.geometric.sightings import (
     drive_times_ns,

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array, Times
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.poses import transform
-from ipsys_log.simulation.calibration_points import SimulatedPose
-from ipsys_log.simulation.cameras import Camera, sees
-from ipsys_log.simulation.lab import EPOCH_NS
-from ipsys_log.simulation.settings import Purpose, random_stream
-from ipsys_log.units import NS_PER_S
+from ipsys_log.capture.simulation.calibration_points import SimulatedPose
+from ipsys_log.capture.simulation.cameras import Camera, sees
+from ipsys_log.capture.simulation.lab import EPOCH_NS
+from ipsys_log.capture.simulation.settings import Purpose, random_stream
+from ipsys_log.messages.arrays import Array, Times
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.poses import transform
 from tests.geometric.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
 from tests.geometric.lab import GeometricLab, PlacedMarkers, camera_poses
 

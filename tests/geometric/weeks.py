@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipsys_log.arrays import Array
+from ipsys_log.capture.simulation.cameras import Camera, sees
+from ipsys_log.capture.simulation.lab import EPOCH_NS
+from ipsys_log.capture.simulation.settings import Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import make_pose, rotation, transform
 from ipsys_log.messages import (
     IMPORTED,
     RIG_TOPIC,
@@ -24,11 +23,12 @@ from ipsys_log.messages import (
     Run,
     calibration_topic,
 )
+from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import MARKERS, RECORD
-from ipsys_log.simulation.cameras import Camera, sees
-from ipsys_log.simulation.lab import EPOCH_NS
-from ipsys_log.simulation.settings import Purpose, random_stream
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import make_pose, rotation, transform
 from tests.geometric.corner_noise import corner_covariances, draw_corner_noise, edge_sigma_px
 from tests.geometric.lab import GeometricLab
 from tests.geometric.session import MARKERS_RUN, geometric_rig

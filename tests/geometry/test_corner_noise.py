@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.markers import check_covariance, pixel_slopes, whiten
+from ipsys_log.vision.markers import check_covariance, pixel_slopes, whiten
 from tests.geometry.squares import LENSES, Array
 
 

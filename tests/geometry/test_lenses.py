@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import check_calibration, project, same_intrinsics, undistort
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.lenses import check_calibration, project, same_intrinsics, undistort
 
 FISHEYE = (-0.1305, 0.0119, -0.0310, 0.0168)
 PINHOLE = (-0.33, 0.046, -0.0043, 0.0041, 0.0666)

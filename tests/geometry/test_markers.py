@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.geometry.markers import camera_point, camera_point_slopes, heading, marker_corners
+from ipsys_log.vision.markers import camera_point, camera_point_slopes, heading, marker_corners
 
 
 def seen(centre: tuple[float, float, float], angle_rad: float, length_m: float) -> np.ndarray:

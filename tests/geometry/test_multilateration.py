@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import (
+from ipsys_log.vision.trilateration import (
     are_collinear,
     crossing_angle,
     multilaterate,

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.markers import heading, marker_corners
-from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, pose_facing_up, rotation, transform
+from ipsys_log.vision.markers import heading, marker_corners
+from ipsys_log.vision.poses import invert_pose, look_down, make_pose, pose_facing_up, rotation, transform
 
 
 def test_a_pose_and_its_inverse_cancel() -> None:

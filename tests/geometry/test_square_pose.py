@@ -8,16 +8,16 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.markers import camera_point, marker_corners, pixel_slopes, whiten
-from ipsys_log.geometry.square_pose import (
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.lenses import undistort
+from ipsys_log.vision.markers import camera_point, marker_corners, pixel_slopes, whiten
+from ipsys_log.vision.square_pose import (
     SquarePoses,
     fit_squares,
     is_convex,
     reprojection_px,
     solve_squares,
 )
-from ipsys_log.messages import CameraCalibration
 from tests.geometry.squares import (
     CENTRE,
     EDGE,

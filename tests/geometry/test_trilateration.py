@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import trilaterate
+from ipsys_log.vision.trilateration import trilaterate
 
 A, B = np.array([1.2192, 2.4384]), np.array([3.6576, 2.4384])
 coordinates = st.floats(-5, 10)

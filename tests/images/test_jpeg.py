@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import FrameError, SizeError
-from ipsys_log.images import decode
-from ipsys_log.images.decode import decode_grey, decode_rows, frame_size
-from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
 from ipsys_log.messages import CompressedImage, RawImage
 from ipsys_log.stages.detect.follow import MarkerTracker
+from ipsys_log.vision import decode
+from ipsys_log.vision.decode import decode_grey, decode_rows, frame_size
+from ipsys_log.vision.jpeg import cut_rows, read_layout, whole_rows
 from tests.stages.drawing import VGA, Array, Look, Picture, at_px, corners_px, draw, jpeg
 
 SAMPLINGS = {

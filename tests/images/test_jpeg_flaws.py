@@ -12,10 +12,10 @@ import pytest
 import simplejpeg
 
 from ipsys_log.errors import FrameError
-from ipsys_log.images.decode import decode_grey, decode_rows
-from ipsys_log.images.jpeg import read_header
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage
+from ipsys_log.vision.decode import decode_grey, decode_rows
+from ipsys_log.vision.jpeg import read_header
 from tests.images.test_jpeg import colourful, packed
 from tests.tiers import first_fast
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ipsys_log.capture.video_packets import pass_through
 from ipsys_log.errors import FrameError
-from ipsys_log.images.video import Video, decode_keyframe, is_keyframe
 from ipsys_log.messages import CompressedVideo, Event, Markers, Message, RawImage, Rig
 from ipsys_log.stages.detect import Detect
+from ipsys_log.vision.video import Video, decode_keyframe, is_keyframe
 from tests.capture.streams import encode, ffmpeg
 
 CODECS = {

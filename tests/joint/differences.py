@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.linalg import lstsq
 from scipy.optimize import least_squares
 
-from ipsys_log.joint.parameters import State
-from ipsys_log.joint.problem import Problem
-from ipsys_log.joint.robust import limit_of, robust_loss
+from ipsys_log.calibration.joint.parameters import State
+from ipsys_log.calibration.joint.problem import Problem
+from ipsys_log.calibration.joint.robust import limit_of, robust_loss
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import look_down, pose_facing_up, transform
-from ipsys_log.joint.observations import (
+from ipsys_log.calibration.joint.observations import (
     CalibrationPoint,
     CameraPrior,
     Observations,
@@ -19,6 +16,9 @@ from ipsys_log.joint.observations import (
     marker_body,
 )
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import look_down, pose_facing_up, transform
 
 Array = NDArray[np.float64]
 

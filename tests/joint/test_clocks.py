@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.model import build_models
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.model import build_models
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Markers, Measurement
-from ipsys_log.simulation.settings import LabSettings
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import geometric_rig, simulate_session
 from tests.joint.test_drives import COARSE, observe

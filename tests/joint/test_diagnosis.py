@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
-from ipsys_log.joint.diagnosis import find_faults, standardise_readings
-from ipsys_log.joint.fit import Finding, fit_jointly
-from ipsys_log.joint.hypotheses import fit_hypotheses
-from ipsys_log.joint.moved_cameras import find_motion, sum_squares
-from ipsys_log.joint.observations import CalibrationPoint, Observations, marker_body
+from ipsys_log.calibration.joint.diagnosis import find_faults, standardise_readings
+from ipsys_log.calibration.joint.fit import Finding, fit_jointly
+from ipsys_log.calibration.joint.hypotheses import fit_hypotheses
+from ipsys_log.calibration.joint.moved_cameras import find_motion, sum_squares
+from ipsys_log.calibration.joint.observations import CalibrationPoint, Observations, marker_body
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation, transform
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
 
 

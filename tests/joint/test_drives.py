@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint import solver
+from ipsys_log.calibration.joint.diagnosis import find_faults
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.settings import JointSettings
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import FitError
-from ipsys_log.joint import solver
-from ipsys_log.joint.diagnosis import find_faults
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.observations import Observations
-from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.simulation.settings import LabSettings
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.joint.differences import jacobian_of, residuals_of

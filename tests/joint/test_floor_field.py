@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ipsys_log.joint.floor_field import make_floor_field
+from ipsys_log.calibration.joint.floor_field import make_floor_field
 
 FIELD = make_floor_field(np.zeros(2), np.array([4.0, 3.0]), 0.002, 0.5)
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.capture.simulation.settings import LabSettings
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.joint.test_drives import observe
 

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.joint import fit as joint_fit
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.model import build_models
-from ipsys_log.joint.moved_cameras import find_motion, sum_squares
-from ipsys_log.joint.normal import Factorisation, NormalEquations
-from ipsys_log.joint.observations import Observations
-from ipsys_log.joint.parameters import State
-from ipsys_log.joint.problem import Problem
-from ipsys_log.joint.settings import JointSettings
-from ipsys_log.joint.solver import Solution, anchor, solve
-from ipsys_log.joint.start import place_cameras
+from ipsys_log.calibration.joint import fit as joint_fit
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import build_models
+from ipsys_log.calibration.joint.moved_cameras import find_motion, sum_squares
+from ipsys_log.calibration.joint.normal import Factorisation, NormalEquations
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.parameters import State
+from ipsys_log.calibration.joint.problem import Problem
+from ipsys_log.calibration.joint.settings import JointSettings
+from ipsys_log.calibration.joint.solver import Solution, anchor, solve
+from ipsys_log.calibration.joint.start import place_cameras
+from ipsys_log.capture.simulation.settings import hall_settings
 from ipsys_log.messages import Markers, Measurement, Rig
-from ipsys_log.simulation.settings import hall_settings
 from tests.geometric.floor_error import grid_nodes
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.points import choose_points
@@ -197,7 +197,7 @@ def test_fit_with_an_unusual_reading_leaves_the_easy_stage(
     longer = replace(point, distances_m=point.distances_m + np.array([0.02, 0.0]))
     changed = replace(observations, points=(longer, *observations.points[1:]))
     problem, state = joint_fit._build(changed, JointSettings(), place_cameras(changed))
-    monkeypatch.setattr("ipsys_log.joint.solver._MOST_EASY_STEPS", 10)
+    monkeypatch.setattr("ipsys_log.calibration.joint.solver._MOST_EASY_STEPS", 10)
     assert solve(problem, state, short=0.3, patient=True).steps > 10
 
 
@@ -205,7 +205,7 @@ def test_blocks_give_the_same_motions_of_cameras(
     started: tuple[GeometricLab, Observations, Problem, State], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An honest hall has no evidence of a motion; the motions with most of it are compared."""
-    monkeypatch.setattr("ipsys_log.joint.moved_cameras._CONTRADICTED", 1.0)
+    monkeypatch.setattr("ipsys_log.calibration.joint.moved_cameras._CONTRADICTED", 1.0)
     _, observations, problem, state = started
     motions = []
     for one in (problem, problem_without_blocks(problem)):

@@ -7,14 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.hand_held import fit_hand_held, predict_errors
+from ipsys_log.calibration.joint.observations import (
+    Body,
+    CalibrationPoint,
+    CameraPrior,
+    Observations,
+    Sightings,
+)
+from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.poses import make_pose, rotation, transform
-from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.hand_held import fit_hand_held, predict_errors
-from ipsys_log.joint.observations import Body, CalibrationPoint, CameraPrior, Observations, Sightings
-from ipsys_log.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.poses import make_pose, rotation, transform
 from tests.joint.differences import jacobian_of, residuals_of
 from tests.joint.small_lab import Array
 

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.poses import make_pose, rotation
-from ipsys_log.joint.diagnosis import find_faults
-from ipsys_log.joint.fit import JointFit
-from ipsys_log.joint.hypotheses import fit_hypotheses
-from ipsys_log.joint.locate_step import LocateCorners
-from ipsys_log.joint.model import build_models
-from ipsys_log.joint.observations import Observations, seeing_cameras, without_points
-from ipsys_log.joint.payload import joint_payload, restore_joint
+from ipsys_log.calibration.joint.diagnosis import find_faults
+from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.hypotheses import fit_hypotheses
+from ipsys_log.calibration.joint.model import build_models
+from ipsys_log.calibration.joint.observations import Observations, seeing_cameras, without_points
+from ipsys_log.calibration.joint.payload import joint_payload, restore_joint
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Marker, Markers, Message, Rig, RigMarker
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.models.locate_corners import LocateCorners
+from ipsys_log.vision.poses import make_pose, rotation
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.joint.small_lab import REFERENCES_M, Array, make_lab

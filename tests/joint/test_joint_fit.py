@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import pose_facing_up, transform
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.model import build_models
-from ipsys_log.joint.parameters import State
-from ipsys_log.joint.settings import JointSettings
-from ipsys_log.joint.solver import solve
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import build_models
+from ipsys_log.calibration.joint.parameters import State
+from ipsys_log.calibration.joint.settings import JointSettings
+from ipsys_log.calibration.joint.solver import solve
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import pose_facing_up, transform
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.joint.differences import descend, jacobian_of, minimise, residuals_of, split_step, step_sizes
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab

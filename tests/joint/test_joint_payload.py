@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.model import JointModel, covariance_modes
+from ipsys_log.calibration.joint.payload import PoseChange, joint_payload, mend_poses, restore_joint
 from ipsys_log.errors import IpsysError
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.model import JointModel, covariance_modes
-from ipsys_log.joint.payload import PoseChange, joint_payload, mend_poses, restore_joint
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.messages import Model, Parameter
 from tests.joint.small_lab import Array, make_lab

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint.fit import explain_divergence, fit_jointly
+from ipsys_log.calibration.joint.observations import Observations, marker_body
+from ipsys_log.calibration.joint.solver import ConvergenceError
 from ipsys_log.errors import FitError
-from ipsys_log.joint.fit import explain_divergence, fit_jointly
-from ipsys_log.joint.observations import Observations, marker_body
-from ipsys_log.joint.solver import ConvergenceError
 from tests.joint.small_lab import make_lab
 
 

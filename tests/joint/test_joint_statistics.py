@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import pose_facing_up, transform
-from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.model import JointModel, build_models
-from ipsys_log.joint.observations import Observations
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import JointModel, build_models
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import pose_facing_up, transform
 from tests.geometric.floor_error import region_shares
 from tests.joint.small_lab import LENGTH_M, Array, Truth, make_lab
 

@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation, transform
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.locate_poses import locate_poses
-from ipsys_log.joint.locate_step import LocateCorners
-from ipsys_log.joint.model import JointModel, build_models
-from ipsys_log.joint.parameters import State
-from ipsys_log.joint.payload import joint_payload
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.locate_poses import locate_poses
+from ipsys_log.calibration.joint.model import JointModel, build_models
+from ipsys_log.calibration.joint.parameters import State
+from ipsys_log.calibration.joint.payload import joint_payload
 from ipsys_log.messages import (
     Event,
     Marker,
@@ -32,6 +28,10 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
+from ipsys_log.models.locate_corners import LocateCorners
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation, transform
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 
 POSES = [(1.6, 1.2, 0.1, 0.3), (2.4, 2.2, 0.0, -2.0), (3.1, 1.9, 0.2, 1.5)]

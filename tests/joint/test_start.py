@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.start import place_cameras
 from ipsys_log.errors import FitError
-from ipsys_log.joint.observations import Observations
-from ipsys_log.joint.start import place_cameras
 from tests.joint.small_lab import Truth, make_lab
 
 

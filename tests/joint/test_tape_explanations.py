@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipsys_log.joint.observations import CalibrationPoint
-from ipsys_log.joint.tape_explanations import Change, PointShape, explain_readings, side_contradicts
+from ipsys_log.calibration.joint.observations import CalibrationPoint
+from ipsys_log.calibration.joint.tape_explanations import (
+    Change,
+    PointShape,
+    explain_readings,
+    side_contradicts,
+)
 from tests.joint.small_lab import REFERENCES_M, Array
 
 PLACES_M = np.array([[0.9, 0.8], [3.1, 4.1], [4.2, 1.1], [2.0, 3.3], [2.9, 0.7], [0.6, 3.9]])

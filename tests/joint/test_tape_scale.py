@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.joint.diagnosis import find_faults, point_covariances
-from ipsys_log.joint.fit import JointFit, fit_jointly
-from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.observations import Observations, Tape
+from ipsys_log.calibration.joint.diagnosis import find_faults, point_covariances
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.observations import Observations, Tape
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig
 from tests.joint.small_lab import make_lab
 

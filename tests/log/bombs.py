@@ -12,6 +12,7 @@ import zstandard
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import ENTRY, HEADER, INDEX_HEAD, MAGIC, MESSAGE, ChunkRef, chunk_head, to_bytes
@@ -35,7 +36,6 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.runs.output import write_log
 
 MIB = 1 << 20
 CORNERS_PX = np.array([(1.0, 1.0), (9.0, 1.0), (9.0, 9.0), (1.0, 9.0)])

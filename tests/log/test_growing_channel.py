@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 
+from ipsys_log.engine.output import write_message
 from ipsys_log.log.growing_channel import GrowingChannel
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, image_topic
-from ipsys_log.runs.output import write_message
 
 
 def image(number: int, camera: str = "red") -> Message:

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from ipsys_log.catalogue import table
-from ipsys_log.catalogue.row import Baseline
-from ipsys_log.catalogue.table import CatalogueUpdate, update_catalogue
+from ipsys_log.api.catalogue import table
+from ipsys_log.api.catalogue.row import Baseline
+from ipsys_log.api.catalogue.table import CatalogueUpdate, update_catalogue
 from ipsys_log.log.location import LogLocation, parse_location
 from ipsys_log.log.log_files import find_logs
 

@@ -12,8 +12,8 @@ from ipsys_log.log import remote_bytes
 from ipsys_log.log.location import LogUrl
 from ipsys_log.log.remote_bytes import RemoteBytes, RemoteRanges
 from ipsys_log.log.remote_object import RemoteObject, open_object
-from ipsys_log.soundness.check import check_logs
-from ipsys_log.soundness.finding import BROKEN, READABLE, UNREAD, LogCheck
+from ipsys_log.tools.soundness.check import check_logs
+from ipsys_log.tools.soundness.finding import BROKEN, READABLE, UNREAD, LogCheck
 from tests.log.range_server import Store
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log import api
-from ipsys_log.cli.lab_inputs import load_calibrations
+from ipsys_log.api import python_api as api
+from ipsys_log.app.cli.lab_inputs import load_calibrations
+from ipsys_log.engine.output import choose_target
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogUrl
-from ipsys_log.runs.output import choose_target
 from tests.conftest import ROOT, Ipsys, small_disk
 from tests.log.range_server import Store
 

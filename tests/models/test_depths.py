@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Rig, RigMarker
-from ipsys_log.models.locate_step import LocatePoints
+from ipsys_log.models.locate_points import LocatePoints
+from ipsys_log.statistics.camera_models import fit_model
 from tests import labs
 
 HEIGHT_M = 0.1

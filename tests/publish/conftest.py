@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.publish.packing import pack
+from ipsys_log.tools.publish.packing import pack
 from tests.publish.packs import SCORED, write_card, write_points_log
 from tests.shared_files import make_once
 

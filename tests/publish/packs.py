@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.runs.output import write_log
+from ipsys_log.engine.output import write_log
 from tests.labs import RIG, camera, measure, places, session
 
 CARD = """title = "Small lab"

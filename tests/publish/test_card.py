@@ -16,8 +16,8 @@ from markdown_it import MarkdownIt
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.plain_text import plain_text
-from ipsys_log.publish.card import card_form, escape_markdown, read_card
-from ipsys_log.publish.packing import pack
+from ipsys_log.tools.publish.card import card_form, escape_markdown, read_card
+from ipsys_log.tools.publish.packing import pack
 from tests.conftest import Ipsys
 from tests.publish.packs import CARD, write_card
 

@@ -18,18 +18,18 @@ import pytest
 from rich.console import Console
 
 import ipsys_log
+from ipsys_log.app.report.pack_scores import score_answer, score_tables
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, TRACKS
+from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.models.poly import PolynomialRegression
-from ipsys_log.pipeline import replay
-from ipsys_log.publish.packing import pack
-from ipsys_log.publish.scores import Score
-from ipsys_log.publish.scoring import ScoreComparison, ScoreResult, score
-from ipsys_log.report.pack_scores import score_answer, score_tables
-from ipsys_log.rig.file import load_rig
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
+from ipsys_log.tools.publish.packing import pack
+from ipsys_log.tools.publish.scores import Score
+from ipsys_log.tools.publish.scoring import ScoreComparison, ScoreResult, score
 from tests.conftest import Ipsys
 from tests.publish.packs import SCORED, change_scores, contents, sign
 from tests.tiers import first_fast

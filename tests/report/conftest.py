@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.app.report.accuracy import Accuracy, read_accuracy
+from ipsys_log.app.report.advice import advise
+from ipsys_log.app.report.findings import Findings, gather_findings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.imsel import read_imsel
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Evaluation, Message, Rig, RigCamera
-from ipsys_log.pipeline import replay
-from ipsys_log.report.accuracy import Accuracy, read_accuracy
-from ipsys_log.report.advice import advise
-from ipsys_log.report.findings import Findings, gather_findings
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
+from ipsys_log.statistics.accuracy import POOLED
 from tests import labs
 
 ALL_MODELS = (

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.app.report.advice import ALL_MODELS, HEIGHT_KNOWN, PAPER, SIMPLE, advise
+from ipsys_log.app.report.findings import Findings
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
-from ipsys_log.report.advice import ALL_MODELS, HEIGHT_KNOWN, PAPER, SIMPLE, advise
-from ipsys_log.report.findings import Findings
-from ipsys_log.runs.output import write_log
 from tests.report.conftest import find
 
 # half of the 95 % interval of the mean, as a share of the mean

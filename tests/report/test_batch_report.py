@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ipsys_log.batch.tasks import LogResult
-from ipsys_log.report.batch import batch_json, batch_table, failure_lines
+from ipsys_log.api.batch.tasks import LogResult
+from ipsys_log.app.report.batch import batch_json, batch_table, failure_lines
 
 
 def shown(results: list[LogResult]) -> list[str]:

@@ -14,8 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.ground_truth import TrackErrors
+from ipsys_log.app.report.accuracy import Accuracy
+from ipsys_log.app.report.errors_figure import count_rows, draw_errors
+from ipsys_log.app.report.floor_figure import FloorData, draw_floor, draw_session, read_floor
+from ipsys_log.app.report.styles import camera_styles
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -34,11 +37,8 @@ from ipsys_log.messages import (
     Tracks,
     WorldPoint,
 )
-from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.floor_figure import FloorData, draw_floor, draw_session, read_floor
-from ipsys_log.report.styles import camera_styles
-from ipsys_log.runs.output import write_log
+from ipsys_log.statistics.accuracy import error_statistics
+from ipsys_log.statistics.ground_truth import TrackErrors
 
 RIG = Rig(
     "lab", "DICT_4X4_100", 0.2, reference_points=(ReferencePoint("A", 1.2, 2.4),), floor=Floor(4.88, 4.88)

@@ -12,14 +12,14 @@ from jinja2 import ChoiceLoader, DictLoader, Environment, PackageLoader
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from ipsys_log.analysis.calibrated_cameras import CalibratedCamera
+from ipsys_log.app.report.calibration_figures import clocks_figure, poses_figure
+from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.html_figures import joint_pictures, other_residual_pictures
+from ipsys_log.app.report.points_figure import draw_hulls
+from ipsys_log.capture.simulation.settings import grid_names
 from ipsys_log.messages import Floor
-from ipsys_log.report.calibration_figures import clocks_figure, poses_figure
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.html_figures import joint_pictures, other_residual_pictures
-from ipsys_log.report.points_figure import draw_hulls
-from ipsys_log.simulation.settings import grid_names
 from ipsys_log.sinks.video.composite import _arrange
+from ipsys_log.statistics.calibrated_cameras import CalibratedCamera
 from tests import labs
 from tests.report.test_joint_figures import calibrated
 
@@ -106,7 +106,7 @@ def test_tables_of_many_cameras_are_folded_on_the_page() -> None:
     page = (
         '{% from "session_macros.html" import each_camera %}{% call each_camera(n, n > 6) %}rows{% endcall %}'
     )
-    loader = ChoiceLoader([DictLoader({"page": page}), PackageLoader("ipsys_log", "report")])
+    loader = ChoiceLoader([DictLoader({"page": page}), PackageLoader("ipsys_log", "app/report")])
     template = Environment(loader=loader, autoescape=True).get_template("page")
     assert "Each of the 24 cameras" in template.render(n=24)
     assert "details" not in template.render(n=3)

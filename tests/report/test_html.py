@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.app.report.accuracy import Accuracy, read_accuracy
+from ipsys_log.app.report.html import render_report
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Message, ReferencePoint, Suspect
-from ipsys_log.pipeline import replay
-from ipsys_log.report.accuracy import Accuracy, read_accuracy
-from ipsys_log.report.html import render_report
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
 from tests import labs
 from tests.conftest import Ipsys
 from tests.report.browser import visit

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.app.report.html import render_report
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Event, Latency, Message
-from ipsys_log.report.html import render_report
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.report.browser import visit
 

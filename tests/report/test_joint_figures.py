@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.calibrated_cameras import CalibratedCamera, ImageResiduals
+from ipsys_log.app.report.calibration_figures import clocks_figure, poses_figure, residuals_figure
+from ipsys_log.app.report.figures import png
+from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.html_figures import joint_pictures
 from ipsys_log.messages import Floor, Rig
-from ipsys_log.report.calibration_figures import clocks_figure, poses_figure, residuals_figure
-from ipsys_log.report.figures import png
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.html_figures import joint_pictures
+from ipsys_log.statistics.calibrated_cameras import CalibratedCamera, ImageResiduals
 from tests import labs
 
 CAMERAS = ("black", "red")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ipsys_log.report.json_format import old_document
+from ipsys_log.app.report.json_format import old_document
 from tests.conftest import Ipsys
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from ipsys_log.report.contents import contents_tables
-from ipsys_log.report.figures import legend_label, name_cameras
-from ipsys_log.report.styles import camera_styles
-from ipsys_log.simulation.settings import grid_names
+from ipsys_log.app.report.contents import contents_tables
+from ipsys_log.app.report.figures import legend_label, name_cameras
+from ipsys_log.app.report.styles import camera_styles
+from ipsys_log.capture.simulation.settings import grid_names
 
 NAMES = grid_names(6, 4)
 

@@ -16,16 +16,16 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 
-from ipsys_log.analysis.trajectory_errors import TrajectoryErrors
+from ipsys_log.app.report.accuracy import Accuracy, accuracy_json
+from ipsys_log.app.report.figures import png
+from ipsys_log.app.report.files import cross_validation_csv, paper_csv
+from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.learning_figure import learning_figure, published_figure
+from ipsys_log.app.report.paper_figures import models_figure, residuals_figure, shown_models, write_plots
+from ipsys_log.app.report.points_figure import places_figure
+from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Residual
-from ipsys_log.report.accuracy import Accuracy, accuracy_json
-from ipsys_log.report.figures import png
-from ipsys_log.report.files import cross_validation_csv, paper_csv
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.learning_figure import learning_figure, published_figure
-from ipsys_log.report.paper_figures import models_figure, residuals_figure, shown_models, write_plots
-from ipsys_log.report.points_figure import places_figure
-from ipsys_log.runs.output import write_log
+from ipsys_log.tools.trajectory_errors import TrajectoryErrors
 from tests.conftest import Ipsys
 from tests.report.conftest import find, lab_messages, many_models, only, scale, with_accuracies
 

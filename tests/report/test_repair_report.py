@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from ipsys_log.app.report.repair import repair_lines
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.report.repair import repair_lines
 
 IMAGE = Schema("foxglove.CompressedImage", "protobuf", b"")
 NOTE = Schema("ipsys.v1.Event", "protobuf", b"")

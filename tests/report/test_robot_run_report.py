@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from ipsys_log.analysis.robot_run import read_robot_run
+from ipsys_log.app.report.robot_run import render_robot_run, robot_run_json, robot_run_tables
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -38,8 +39,7 @@ from ipsys_log.messages import (
     Waypoint,
     WheelCommand,
 )
-from ipsys_log.report.robot_run import render_robot_run, robot_run_json, robot_run_tables
-from ipsys_log.runs.output import write_log
+from ipsys_log.tools.robot_run import read_robot_run
 from tests.labs import RIG
 from tests.stages.drawing import VGA
 

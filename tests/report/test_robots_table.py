@@ -7,8 +7,8 @@ import math
 
 from rich.console import Console
 
+from ipsys_log.app.report.cameras import robots_table
 from ipsys_log.messages import Track
-from ipsys_log.report.cameras import robots_table
 
 
 def shown(tracks: list[Track]) -> list[list[str]]:

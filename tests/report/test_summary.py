@@ -14,18 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from ipsys_log.analysis.accuracy import POOLED, error_statistics, root_mean_square_m
-from ipsys_log.analysis.ground_truth import TrackErrors
+from ipsys_log.app.report.accuracy import Accuracy, accuracy_json, read_accuracy
+from ipsys_log.app.report.files import cross_validation_csv
+from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.summary import answer_json, answer_text
+from ipsys_log.app.report.tables import models_table
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, Suspect
-from ipsys_log.pipeline import replay
-from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
-from ipsys_log.report.files import cross_validation_csv
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.summary import answer_json, answer_text
-from ipsys_log.report.tables import models_table
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
+from ipsys_log.statistics.accuracy import POOLED, error_statistics, root_mean_square_m
+from ipsys_log.statistics.ground_truth import TrackErrors
 from tests.conftest import Ipsys
 from tests.report.conftest import ALL_MODELS, lab_messages, many_models, only, rename_cameras, scale
 from tests.report.test_tables import with_truth

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from ipsys_log.app.report.accuracy import Accuracy
+from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.tables import accuracy_tables
 from ipsys_log.messages import Suspect
-from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.tables import accuracy_tables
 from tests.report.conftest import ALL_MODELS, many_models, only, rename_cameras, scale
 
 

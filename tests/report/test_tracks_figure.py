@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from ipsys_log.app.report.tracks_figure import DrawnTrack, draw_tracks, plot_tracks, read_drawn_tracks
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.report.tracks_figure import DrawnTrack, draw_tracks, plot_tracks, read_drawn_tracks
-from ipsys_log.runs.output import write_log
 
 EPOCH_NS, STEP_NS = 1_700_000_000_000_000_000, 50_000_000
 

@@ -14,18 +14,18 @@ from evo.core.units import Unit
 from rich.console import Console
 
 import ipsys_log as ipsys
-from ipsys_log.analysis.accuracy import root_mean_square_m
-from ipsys_log.analysis.ground_truth import gather_paths
-from ipsys_log.analysis.trajectory_errors import TrajectoryErrors, pairs_at, trajectory_errors
+from ipsys_log.app.report.accuracy import Accuracy, accuracy_json, read_accuracy
+from ipsys_log.app.report.summary import answer_text
+from ipsys_log.app.report.tables import trajectory_table
+from ipsys_log.engine.output import append_messages
+from ipsys_log.engine.provenance import Outcome
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, ErrorStatistics, Message
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
-from ipsys_log.report.summary import answer_text
-from ipsys_log.report.tables import trajectory_table
-from ipsys_log.runs.output import append_messages
-from ipsys_log.runs.provenance import Outcome
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.statistics.accuracy import root_mean_square_m
+from ipsys_log.statistics.ground_truth import gather_paths
+from ipsys_log.tools.trajectory_errors import TrajectoryErrors, pairs_at, trajectory_errors
 from tests.exchange.driven_lab import ROBOTS, START_NS, instants_ns, path_of, tracked, write_lab
 
 SECONDS = 12.0

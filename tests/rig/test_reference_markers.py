@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.app.report.prints import rig_prints
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.messages import (
@@ -20,9 +22,7 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.report.prints import rig_prints
-from ipsys_log.rig.file import load_rig, rig_toml
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.messages.rig_file import load_rig, rig_toml
 from ipsys_log.stages.camera_frame import CameraFrame
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.weeks import WeekSettings, reference_rig, simulate_week

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.messages.rig_checks import dictionary_size
+from ipsys_log.messages.rig_file import check_rig, example_toml, load_rig, rig_toml
 from ipsys_log.plain_text import hide_password
-from ipsys_log.rig.checks import dictionary_size
-from ipsys_log.rig.file import check_rig, example_toml, load_rig, rig_toml
 
 RIG = Rig(
     "lab",

@@ -71,6 +71,6 @@ def _add_stage() -> None:
 
 if __name__ == "__main__":
     _add_stage()
-    from ipsys_log.cli import main
+    from ipsys_log.app.cli import main
 
     main()

@@ -13,6 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from ipsys_log.engine.graph import version_parameters
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import append_messages, write_log
+from ipsys_log.engine.states import recorded_stages
+from ipsys_log.live_runs.pipeline import replay
+from ipsys_log.live_runs.survey.exclusion import exclude
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraPoints,
@@ -23,17 +29,11 @@ from ipsys_log.messages import (
     Run,
 )
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.compact import compact
-from ipsys_log.runs.cut import cut
-from ipsys_log.runs.cut_selection import CutOptions
-from ipsys_log.runs.graph import version_parameters
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import append_messages, write_log
-from ipsys_log.runs.states import recorded_stages
-from ipsys_log.runs.superseded import superseded_runs
-from ipsys_log.runs.verify import verify
-from ipsys_log.survey.exclusion import exclude
+from ipsys_log.tools.compact import compact
+from ipsys_log.tools.cut import cut
+from ipsys_log.tools.cut_selection import CutOptions
+from ipsys_log.tools.superseded import superseded_runs
+from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys
 from tests.shared_files import make_once
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
@@ -34,10 +35,9 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.runs.cut import cut
-from ipsys_log.runs.cut_selection import CutOptions
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.tools.cut import cut
+from ipsys_log.tools.cut_selection import CutOptions
 from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import append_messages
+from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Measurement, Message
 from ipsys_log.messages.channels import CUTS, MARKERS
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.cut import cut
-from ipsys_log.runs.cut_selection import CutOptions
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import append_messages
-from ipsys_log.runs.states import recorded_stages
-from ipsys_log.runs.verify import verify
-from ipsys_log.soundness.check import check_logs
+from ipsys_log.tools.cut import cut
+from ipsys_log.tools.cut_selection import CutOptions
+from ipsys_log.tools.soundness.check import check_logs
+from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys
 from tests.shared_files import make_once
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.engine.frame_times import channel_times
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
-from ipsys_log.runs.frame_times import channel_times
 
 
 def test_times_of_all_channels_are_those_of_their_indexes(detected_log: Path) -> None:

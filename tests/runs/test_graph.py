@@ -9,6 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.engine import graph
+from ipsys_log.engine.graph import STAGES, stages_until
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RawImage, Tracks, channels
 from ipsys_log.messages.channels import (
@@ -20,12 +24,8 @@ from ipsys_log.messages.channels import (
     TRUTH,
     channel_of,
 )
-from ipsys_log.pipeline import replay
-from ipsys_log.runs import graph
-from ipsys_log.runs.graph import STAGES, stages_until
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.verify import verify
 from ipsys_log.stages import ENTRIES
+from ipsys_log.tools.verify import verify
 from tests.conftest import ROOT, Ipsys, data_section
 from tests.runs import damping
 from tests.runs.damping import DAMPED_TRACKS

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
@@ -29,10 +30,9 @@ from ipsys_log.messages import (
     RigCamera,
     RigMarker,
 )
-from ipsys_log.runs.merge import merge
-from ipsys_log.runs.merge_plan import LogOffset
-from ipsys_log.runs.output import write_log
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.tools.merge import merge
+from ipsys_log.tools.merge_plan import LogOffset
 from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.engine.output import write_messages
 from ipsys_log.errors import LogError
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message
-from ipsys_log.runs.output import write_messages
 
 
 def test_a_frame_of_another_schema_is_refused_by_its_topic(tmp_path: Path) -> None:

@@ -12,17 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.errors import IpsysError
-from ipsys_log.log.codec import PAYLOADS, encode
-from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Rig, RigMarker, kind_of
-from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.stage import Resets
-from ipsys_log.runs.blas import one_blas_thread
-from ipsys_log.runs.execute import compute_messages
-from ipsys_log.runs.graph import Task, plan_stage, writer_of
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.pieces import (
+from ipsys_log.engine.blas import one_blas_thread
+from ipsys_log.engine.execute import compute_messages
+from ipsys_log.engine.graph import Task, plan_stage, writer_of
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.pieces import (
     Piece,
     PieceFrames,
     PieceResult,
@@ -33,8 +27,14 @@ from ipsys_log.runs.pieces import (
     plan_pieces,
     split_frames,
 )
-from ipsys_log.runs.stream import wire
-from ipsys_log.units import NS_PER_S
+from ipsys_log.engine.stream import wire
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import PAYLOADS, encode
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Message, Rig, RigMarker, kind_of
+from ipsys_log.messages.channels import MARKERS
+from ipsys_log.messages.stage import Resets
+from ipsys_log.messages.units import NS_PER_S
 
 Row = tuple[str, int, int, bytes]
 

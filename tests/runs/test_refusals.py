@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
@@ -28,7 +27,8 @@ from ipsys_log.messages import (
     Rig,
     WorldPoint,
 )
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.lenses import scale_intrinsics
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused
@@ -217,8 +217,8 @@ CASES: dict[str, Case] = {
 @pytest.fixture(scope="module")
 def model_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with the fitted model poly."""
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.pipeline import replay
 
     path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("model") / "model.mcap"))
     replay([path], Request(), "fit")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ipsys_log.runs.output import write_log
+from ipsys_log.engine.output import write_log
 from tests.conftest import Ipsys
 from tests.stages.drawing import VGA, calibrated, each_time, frame, jpeg, rig
 from tests.stages.lighting import marker_in_glare

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import ipsys_log
-from ipsys_log import pipeline
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import append_messages, write_log, write_messages
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
@@ -26,9 +28,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, RUN_EVENTS
-from ipsys_log.rig.file import load_rig
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import append_messages, write_log, write_messages
+from ipsys_log.messages.rig_file import load_rig
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.shared_files import make_once

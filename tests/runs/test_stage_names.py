@@ -11,7 +11,7 @@ from tests.conftest import ROOT
 PACKAGE = ROOT / "ipsys_log"
 NAMES = {entry.name for entry in ENTRIES}
 EXCEPTIONS = {
-    "cli/app.py": "the panels and the examples of the help, by command",
+    "app/cli/app.py": "the panels and the examples of the help, by command",
 }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.runs.graph import VERSIONS
+from ipsys_log.engine.graph import VERSIONS
 from tests.runs.stage_output import COMBINATIONS, EXPECTED, TOLERANCES, computed, environment, kind_of
 
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
+from ipsys_log.engine import provenance
+from ipsys_log.engine.graph import STAGES, VERSIONS, version_parameters
+from ipsys_log.engine.provenance import recorded_version
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.models.table import CORNER_MODELS, MODELS
-from ipsys_log.runs import provenance
-from ipsys_log.runs.graph import STAGES, VERSIONS, version_parameters
-from ipsys_log.runs.provenance import recorded_version
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
 from tests.conftest import ROOT, Ipsys
@@ -118,8 +118,8 @@ def test_name_of_a_run_that_is_out_of_date_is_refused_first(
 
 
 def test_stages_that_are_not_known_here_are_left_alone(ipsys: Ipsys, log: Path) -> None:
+    from ipsys_log.engine.output import append_messages
     from ipsys_log.messages import Message, Run
-    from ipsys_log.runs.output import append_messages
 
     with Session([log]) as session:
         time_ns = session.end_ns + 1
@@ -206,9 +206,9 @@ def test_package_versions_do_not_outdate_runs(
 
 
 def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+    from ipsys_log.engine.output import append_messages
+    from ipsys_log.live_runs.survey.checks import withdrawal_of
     from ipsys_log.messages import Message
-    from ipsys_log.runs.output import append_messages
-    from ipsys_log.survey.checks import withdrawal_of
 
     with Session([log]) as session:
         last, time_ns = session.payloads(["/measurements"])[-1], session.end_ns + 1
@@ -238,7 +238,7 @@ def test_run_without_its_inputs_is_not_repeatable(ipsys: Ipsys, tmp_path: Path) 
 def test_unfinished_run_has_the_state_unfinished(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.mcap"
     with Session([log]) as session, LogWriter.create(short) as writer:
-        from ipsys_log.runs.output import write_message
+        from ipsys_log.engine.output import write_message
 
         left = 3
         for message in session.messages({t for reader in session.readers for t in reader.channels}):

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.engine import pieces, workers
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.pieces import Piece, PieceFrames, PiecePlan, PieceRun
+from ipsys_log.engine.workers import LocalWorkers
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.reader import LogReader
-from ipsys_log.pipeline import replay
-from ipsys_log.runs import pieces, workers
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.pieces import Piece, PieceFrames, PiecePlan, PieceRun
-from ipsys_log.runs.workers import LocalWorkers
 from tests.conftest import Ipsys
 
 pytestmark = pytest.mark.slow  # each process imports the package
@@ -120,7 +120,7 @@ def test_workers_start_only_for_a_missing_run(lab: Path, monkeypatch: pytest.Mon
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("ipsys_log.runs.execute.fingerprint", interrupted)
+        patch.setattr("ipsys_log.engine.execute.fingerprint", interrupted)
         with pytest.raises(KeyboardInterrupt):
             replay([lab], REQUEST, "detect", jobs=2)
     assert [worker.process.poll() for worker in started] == [-9, -9]

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ipsys_log.capture.simulation.cameras import Camera
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Marker, Markers, Message, Rig, Tracks
 from ipsys_log.messages.channels import MODEL
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.cameras import Camera
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.capture.simulation.cameras import mount_cameras, sees
+from ipsys_log.capture.simulation.drive import LanePath, plan_drive
+from ipsys_log.capture.simulation.settings import LabSettings, hall_settings, parse_grid
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Markers, Rig
-from ipsys_log.rig.file import check_rig
-from ipsys_log.simulation.cameras import mount_cameras, sees
-from ipsys_log.simulation.drive import LanePath, plan_drive
-from ipsys_log.simulation.settings import LabSettings, hall_settings, parse_grid
+from ipsys_log.messages.rig_file import check_rig
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import simulate_session

@@ -8,17 +8,23 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.capture.simulation.calibration_points import (
+    SimulatedPose,
+    cameras_seeing,
+    measure,
+    plan_points,
+    split,
+)
+from ipsys_log.capture.simulation.cameras import mount_cameras, sees
+from ipsys_log.capture.simulation.drive import plan_drive
+from ipsys_log.capture.simulation.lab import simulate
+from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import PlacedMarker, project_corners
-from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, Message, Rig, Tracks
-from ipsys_log.rig.file import check_rig
-from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing, measure, plan_points, split
-from ipsys_log.simulation.cameras import mount_cameras, sees
-from ipsys_log.simulation.drive import plan_drive
-from ipsys_log.simulation.lab import simulate
-from ipsys_log.simulation.settings import FLOOR_M, LabSettings
+from ipsys_log.messages.rig_file import check_rig
+from ipsys_log.vision.marker_cells import PlacedMarker, project_corners
+from ipsys_log.vision.trilateration import trilaterate
 
 SMALL = LabSettings(width=640, height=360, stations=4, frames_per_station=2, drive_s=0.5, rate_hz=10.0)
 

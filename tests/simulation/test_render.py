@@ -8,12 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.geometry.marker_cells import PlacedMarker, project_corners
-from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation
-from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.floor import FloorView, prepare_view
-from ipsys_log.simulation.render import encode_jpeg, expose, render
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.render import encode_jpeg, expose, render
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.vision.marker_cells import PlacedMarker, project_corners
+from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation
 
 Array = NDArray[np.float64]
 LENGTH_M = 0.2

@@ -8,16 +8,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from ipsys_log.geometry.marker_cells import MovingMarker, PlacedMarker, project_corners
-from ipsys_log.geometry.poses import look_down, pose_facing_up
+from ipsys_log.capture.simulation.calibration_points import place_marker
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.drive import Drive, plan_drive
+from ipsys_log.capture.simulation.floor import prepare_view
+from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
+from ipsys_log.capture.simulation.render import expose
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CompressedImage, Message, Rig, Tracks
-from ipsys_log.simulation.calibration_points import place_marker
-from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.drive import Drive, plan_drive
-from ipsys_log.simulation.floor import prepare_view
-from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
-from ipsys_log.simulation.render import expose
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker, project_corners
+from ipsys_log.vision.poses import look_down, pose_facing_up
 from tests.tiers import first_fast
 
 Array = NDArray[np.float64]

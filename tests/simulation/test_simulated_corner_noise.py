@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.poses import pose_facing_up
-from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.vision.poses import pose_facing_up
 from tests.geometric.corner_noise import (
     REPEATABLE_SHARE,
     WHITE_SHARE,

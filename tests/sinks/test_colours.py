@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ipsys_log.report.styles import camera_styles, to_rgb
-from ipsys_log.simulation.settings import grid_names
+from ipsys_log.app.report.styles import camera_styles, to_rgb
+from ipsys_log.capture.simulation.settings import grid_names
 from ipsys_log.sinks.colours import camera_colours, oklab, robot_colour
 
 # Red and the orange of Okabe and Ito, which are easy to tell apart, have a distance of 0.16.

@@ -15,10 +15,10 @@ import foxglove.layouts as fl
 import numpy as np
 import pytest
 
+from ipsys_log.capture.simulation.settings import grid_names
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC, CompressedImage, Latency, Message, image_topic
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import grid_names
 from ipsys_log.sinks.foxglove_layout import _grid, make_layout
 from tests.conftest import ROOT, Ipsys
 

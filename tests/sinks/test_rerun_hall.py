@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from rerun.chunk import RrdReader
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CompressedImage,
@@ -25,7 +26,6 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.runs.output import write_log
 from ipsys_log.sinks.rerun.recording import write_recording
 from ipsys_log.sinks.rerun.scene import Plot, layout
 from tests.geometry.squares import FISHEYE

@@ -14,6 +14,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -34,7 +35,6 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.runs.output import write_log
 from ipsys_log.sinks.rerun.messages import RerunSink, encoded_frame, raw_image
 from ipsys_log.sinks.rerun.recording import write_recording
 

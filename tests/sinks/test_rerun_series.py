@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, Latency, Message, Position, Positions, Run
-from ipsys_log.runs.output import write_log
 from ipsys_log.sinks.rerun.recording import write_recording
 
 START_NS = 1_700_000_000_000_000_000

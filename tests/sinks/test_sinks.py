@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log import pipeline
 from ipsys_log.capture.devices import OPENERS, open_source
 from ipsys_log.capture.frames import Clock, Frame, Say
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig, RigCamera, Tracks
 from ipsys_log.messages.channels import EVENTS

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 import ipsys_log as ipsys
 from ipsys_log import IpsysError
-from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, RawImage
 from ipsys_log.sinks.colours import MARKER_COLOUR, robot_colour
+from ipsys_log.vision.video import Video
 from tests.conftest import Ipsys
 from tests.exchange.pictured_lab import COLOUR, RUN, SIZE, START_NS, STEP_NS, PicturedLab, image, jpeg, track
 

@@ -15,7 +15,6 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import ipsys_log as ipsys
-from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import journal_path
 from ipsys_log.log.reader import LogReader
@@ -30,10 +29,11 @@ from ipsys_log.messages import (
     Rig,
     RigCamera,
 )
-from ipsys_log.soundness.check import check_logs
-from ipsys_log.soundness.finding import LogCheck, LogFinding
-from ipsys_log.soundness.times import MessageTimes
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.tools.soundness.check import check_logs
+from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
+from ipsys_log.tools.soundness.times import MessageTimes
+from ipsys_log.vision.lenses import scale_intrinsics
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys
 from tests.log.bombs import BOMBS

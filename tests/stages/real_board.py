@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import find_board
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.geometry.lenses import undistort
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, Markers, Message, Rig, RigMarker
 from ipsys_log.stages.detect import FrameDetector
+from ipsys_log.vision.lenses import undistort
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.markers import camera_point, heading
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
@@ -27,9 +27,9 @@ from ipsys_log.messages import (
     RigMarker,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
+from ipsys_log.vision.lenses import undistort
+from ipsys_log.vision.markers import camera_point, heading
 from tests.conftest import ROOT, Ipsys
 from tests.geometry.squares import CENTRE, EDGE, FISHEYE, LENSES, MIDWAY, Array, corners_px, turned
 from tests.stages.real_board import RIG as BOARD_RIG

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.messages import CameraCalibration, CameraPoints, Event, Marker, Markers, Message, Pair
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED
-from ipsys_log.models.locate_step import LocatePoints
+from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
 from ipsys_log.stages.camera_frame import STAGE as CAMERA_FRAME
 from ipsys_log.stages.detect import STAGE as DETECT
 from ipsys_log.stages.detect.reports import LensInUse, Reports
+from ipsys_log.statistics.camera_models import fit_model
 from tests.analysis.marked_floor import FISHEYE, RIG, changed, sighted
 
 

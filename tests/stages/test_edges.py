@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.marker_cells import project_corners
+from ipsys_log.capture.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.drive import plan_drive
+from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
+from ipsys_log.capture.simulation.render import encode_jpeg, render
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
-from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
-from ipsys_log.simulation.cameras import Camera, mount_cameras
-from ipsys_log.simulation.drive import plan_drive
-from ipsys_log.simulation.floor import FloorView, prepare_view
-from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
-from ipsys_log.simulation.render import encode_jpeg, render
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import Guess
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.follow import MarkerTracker
-from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.marker_cells import project_corners
 from tests.stages.drawing import (
     FISHEYE,
     PLUMB_BOB,

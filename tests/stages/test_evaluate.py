@@ -10,9 +10,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ipsys_log.analysis.accuracy import POOLED, error_statistics, evaluate_cross_validated, evaluate_held_out
-from ipsys_log.analysis.camera_models import fit_model, height_sigmas
-from ipsys_log.analysis.cross_validation import (
+from ipsys_log.errors import FitError
+from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
+from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.table import AppliedModel, group_dependent_cameras, min_pairs
+from ipsys_log.statistics.accuracy import (
+    POOLED,
+    error_statistics,
+    evaluate_cross_validated,
+    evaluate_held_out,
+)
+from ipsys_log.statistics.camera_models import fit_model, height_sigmas
+from ipsys_log.statistics.cross_validation import (
     FOLDS,
     Study,
     gather_points,
@@ -23,13 +32,9 @@ from ipsys_log.analysis.cross_validation import (
     predict_without,
     published_curve,
 )
-from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
-from ipsys_log.analysis.point_evaluation import evaluate_model
-from ipsys_log.analysis.tape import RiggedMeasurement, world_point
-from ipsys_log.errors import FitError
-from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
-from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import AppliedModel, group_dependent_cameras, min_pairs
+from ipsys_log.statistics.ground_truth import gather_tracks, track_errors
+from ipsys_log.statistics.point_evaluation import evaluate_model
+from ipsys_log.statistics.tape import RiggedMeasurement, world_point
 from tests import labs
 
 POINTS = np.random.default_rng(0).uniform((-2, -1, 1.9), (2, 1, 2.1), (14, 3))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ipsys_log.engine.stream import run, wire
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     RIG_TOPIC,
@@ -16,7 +17,6 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.messages.channels import POSITIONS
-from ipsys_log.runs.stream import run, wire
 from ipsys_log.stages import fuse
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.markers import white_cells
 from ipsys_log.messages import Event, Markers
 from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES, count_contradictions
+from ipsys_log.vision.markers import white_cells
 from tests.stages.drawing import (
     VGA,
     Array,

@@ -11,23 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log import api
-from ipsys_log.analysis.joint_evaluation import JOINT_SUBSETS
-from ipsys_log.api import load_model
+from ipsys_log.api import python_api as api
+from ipsys_log.api.python_api import load_model
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.select import evaluated_models
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.joint.fitted_corners import FittedCornerModel
+from ipsys_log.live_runs.survey.checks import check_entry
+from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
+from ipsys_log.live_runs.survey.from_log import open_finished_log
+from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, Markers, Measurement, Message, Model, Run, Tracks
 from ipsys_log.messages.channels import EVALUATION, MARKERS, MEASUREMENTS_TOPIC, POSITIONS, RIG
+from ipsys_log.models.fitted_corners import FittedCornerModel
 from ipsys_log.models.table import MODELS
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.select import evaluated_models
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.survey.checks import check_entry
-from ipsys_log.survey.entry import TypedEntry, parse_entry
-from ipsys_log.survey.from_log import open_finished_log
-from ipsys_log.survey.scene import observe_marker
+from ipsys_log.statistics.joint_evaluation import JOINT_SUBSETS
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
@@ -271,8 +271,8 @@ def test_usual_joint_model_that_cannot_be_fitted_is_left_out(
     def fail(*_arguments: object) -> Model:
         raise FitError("camera red: no overlap")
 
-    monkeypatch.setattr("ipsys_log.pipeline.evaluated_models", lambda paths: ("rigid", "joint"))
-    monkeypatch.setattr("ipsys_log.analysis.joint_calibration.fit_joint_model", fail)
+    monkeypatch.setattr("ipsys_log.live_runs.pipeline.evaluated_models", lambda paths: ("rigid", "joint"))
+    monkeypatch.setattr("ipsys_log.statistics.joint_calibration.fit_joint_model", fail)
     done = ipsys("evaluate", log)
     assert done.code == 0, done.err
     assert "joint is left out: camera red: no overlap" in done.err

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.from_messages import gather_observations
-from ipsys_log.joint.locate_step import LocateCorners
-from ipsys_log.joint.payload import joint_payload
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.payload import joint_payload
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Markers, Measurement, Positions
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.models.locate_corners import LocateCorners
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import geometric_rig, simulate_session
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Pair, Rig
-from ipsys_log.models.locate_step import LocatePoints
+from ipsys_log.models.locate_points import LocatePoints
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.vision.poses import look_down, transform
 
 RIG = Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, marker_height_m=0.1))
 

@@ -9,20 +9,20 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.marker_cells import project_corners
-from ipsys_log.images.decode import decode_grey
+from ipsys_log.capture.simulation.calibration_points import place_marker
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.drive import plan_drive
+from ipsys_log.capture.simulation.floor import prepare_view
+from ipsys_log.capture.simulation.render import encode_jpeg, render
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CompressedImage, Event, Marker
-from ipsys_log.simulation.calibration_points import place_marker
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.drive import plan_drive
-from ipsys_log.simulation.floor import prepare_view
-from ipsys_log.simulation.render import encode_jpeg, render
-from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.partial import fit_visible_edges
 from ipsys_log.stages.detect.stock import detect_markers
 from ipsys_log.stages.detect.uneven_light import compare_pattern
+from ipsys_log.vision.decode import decode_grey
+from ipsys_log.vision.marker_cells import project_corners
 from tests.stages.drawing import (
     FISHEYE,
     VGA,

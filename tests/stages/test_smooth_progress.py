@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.view import LogView
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RIG_TOPIC, Message, Position, Positions, Rig, RigMarker
 from ipsys_log.messages.channels import POSITIONS
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.view import LogView
 from ipsys_log.stages import smooth
 
 FRAMES, STEP_NS = 50, 30_000_000

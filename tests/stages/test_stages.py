@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.images.decode import decode_grey
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -22,9 +20,11 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.models.locate_step import LocatePoints
+from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.fuse import Fuse
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.vision.decode import decode_grey
 
 RIG = Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3, robot="ada"),)))
 

@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.lab import drive_start_ns, simulate
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.engine.stream import run, wire
+from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -33,15 +38,10 @@ from ipsys_log.messages import (
     Vector3,
 )
 from ipsys_log.messages.channels import POSITIONS, TRACKS
-from ipsys_log.models.locate_step import LocatePoints
-from ipsys_log.pipeline import replay
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.runs.stream import run, wire
-from ipsys_log.simulation.cameras import mount_cameras
-from ipsys_log.simulation.lab import drive_start_ns, simulate
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages import fuse
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.statistics.ground_truth import gather_tracks, track_errors
 
 MS = 1_000_000
 RIG = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2, tuple(RigMarker(n) for n in range(9))))

@@ -10,13 +10,13 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from ipsys_log.analysis.pairs import active_baselines, active_measurements
-from ipsys_log.cli import dialog
+from ipsys_log.app.cli import dialog
+from ipsys_log.app.web.server import serve
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.checks import needs_baseline, read_baseline, withdrawal_of
+from ipsys_log.live_runs.survey.scene import CameraView, StationaryInterval
 from ipsys_log.messages import Measurement, ReferencePoint, Rig
-from ipsys_log.survey.checks import needs_baseline, read_baseline, withdrawal_of
-from ipsys_log.survey.scene import CameraView, StationaryInterval
-from ipsys_log.web.server import serve
+from ipsys_log.statistics.pairs import active_baselines, active_measurements
 
 POINTS = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
 RIG = Rig("lab", "DICT_4X4_100", 0.2, reference_points=POINTS)

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.camera_models import fit_model
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
+from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
+from ipsys_log.live_runs.survey.scene import MarkerObservations
 from ipsys_log.messages import Interval, Measurement, Model, ReferencePoint, Rig
-from ipsys_log.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
-from ipsys_log.survey.entry import TypedEntry, parse_entry
-from ipsys_log.survey.scene import MarkerObservations
+from ipsys_log.statistics.camera_models import fit_model
 from tests import labs
 
 Array = labs.Array

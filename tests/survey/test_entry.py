@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.entry import TypedEntry, check_references, parse_entry
 from ipsys_log.messages import ReferencePoint
-from ipsys_log.survey.entry import TypedEntry, check_references, parse_entry
 from tests import labs
 
 THREE = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, ReferencePoint("C", 2.4, 0.1)))

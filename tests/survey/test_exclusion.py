@@ -10,23 +10,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.pairs import active_measurements, withdrawals
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.exclusion import exclude
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Evaluation, Measurement, Message, Model
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
-from ipsys_log.runs.output import write_log
-from ipsys_log.soundness.check import check_logs
-from ipsys_log.survey.exclusion import exclude
+from ipsys_log.statistics.pairs import active_measurements, withdrawals
+from ipsys_log.tools.soundness.check import check_logs
 from tests.conftest import Ipsys, data_section
 
 
 @pytest.fixture(scope="module")
 def fitted_log(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the small simulated session with a rigid model and its evaluation."""
-    from ipsys_log.pipeline import replay
-    from ipsys_log.runs.options import Request
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.pipeline import replay
 
     log = tmp_path_factory.mktemp("fitted") / "lab.mcap"
     shutil.copy(detected_log, log)
@@ -145,9 +145,9 @@ def test_excluded_points_are_not_faulty(tmp_path: Path) -> None:
 
 
 def test_measuring_page_shows_the_reason_of_an_exclusion(detected_lab: Path) -> None:
-    from ipsys_log.runs.options import Request
-    from ipsys_log.survey.from_log import open_finished_log
-    from ipsys_log.web.app import history_json
+    from ipsys_log.app.web.app import history_json
+    from ipsys_log.engine.options import Request
+    from ipsys_log.live_runs.survey.from_log import open_finished_log
 
     name = measured(detected_lab)[0].id
     exclude(detected_lab, [name], "the tape sagged")

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import pytest
 
+from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.live_runs.survey.live_calibration import LiveCalibration
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.survey.live_calibration import LiveCalibration
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import geometric_rig, simulate_session
 
@@ -94,7 +94,7 @@ def test_bug_of_a_live_fit_is_raised(monkeypatch: pytest.MonkeyPatch, at: str) -
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("ipsys_log.survey.live_calibration.fit_without", fail)
+    monkeypatch.setattr("ipsys_log.live_runs.survey.live_calibration.fit_without", fail)
     lines: list[str] = []
     live = LiveCalibration(geometric_rig(LAB), LAB.calibrations, 0.05, lines.append, every_s=4.0)
     messages = iter(list(simulate_session(LAB)))

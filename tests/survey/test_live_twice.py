@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ipsys_log.capture.frames import CameraState
+from ipsys_log.live_runs.survey.checks import EntryCheck, check_entry, withdrawal_of
+from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
+from ipsys_log.live_runs.survey.live import LiveScene
+from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.messages import CameraPoint, CameraPoints, CompressedImage, Markers, Message
-from ipsys_log.survey.checks import EntryCheck, check_entry, withdrawal_of
-from ipsys_log.survey.entry import TypedEntry, parse_entry
-from ipsys_log.survey.live import LiveScene
-from ipsys_log.survey.scene import observe_marker
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 from tests import labs
 
 PLACE = TypedEntry("0", {"A": "170", "B": "190"}, "left", "10")

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.engine.options import Request
+from ipsys_log.live_runs.survey.entry import TypedEntry
+from ipsys_log.live_runs.survey.from_log import open_finished_log
+from ipsys_log.live_runs.survey.sheet import name_columns
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.runs.options import Request
-from ipsys_log.survey.entry import TypedEntry
-from ipsys_log.survey.from_log import open_finished_log
-from ipsys_log.survey.sheet import name_columns
+from ipsys_log.statistics.pairs import active_measurements
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.survey.test_checks import THREE, check, tape

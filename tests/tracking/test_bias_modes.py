@@ -8,20 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.camera_models import fit_model
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import pose_facing_up, transform
-from ipsys_log.joint.fit import fit_jointly
-from ipsys_log.joint.locate import locate_markers
-from ipsys_log.joint.model import JointModel
-from ipsys_log.joint.payload import joint_payload, restore_joint
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import JointModel
+from ipsys_log.calibration.joint.payload import joint_payload, restore_joint
 from ipsys_log.messages import Model, Pair, Rig, RigMarker
 from ipsys_log.models.table import AppliedModel
-from ipsys_log.tracking import bias_modes as modes_module
-from ipsys_log.tracking import calibration_modes as table_module
-from ipsys_log.tracking.bias_modes import LOCAL_M, BiasModes, Grid, NodeModes, reduce_modes
-from ipsys_log.tracking.calibration_modes import calibration_modes
+from ipsys_log.models.tracking import bias_modes as modes_module
+from ipsys_log.models.tracking import calibration_modes as table_module
+from ipsys_log.models.tracking.bias_modes import LOCAL_M, BiasModes, Grid, NodeModes, reduce_modes
+from ipsys_log.models.tracking.calibration_modes import calibration_modes
+from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import pose_facing_up, transform
 from tests.joint.small_lab import LENGTH_M, make_lab
 
 Array = NDArray[np.float64]

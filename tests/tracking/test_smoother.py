@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.tracking.filter import Sightings, States, start
-from ipsys_log.tracking.motion import MOTION, POSE, MotionNoise, transition
-from ipsys_log.tracking.smoother import smooth_track
+from ipsys_log.models.tracking.filter import Sightings, States, start
+from ipsys_log.models.tracking.motion import MOTION, POSE, MotionNoise, transition
+from ipsys_log.models.tracking.smoother import smooth_track
 
 Array = NDArray[np.float64]
 

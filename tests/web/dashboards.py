@@ -11,6 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from ipsys_log.app.web.dashboard.app import build_dashboard
+from ipsys_log.app.web.dashboard.operator import Operator
+from ipsys_log.app.web.dashboard.state import Dashboard, DashboardSetting
+from ipsys_log.app.web.server import PageServer, serve_app
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.messages import (
@@ -32,11 +36,7 @@ from ipsys_log.messages import (
     Tracks,
     image_topic,
 )
-from ipsys_log.units import NS_PER_S
-from ipsys_log.web.dashboard.app import build_dashboard
-from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
-from ipsys_log.web.server import PageServer, serve_app
+from ipsys_log.messages.units import NS_PER_S
 from tests.playing import WAIT_LIMIT_S
 from tests.stages.drawing import jpeg
 

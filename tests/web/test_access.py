@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.app.web.server import qr_code, serve
 from ipsys_log.errors import IpsysError
-from ipsys_log.web.server import qr_code, serve
 from tests.playing import WAIT_LIMIT_S
 from tests.web.test_measuring_page import Recording
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log import api
+from ipsys_log.api import python_api as api
+from ipsys_log.app.first_day.lab_folder import LabFolder
+from ipsys_log.app.web.first_day.app import SetupApp
+from ipsys_log.app.web.server import serve, serve_app
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
-from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.messages import CameraModel, Model
-from ipsys_log.web.first_day.app import SetupApp
-from ipsys_log.web.server import serve, serve_app
 from tests.conftest import Unmeasured
 from tests.waiting import wait_until
 from tests.web.axe import serious_faults

@@ -24,12 +24,12 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
-from ipsys_log.cli.pages import say_faults
+from ipsys_log.app.cli.pages import say_faults
+from ipsys_log.app.web.connections import PageLimits, derive_limits
+from ipsys_log.app.web.server import PageServer, ServerExceptions, serve
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.scene import CameraView
 from ipsys_log.log.dataset import Session
-from ipsys_log.survey.scene import CameraView
-from ipsys_log.web.connections import PageLimits, derive_limits
-from ipsys_log.web.server import PageServer, ServerExceptions, serve
 from tests.test_measure_now import Lab, still_lab
 from tests.waiting import wait_until
 from tests.web.test_access import Caller

@@ -16,17 +16,17 @@ from urllib.parse import urlsplit
 import pytest
 import simplejpeg
 
-from ipsys_log import pipeline
-from ipsys_log.cli.pages import serve_dashboard
+from ipsys_log.app.cli.pages import serve_dashboard
+from ipsys_log.app.web.connections import PageLimits
+from ipsys_log.app.web.dashboard.operator import Operator
+from ipsys_log.app.web.dashboard.state import Dashboard, DashboardSetting
+from ipsys_log.engine.options import Request
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, Latency, Message, Tracks
 from ipsys_log.messages.channels import EVENTS, RIG
 from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
-from ipsys_log.runs.options import Request
-from ipsys_log.web.connections import PageLimits
-from ipsys_log.web.dashboard.operator import Operator
-from ipsys_log.web.dashboard.state import Dashboard, DashboardSetting
 from tests.live_recordings import again, attached_in_steps, lenses, sent
 from tests.playing import WAIT_LIMIT_S
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, markers, page_of, robot, tracks

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from ipsys_log.capture.live_check import FrameCheck
+from ipsys_log.capture.simulation.settings import grid_names
 from ipsys_log.messages import CameraModel, Model, RigMarker
-from ipsys_log.simulation.settings import grid_names
 from tests.web.contrast import low_contrasts
 from tests.web.dashboards import RIG, LiveLab, event, frame, markers, page_of, robot, tracks
 from tests.web.phone import Phone

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.app.first_day.lab_folder import LabFolder
+from ipsys_log.app.web.first_day.app import SetupApp
+from ipsys_log.app.web.server import serve_app
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
-from ipsys_log.first_day.lab_folder import LabFolder
 from ipsys_log.log.dataset import Session
-from ipsys_log.web.first_day.app import SetupApp
-from ipsys_log.web.server import serve_app
 from tests.capture.nodes.tcp_relay import Relay
 from tests.ports import free_port
 from tests.waiting import wait_until

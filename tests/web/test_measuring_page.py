@@ -10,7 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.app.web.server import serve
+from ipsys_log.engine.options import Request
 from ipsys_log.errors import LogError
+from ipsys_log.live_runs.survey.from_log import FinishedLog, open_finished_log
+from ipsys_log.live_runs.survey.scene import CameraView, StationaryInterval
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraPoint,
@@ -24,10 +28,6 @@ from ipsys_log.messages import (
     RigMarker,
 )
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.runs.options import Request
-from ipsys_log.survey.from_log import FinishedLog, open_finished_log
-from ipsys_log.survey.scene import CameraView, StationaryInterval
-from ipsys_log.web.server import serve
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import as_typed, foreign_read

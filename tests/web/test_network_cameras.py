@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.app.first_day.lab_folder import LabFolder
+from ipsys_log.app.web.first_day.app import SetupApp
+from ipsys_log.app.web.server import serve_app
 from ipsys_log.capture.nodes import centre
 from ipsys_log.capture.nodes.network import NodeNetwork
-from ipsys_log.first_day.lab_folder import LabFolder
-from ipsys_log.rig.file import load_rig
-from ipsys_log.web.first_day.app import SetupApp
-from ipsys_log.web.server import serve_app
+from ipsys_log.messages.rig_file import load_rig
 from tests.capture.nodes.lab_of_nodes import sending
 from tests.capture.streams import encode, make_jpegs
 from tests.capture.test_rtsp import CODECS, HAS_SERVER, served

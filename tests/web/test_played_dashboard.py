@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
+from ipsys_log.app.web.dashboard.app import dashboard_of_player
+from ipsys_log.app.web.dashboard.pictures import EVERY_NS
+from ipsys_log.app.web.dashboard.state import PlayedLog
+from ipsys_log.live_runs.player import Player
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import LATENCY, TRACKS
-from ipsys_log.player import Player
 from ipsys_log.sinks.playback import PlaybackOptions
-from ipsys_log.web.dashboard.app import dashboard_of_player
-from ipsys_log.web.dashboard.pictures import EVERY_NS
-from ipsys_log.web.dashboard.state import PlayedLog
 from tests.cli.test_stream_command import started, stop
 from tests.conftest import Ipsys
 from tests.sinks.streaming import write_tracks

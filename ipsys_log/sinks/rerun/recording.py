@@ -10,8 +10,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.disagreement import read_disagreement, reference_ids
-from ipsys_log.analysis.pairs import locate_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC
@@ -29,6 +27,8 @@ from ipsys_log.sinks.rerun.scene import (
 )
 from ipsys_log.sinks.rerun.viewer import show_in_viewer
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
+from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
+from ipsys_log.statistics.pairs import locate_measurements
 
 # The entities above the series; each has its own plot.
 DISAGREEMENT = "series/disagreement"

@@ -10,9 +10,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ipsys_log.analysis.pairs import KINDS, Place
 from ipsys_log.messages import Floor, Rig
 from ipsys_log.sinks.colours import KIND_COLOURS
+from ipsys_log.statistics.pairs import KINDS, Place
 
 # The viewer shows the first timeline; the times in the payloads belong to it.
 TIMELINES = ("publish_time", "log_time")

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.rotations import quaternion
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
-from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.rotations import quaternion
 
 if TYPE_CHECKING:
-    from ipsys_log.geometry.posed_camera import PosedCamera
+    from ipsys_log.vision.posed_camera import PosedCamera
 
 # Jazzy and Kilted have the same definitions of these messages.
 _STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from ipsys_log.errors import FrameError
-from ipsys_log.images.decode import decode_colour
-from ipsys_log.images.video import Video
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, RawImage
 from ipsys_log.sinks.colours import MARKER_COLOUR
 from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
+from ipsys_log.vision.decode import decode_colour
+from ipsys_log.vision.video import Video
 
 _GROUND: RGB = (16, 16, 19)
 _TITLE: RGB = (44, 44, 50)

@@ -11,9 +11,6 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.errors import FrameError, IpsysError, SizeError
-from ipsys_log.geometry.lenses import check_calibration, check_size, same_intrinsics
-from ipsys_log.images.decode import decode_grey
-from ipsys_log.images.video import Video
 from ipsys_log.messages import (
     CameraCalibration,
     Color,
@@ -41,6 +38,7 @@ from ipsys_log.messages.channels import (
 )
 from ipsys_log.messages.events import skipped_frames
 from ipsys_log.messages.stage import Pieces, Plan, Resets, Stage, StageView
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.stages.detect.misprints import Inspection, Misprints
@@ -55,7 +53,9 @@ from ipsys_log.stages.detect.reports import (
     SeenSquares,
 )
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
-from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.decode import decode_grey
+from ipsys_log.vision.lenses import check_calibration, check_size, same_intrinsics
+from ipsys_log.vision.video import Video
 
 EDGES, STOCK = CORNERS = ("edges", "stock")
 

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array, Grey
-from ipsys_log.geometry.lenses import project
-from ipsys_log.images.decode import levels_at
+from ipsys_log.messages.arrays import Array, Grey
 from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import MarkerView, Poses
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES
+from ipsys_log.vision.decode import levels_at
+from ipsys_log.vision.lenses import project
 
 # Prior weights: squared pixels per squared unit of each unknown: translation and rotation, edge offset,
 # speed. A marker directly below the camera has an unobservable tilt, which keeps its value.

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array, Grey
+from ipsys_log.messages.arrays import Array, Grey
 
 Samples = NDArray[np.float32]
 

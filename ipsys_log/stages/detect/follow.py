@@ -6,12 +6,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ipsys_log.arrays import Array, Grey
-from ipsys_log.geometry.lenses import check_size, project, undistort
-from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.square_pose import is_convex, solve_squares
-from ipsys_log.images.decode import decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
+from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.changes import ChangeDetector
 from ipsys_log.stages.detect.edges import fit_edges
@@ -27,7 +24,10 @@ from ipsys_log.stages.detect.search import (
     search_thoroughly,
     search_unexplained_areas,
 )
-from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.decode import decode_rows
+from ipsys_log.vision.lenses import check_size, project, undistort
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.square_pose import is_convex, solve_squares
 
 # Number of frames between two searches of the whole image, and between two thorough searches at full size.
 _SEARCH_EVERY = 20

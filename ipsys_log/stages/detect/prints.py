@@ -8,8 +8,8 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array
-from ipsys_log.geometry.markers import marker_corners, white_cells
+from ipsys_log.messages.arrays import Array
+from ipsys_log.vision.markers import marker_corners, white_cells
 
 # Positions of points along the side of a cell, away from its corners, because the blur rounds the corners.
 _ALONG_CELL = np.array([0.3, 0.7])

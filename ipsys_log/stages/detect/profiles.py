@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array, Grey
-from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.poses import rotation
-from ipsys_log.images.decode import levels_at
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.messages.arrays import Array, Grey
 from ipsys_log.stages.detect.prints import Prints
+from ipsys_log.vision.decode import levels_at
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.poses import rotation
 
 # In grey levels: a smaller rise is no edge.
 LEAST_CONTRAST = 8.0

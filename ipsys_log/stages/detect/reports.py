@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.analysis.intrinsics_test import IntrinsicsTest
 from ipsys_log.errors import SizeError
-from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, MIRRORED, OTHER_PRINTS
+from ipsys_log.statistics.intrinsics_test import IntrinsicsTest
+from ipsys_log.vision.lenses import same_intrinsics
 
 NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER = ("no_keyframe", "rejected_marker", "unknown_marker")
 _ONCE = (NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER, MIRRORED, OTHER_PRINTS)

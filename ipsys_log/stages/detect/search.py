@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.arrays import Array, Grey
-from ipsys_log.geometry.markers import white_cells
-from ipsys_log.images.decode import levels_at
+from ipsys_log.messages.arrays import Array, Grey
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES, count_contradictions
+from ipsys_log.vision.decode import levels_at
+from ipsys_log.vision.markers import white_cells
 
 _SHRINK = 3
 # Window of the threshold at that scale. It is wider than the black border of a marker.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ipsys_log.arrays import Grey
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.markers import white_cells
 from ipsys_log.messages import Marker
+from ipsys_log.messages.arrays import Grey
 from ipsys_log.stages.detect.search import count_wrong_cells, read_cells
+from ipsys_log.vision.markers import white_cells
 
 # OpenCV corrects wrong cells, up to three of 6x6, and a third of the border. More than one is another print.
 _WRONG_CELLS = 1

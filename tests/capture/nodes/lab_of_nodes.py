@@ -16,9 +16,9 @@ from ipsys_log.capture.frames import Clock, Frame, Say, SourceMessage
 from ipsys_log.capture.nodes.centre import Centre
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
+from ipsys_log.engine.output import write_message
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ClockEstimate, CompressedImage, Event, Message, RigCamera, image_topic
-from ipsys_log.runs.output import write_message
 from tests.ports import free_port
 from tests.waiting import wait_until
 

@@ -16,13 +16,13 @@ from itertools import count
 import numpy as np
 import simplejpeg
 
+from ipsys_log.app.cli import main
 from ipsys_log.capture import camera_thread
 from ipsys_log.capture.devices import OPENERS
 from ipsys_log.capture.frames import Clock, Frame, Say
 from ipsys_log.capture.nodes import centre, node
-from ipsys_log.cli import main
 from ipsys_log.messages import RigCamera
-from ipsys_log.units import NS_PER_S
+from ipsys_log.messages.units import NS_PER_S
 
 PATIENCE_S, PERIOD_S = 600.0, 0.05
 _COMMENT = b"\xff\xfe\x00\x0a"

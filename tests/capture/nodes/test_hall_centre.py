@@ -11,20 +11,21 @@ from threading import Event, Thread
 
 import pytest
 
-from ipsys_log import __version__, pipeline
+from ipsys_log import __version__
 from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.frames import Clock, Open, Say
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
+from ipsys_log.capture.simulation.settings import hall_settings
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.output import write_log
+from ipsys_log.live_runs import pipeline
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Markers, Message, RigCamera, RigNodes, Tracks
 from ipsys_log.messages.channels import EVENTS, MARKERS, POSITIONS, TRACKS
-from ipsys_log.runs.options import Request
-from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.settings import hall_settings
 from tests.capture.nodes.lab_of_nodes import PATIENCE_S
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

@@ -1,0 +1,222 @@
+"""Contents of a log: ``ipsys info`` and ``ipsys cat``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ipsys_log.app.cli.console import console, print_json, progress_bar, say
+from ipsys_log.app.cli.options import AsJson, ReadLogs, figure_option
+from ipsys_log.app.cli.signals import writes_nothing
+from ipsys_log.plain_text import shell_words
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.log.location import LogLocation
+
+_Seconds = float | None
+
+
+@writes_nothing
+def info(
+    logs: ReadLogs,
+    runs: Annotated[
+        bool,
+        typer.Option("--runs", help="Show the runs with their inputs, parameters, versions and states."),
+    ] = False,
+    sizes: Annotated[
+        bool, typer.Option("--sizes", help="Show the size of each channel of each log, the largest first.")
+    ] = False,
+    latency: Annotated[
+        bool,
+        typer.Option(
+            "--latency",
+            help="Show the latency of each step of a live run, from the frame to the position.",
+        ),
+    ] = False,
+    plot: Annotated[Path | None, figure_option("the processing steps of --latency")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show cameras, channels, counts, rates, gaps and runs of a log.
+
+    A run is current, out of date, not repeatable or unfinished. If it is out of date, the reason follows, and
+    ipsys replay makes a new run. Inputs of a run that is not repeatable are not in the log. The writer of an
+    unfinished run was stopped.
+
+    In --sizes, the payload is counted before compression. A compressed chunk counts in proportion to the
+    bytes of its messages.
+
+    Examples
+
+        ipsys info monday.mcap
+        ipsys info monday.mcap --runs --sizes
+        ipsys info monday.mcap --latency --plot latency.pdf
+        ipsys info s3://lab/monday.mcap          # at a URL: docs/scale.md
+    """
+    from ipsys_log.errors import IpsysError
+
+    if plot is not None and not latency:
+        raise IpsysError(f"--plot {plot}: has no effect without --latency; add --latency")
+    parts: dict[str, Callable[[], tuple[Any, list[RenderableType]]]] = {}
+    if runs:
+        parts["runs"] = lambda: _runs(logs)
+    if sizes:
+        parts["sizes"] = lambda: _sizes(logs)
+    if latency:
+        parts["latency"] = lambda: _latency(logs, plot)
+    shown = {name: show() for name, show in (parts or {"": lambda: _contents(logs)}).items()}
+    if as_json:
+        results = {name: plain for name, (plain, _) in shown.items()}
+        print_json(results if len(results) > 1 else next(iter(results.values())))
+        return
+    for number, table in enumerate(table for _, tables in shown.values() for table in tables):
+        if number:
+            console.print()
+        console.print(table)
+
+
+def _contents(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
+    """Return the contents of a session as plain data and as tables."""
+    from ipsys_log.app.report.contents import contents_json, contents_tables
+    from ipsys_log.log.dataset import Session
+
+    with Session(logs) as session:
+        contents = contents_json(session)
+    return contents, [*contents_tables(contents)]
+
+
+def _runs(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
+    from ipsys_log.app.report.contents import runs_table, states_json
+    from ipsys_log.log.dataset import Session
+
+    with Session(logs) as session:
+        states = states_json(session)
+    return states, [runs_table(states)]
+
+
+def _sizes(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
+    from ipsys_log.app.report.log_texts import sizes_json, sizes_table
+    from ipsys_log.log.reader import LogReader
+
+    def read(path: LogLocation) -> dict[str, Any]:
+        with LogReader(path) as reader, progress_bar(()) as progress:
+            sizes = reader.sizes(lambda done: progress("chunks", done, reader.chunk_count))
+            return sizes_json(str(path), reader.size, sizes)
+
+    results = [read(path) for path in logs]
+    return results, [sizes_table(result) for result in results]
+
+
+def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[RenderableType]]:
+    from dataclasses import asdict
+
+    from ipsys_log.app.report.cameras import latency_table
+    from ipsys_log.app.report.files import check_figure_file
+    from ipsys_log.statistics.latency import latency_percentiles, recorded_latencies, step_times_s
+
+    if plot is not None:
+        check_figure_file(plot, "--plot", logs)
+    times_s = step_times_s(recorded_latencies(logs))
+    steps = latency_percentiles(times_s)
+    if plot is not None:
+        from ipsys_log.app.report.latency_figure import draw_latency
+
+        draw_latency(times_s, plot)
+        say(f"{plot} drawn")
+    return {step: asdict(times) for step, times in steps.items()}, [latency_table(steps)]
+
+
+@writes_nothing
+def cat(
+    logs: ReadLogs,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option("--topics", metavar="TOPIC,...", help="Print only these topics, separated by commas."),
+    ] = None,
+    start_secs: Annotated[
+        _Seconds,
+        typer.Option("--start-secs", metavar="SECONDS", help="Begin at this log time since 1970, in UTC."),
+    ] = None,
+    end_secs: Annotated[
+        _Seconds,
+        typer.Option("--end-secs", metavar="SECONDS", help="End before this log time since 1970, in UTC."),
+    ] = None,
+    start_offset: Annotated[
+        _Seconds,
+        typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first message."),
+    ] = None,
+    end_offset: Annotated[
+        _Seconds,
+        typer.Option("--end-offset", metavar="SECONDS", help="End so long after the first message."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the messages of a log in log order, one line each: time (UTC), topic, schema and short content.
+
+    With --json, each line is a JSON object with all values; images are given by their size.
+
+    Examples
+
+        ipsys cat monday.mcap --topics /events,/latency
+        ipsys cat monday.mcap --start-offset 10 --end-offset 12 | less
+        ipsys cat monday.mcap --topics /runs/poly/tracks --json > tracks.ndjson
+    """
+    from ipsys_log.app.report.log_texts import message_json, message_line
+    from ipsys_log.log.dataset import Session
+
+    draw = message_json if as_json else message_line
+    with Session(logs) as session:
+        channels = {
+            topic: channel for reader in session.readers for topic, channel in reader.channels.items()
+        }
+        wanted = _wanted(session, topics or [])
+        starts_ns = [_ns(start_secs), _ns(start_offset, session.start_ns)]
+        ends_ns = [_ns(end_secs), _ns(end_offset, session.start_ns)]
+        start_ns = max((time for time in starts_ns if time is not None), default=None)
+        end_ns = min((time for time in ends_ns if time is not None), default=None)
+        try:
+            for raw, message in session.attempts(wanted, start_ns, end_ns):
+                print(draw(raw, message, channels[raw.topic]))  # noqa: T201
+            sys.stdout.flush()
+        except BrokenPipeError:  # the reader of the pipe, such as head, has ended
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _wanted(session: Session, topics: list[str]) -> list[str]:
+    """Return the topics to print: those of the options, or all that can be read."""
+    from ipsys_log.errors import IpsysError
+
+    known = {topic for reader in session.readers for topic in reader.channels}
+    named = [topic for words in topics for topic in words.split(",") if topic]
+    for topic in named:
+        if topic not in known:
+            raise IpsysError(
+                f"{session}: has no topic {topic}; to list the topics: "
+                f"ipsys info {shell_words(*session.paths)}"
+            )
+    return named or sorted(known)
+
+
+def _ns(seconds: float | None, start_ns: int = 0) -> int | None:
+    """Return the time in ns that lies `seconds` after `start_ns`; None without an option.
+
+    Raises
+    ------
+    IpsysError
+        The value is not a number of seconds of these centuries.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.messages.units import NS_PER_S
+
+    if seconds is None:
+        return None
+    if not 0 <= seconds < 1e10:
+        raise IpsysError(f"{seconds:g} s is no time in a log; give seconds from 0 on")
+    return start_ns + round(seconds * NS_PER_S)

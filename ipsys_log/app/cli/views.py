@@ -1,0 +1,260 @@
+"""Views of a log in other programs: ``ipsys view``, ``report`` and ``export``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ipsys_log.app.cli.console import console, progress_bar, say
+from ipsys_log.app.cli.options import ReadLogs
+from ipsys_log.app.cli.stages import MORE, build_command, derive, options_until
+
+if TYPE_CHECKING:
+    from ipsys_log.log.location import LogLocation
+
+_COUNTED = ("bag", "video", "pictures")
+Runs = Annotated[
+    list[str] | None,
+    typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),
+]
+Save = Annotated[
+    Path | None,
+    typer.Option(
+        "--save", metavar="FILE", help="Write a Rerun recording (.rrd) instead of opening the viewer."
+    ),
+]
+FoxgloveLayout = Annotated[
+    Path | None,
+    typer.Option(
+        "--foxglove-layout",
+        metavar="FILE",
+        help="Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
+    ),
+]
+_HTML = (
+    Annotated[
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="The page to write. Default: the log's name with .html."),
+    ],
+    None,
+)
+_REPORT = f"""
+Write an HTML page on a session: its accuracy, its recording and its runs.
+
+The page needs no network. Without calibration points, it has no accuracy. For a log of ipsys drive, it has
+the errors of the robots, and figure 12 of the paper.{MORE}
+
+Examples
+
+    ipsys report calibration.mcap                      # calibration.html
+"""
+
+
+def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: FoxgloveLayout = None) -> None:
+    """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun.
+
+    Examples
+
+        ipsys view monday.mcap                             # the newest run
+        ipsys view monday.mcap --run poly --save monday.rrd
+    """
+    from ipsys_log.extras import check_installed
+    from ipsys_log.log.dataset import Session
+
+    if foxglove_layout is not None:
+        _write_layout(logs, run or (), foxglove_layout)
+        if save is None:
+            return
+    check_installed("view needs", "rerun")
+    if save is not None:
+        _check_save(save, logs)
+    from ipsys_log.engine.states import out_of_date_lines
+    from ipsys_log.sinks.rerun.recording import write_recording
+
+    with Session(logs) as session:
+        shown = write_recording(session, run or (), save)
+        for line in out_of_date_lines(session, [shown.markers, *shown.runs]):
+            say(line)
+    for kind, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
+        named = ", ".join(name for name in names if name)
+        if named:
+            say(f"{kind:<21} run {named}")
+    if save is not None:
+        say(f"{save} written; to view it: rerun {save}")
+
+
+def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
+    from ipsys_log.app.report.files import check_file
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.atomic_files import replacement_of
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.sinks.foxglove_layout import make_layout
+
+    if path.suffix != ".json":
+        raise IpsysError(f"--foxglove-layout {path}: a layout ends in .json; use {path.stem}.json")
+    check_file(path, "--foxglove-layout", logs)
+    with Session(logs) as session:
+        layout = make_layout(session, runs)
+    with replacement_of(path) as file:
+        file.write(json.dumps(layout, indent=2).encode() + b"\n")
+    say(f"{path} written; in Foxglove: Layouts, Import from file")
+
+
+def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
+    """Check that a recording can be written, and that Rerun will open it by its name."""
+    from ipsys_log.app.report.files import check_file
+    from ipsys_log.errors import IpsysError
+
+    if save.suffix != ".rrd":
+        raise IpsysError(f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd")
+    check_file(save, "--save", logs)
+
+
+def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:
+    from ipsys_log.app.report.files import check_file, write_files
+    from ipsys_log.extras import check_installed
+
+    check_installed("report needs", "matplotlib", "jinja2")
+    from ipsys_log.log.location import file_beside
+
+    target = html or file_beside(output or logs[-1], ".html")
+    check_file(target, "--html", [*logs, *([output] if output else [])])
+    if _report_robots(logs, target):
+        return
+    if _report_recording(logs, target):
+        return
+    from ipsys_log.app.report.html import render_report
+
+    with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
+        write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
+    console.print(f"{target} written: open it in a browser")
+
+
+def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
+    """Write the page of a session without calibration points; return False if the logs have some."""
+    from ipsys_log.app.report.files import write_files
+    from ipsys_log.app.report.html import render_report
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import MEASUREMENTS
+
+    with Session(logs) as session:
+        if session.topics(MEASUREMENTS):
+            return False
+        page = render_report(session, ())
+    write_files(target.parent, {target.name: page.encode()})
+    console.print(f"{target} written: open it in a browser")
+    say("the session has no calibration points: the page shows the recording and its runs")
+    return True
+
+
+def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
+    """Write the page and the figure of a robot run; return False if the logs have none."""
+    from ipsys_log.app.report.files import check_file, write_files
+    from ipsys_log.app.report.robot_run import render_robot_run
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.tools.robot_run import has_robot_run
+
+    with Session(logs) as session:
+        if not has_robot_run(session):
+            return False
+        picture = target.with_suffix(".png")
+        check_file(picture, "--html", logs)
+        page, panels = render_robot_run(session)
+    write_files(target.parent, {target.name: page.encode(), picture.name: panels})
+    console.print(f"{target} and {picture} written")
+    return True
+
+
+_options = options_until("evaluate")
+del _options["as_json"]
+report = build_command("report", _REPORT, {**_options, "html": _HTML}, _report)
+
+
+def export(
+    logs: ReadLogs,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
+            "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
+        ),
+    ],
+    format_: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
+        ),
+    ] = None,
+    table: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
+        ),
+    ] = "tracks",
+    run: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--run", metavar="NAME", help="Export this run instead of the newest; repeat it for several."
+        ),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Export only this robot."),
+    ] = None,
+    without_images: Annotated[
+        bool, typer.Option("--without-images", help="Leave the images out of a ROS 2 bag.")
+    ] = False,
+    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames per second of a video.")] = 25.0,
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a video in pixels, two even numbers.")
+    ] = "1280x720",
+) -> None:
+    """Export positions, images or another channel to a file for other programs.
+
+    A table has one row for each robot and instant; units are in the names of the columns, times are in UTC. A
+    ROS 2 bag has images, intrinsics, poses, odometry and transforms. A video shows the cameras with their
+    markers, and the robots on the floor. A COCO data set has the images and the corners of their markers.
+
+    Examples
+
+        ipsys export monday.mcap -o tracks.csv
+        ipsys export monday.mcap -o tracks.parquet --run poly --run best
+        ipsys export monday.mcap -o robot.tum --robot robot_0    # for evo
+        ipsys export monday.mcap -o truth.tum --robot robot_0 --table truth
+        ipsys export monday.mcap -o bag.mcap --format ros2       # with images
+        ipsys export monday.mcap -o view.mp4 --size 1920x1080
+        ipsys export monday.mcap -o markers --format coco        # a new folder
+    """
+    from ipsys_log.api import python_api as api
+    from ipsys_log.api.log_export import find_format, parse_size
+    from ipsys_log.app.report.files import check_file
+
+    wanted = find_format(output, format_)
+    if wanted.suffix is not None:
+        check_file(output, "-o", logs)
+    with api.open(*logs) as log, progress_bar(_COUNTED) as progress:
+        exported = log.export(
+            output,
+            table,
+            run,
+            robot,
+            format=format_,
+            with_images=not without_images,
+            rate_hz=frame_rate,
+            size_px=parse_size(size),
+            progress=progress,
+        )
+    console.print(
+        f"{output} written: {exported.rows} {exported.content}"
+        + (f", run {' and '.join(exported.runs)}" if exported.runs else "")
+    )

@@ -1,0 +1,199 @@
+"""The folder of a lab: the names of its files, and the facts in its logs that tell the finished steps."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from ipsys_log.app.first_day.alignment import AlignmentResult, read_result
+from ipsys_log.app.first_day.outlier_points import OutlierPoint, find_outlier_points
+from ipsys_log.app.report.accuracy import Accuracy
+from ipsys_log.app.report.summary import answer_json, answer_text
+from ipsys_log.engine.graph import writes
+from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.states import recorded_stages
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.lab_files import tape_sheet_path
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import LATENCY_TOPIC
+from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, TRACKS
+from ipsys_log.statistics.pairs import active_measurements
+
+# The names of logs of an alignment begin with this.
+ALIGNMENT_LOG = "alignment"
+_SUFFIX = ".mcap"
+_MOST_LOGS = 200
+_Stamp = tuple[tuple[str, int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogFacts:
+    """The facts of a log.
+
+    Attributes
+    ----------
+    points : number of calibration points that are not withdrawn.
+    tracked : number of messages with tracks of a live recording.
+    alignment : the result of an alignment; None for other logs.
+    fault : the reason if the log cannot be read.
+    """
+
+    path: Path
+    start_ns: int = 0
+    points: int = 0
+    tracked: int = 0
+    alignment: AlignmentResult | None = None
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FitFacts:
+    """The newest evaluation of the calibration logs.
+
+    ``answer`` are the sentences of ``ipsys replay``, ``mean_m`` the mean distance to the tape points.
+    ``outliers`` are the points that contradict the fit. ``stale`` is the reason if the evaluation is out of
+    date; "" if it is current.
+    """
+
+    run: str
+    stale: str
+    answer: tuple[str, ...]
+    mean_m: float | None
+    outliers: tuple[OutlierPoint, ...]
+
+
+class LabFolder:
+    """A folder with ``lab.toml``, intrinsics and logs. Any thread may read it.
+
+    Parameters
+    ----------
+    path : the folder; it exists.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rig_file = path / "lab.toml"
+        self._facts: dict[_Stamp, LogFacts] = {}
+        self._fits: dict[_Stamp, FitFacts | None] = {}
+        self._lock = threading.Lock()
+        self._writing: Path | None = None
+
+    @property
+    def sheet(self) -> Path | None:
+        """The sheet of tape measurements of the simulated lab; None if there is none."""
+        sheet = tape_sheet_path(self.rig_file)
+        return sheet if sheet.exists() else None
+
+    def new_log(self, name: str) -> Path:
+        """Return the path of a new log, such as ``live.mcap``, ``live_2.mcap`` and so on.
+
+        Until :meth:`finish_log`, the log does not count: it is being written.
+        """
+        number, path = 1, self.path / f"{name}{_SUFFIX}"
+        while path.exists():
+            number += 1
+            path = self.path / f"{name}_{number}{_SUFFIX}"
+        self._writing = path
+        return path
+
+    def new_board_folder(self, camera: str) -> Path:
+        """Make and return a folder for pictures of a board: ``boards/red``, ``boards/red_2`` and so on."""
+        number, path = 1, self.path / "boards" / camera
+        while path.exists():
+            number += 1
+            path = self.path / "boards" / f"{camera}_{number}"
+        path.mkdir(parents=True)
+        return path
+
+    def finish_log(self) -> None:
+        """Note that no log is being written."""
+        self._writing = None
+
+    def logs(self) -> list[LogFacts]:
+        """Return the facts of all finished logs, in the order of their time."""
+        paths = sorted(self.path.glob(f"*{_SUFFIX}"))[:_MOST_LOGS]
+        with self._lock:
+            facts = [self._read(path) for path in paths if path != self._writing]
+        return sorted((one for one in facts if one is not None), key=lambda one: (one.start_ns, one.path))
+
+    def calibration_logs(self) -> list[Path]:
+        """Return the logs with calibration points, in the order of their time."""
+        return [log.path for log in self.logs() if log.points]
+
+    def fit(self) -> FitFacts | None:
+        """Return the newest evaluation of the calibration logs; None if there is none."""
+        paths = self.calibration_logs()
+        stamp = _stamp(paths)
+        if not paths or stamp is None:
+            return None
+        with self._lock:
+            if stamp not in self._fits:
+                self._fits = {stamp: _read_fit(paths)}
+            return self._fits[stamp]
+
+    def _read(self, path: Path) -> LogFacts | None:
+        """Return the facts of a log, read again only if the file has changed."""
+        stamp = _stamp([path])
+        if stamp is None:
+            return None
+        if stamp not in self._facts:
+            self._facts = {key: facts for key, facts in self._facts.items() if facts.path != path}
+            self._facts[stamp] = _read_facts(path)
+        return self._facts[stamp]
+
+
+def _stamp(paths: Sequence[Path]) -> _Stamp | None:
+    """Return names, sizes and times of files; None if one of them has vanished."""
+    with suppress(FileNotFoundError):
+        stats = [(path.name, path.stat()) for path in paths]
+        return tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats)
+    return None
+
+
+def _read_facts(path: Path) -> LogFacts:
+    try:
+        with Session([path]) as session:
+            points = len(active_measurements(session.payloads(session.topics(MEASUREMENTS))))
+            # Only a live recording has latencies; the run of a replay does not count.
+            run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
+            tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
+            alignment = None if points or tracked else _read_alignment(session, path)
+            return LogFacts(path, session.start_ns, points, tracked, alignment)
+    except (IpsysError, OSError) as error:
+        return LogFacts(path, fault=str(error))
+
+
+def _read_alignment(session: Session, path: Path) -> AlignmentResult | None:
+    run = newest_run(session, CAMERA_POINTS) if path.stem.startswith(ALIGNMENT_LOG) else None
+    return None if run is None else read_result(session, run)
+
+
+def _read_fit(paths: Sequence[Path]) -> FitFacts | None:
+    try:
+        with Session(paths) as session:
+            stages = [one for one in recorded_stages(session) if writes(one.run, EVALUATION)]
+            if not stages:
+                return None
+            newest = stages[-1]
+            run = newest.run.run
+            evaluations = session.payloads(session.topics(EVALUATION, run))
+        if not evaluations:
+            return None
+        accuracies = [Accuracy(run, evaluations[-1], None)]
+        outliers = find_outlier_points(paths, accuracies)
+    except IpsysError:
+        return None
+    stale = newest.state.partition(": ")[2] if newest.out_of_date else ""
+    mean_m = answer_json(accuracies).get("answer", {}).get("mean_m")
+    return FitFacts(run, stale, _sentences(accuracies), mean_m, outliers)
+
+
+def _sentences(accuracies: Sequence[Accuracy]) -> tuple[str, ...]:
+    """Return the lines of the answer, each sentence on one line."""
+    answer = answer_text(accuracies)
+    if answer is None:
+        return ()
+    return tuple(" ".join(str(line).split()) for line in answer.renderables)

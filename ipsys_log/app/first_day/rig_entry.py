@@ -1,0 +1,238 @@
+"""Typed fields of a rig, and their faults: marker, floor, reference points and robots."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from ipsys_log.app.first_day.rig_text import replace_tables, replace_values, write_rig
+from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.entry import Fault
+from ipsys_log.messages import Floor, ReferencePoint, Rig, RigMarker
+from ipsys_log.messages.rig_checks import check_units
+from ipsys_log.messages.rig_file import check_rig, example_toml, load_rig
+from ipsys_log.stages.detect.stock import marker_detector
+
+_FILE = "lab.toml"
+_USUAL = ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 1.0, 0.0)
+_LONGEST_FIELD = 200
+# Larger factors from an error of the tape to an error of the position are worth a warning.
+_MOST_GROWTH = 6.0
+# The fields of the form: key, label.
+LABELS = {
+    "name": "Name of the lab",
+    "dictionary": "Dictionary of the markers",
+    "marker_length_m": "Side of the black square, in m",
+    "robots": "Marker ids of robots: 0, 1, 2",
+    "width_m": "Floor width, in m",
+    "depth_m": "Floor depth, in m",
+    "first_x_m": "Point A: x, in m",
+    "first_y_m": "Point A: y, in m",
+    "second_x_m": "Point B: x, in m",
+    "second_y_m": "Point B: y, in m",
+}
+_NUMBERS = [key for key in LABELS if key.endswith("_m")]
+
+
+def example_rig() -> Rig:
+    """Return the rig of the example that ``ipsys init`` writes."""
+    return _in_memory(example_toml())
+
+
+def rig_fields(rig: Rig) -> dict[str, str]:
+    """Return the text of each field for a rig; a missing value is an empty text."""
+    first, second = (*rig.reference_points[:2], *_USUAL[len(rig.reference_points) :])
+    values: dict[str, Any] = {
+        "name": rig.name,
+        "dictionary": rig.dictionary,
+        "marker_length_m": rig.marker_length_m,
+        "robots": ", ".join(str(marker.id) for marker in rig.markers if marker.robot),
+        "width_m": rig.floor.width_m if rig.floor else "",
+        "depth_m": rig.floor.depth_m if rig.floor else "",
+        "first_x_m": first.x_m,
+        "first_y_m": first.y_m,
+        "second_x_m": second.x_m,
+        "second_y_m": second.y_m,
+    }
+    return {key: f"{value:g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+
+
+def check_rig_entry(typed: Mapping[str, str], rig: Rig) -> tuple[Rig | None, list[Fault]]:
+    """Return the typed rig, or the faults of its fields in the words of the rig file.
+
+    Parameters
+    ----------
+    typed : texts by field; a missing field keeps the value of ``rig``.
+    rig : the present rig; its cameras, its other markers and its other reference points stay.
+    """
+    texts = {key: typed.get(key, text).strip()[:_LONGEST_FIELD] for key, text in rig_fields(rig).items()}
+    faults: list[Fault] = []
+    values: dict[str, Any] = {}
+    for key, text in texts.items():
+        try:
+            values[key] = _value(key, text)
+            _check_alone(key, values[key], values.get("dictionary", rig.dictionary))
+        except IpsysError as error:
+            faults.append(Fault(key, _without_key(str(error))))
+    # The valid fields are checked together, beside the present values of the others: one answer names all
+    # faults.
+    wrong = {fault.field for fault in faults}
+    present = {key: _value(key, text) for key, text in rig_fields(rig).items() if key in wrong and text}
+    new = None if wrong - set(present) else _build({**values, **present}, rig)
+    if new is not None:
+        faults += [fault for fault in _check_together(new) if fault.field not in wrong]
+    return (None, faults) if faults else (new, [])
+
+
+def _check_together(rig: Rig) -> list[Fault]:
+    """Return the fault of values that contradict each other."""
+    try:
+        check_rig(rig, _FILE)
+        check_units(rig, _FILE)
+    except IpsysError as error:
+        text = _without_key(str(error))
+        return [Fault("second_x_m" if "reference points" in text else "robots", text)]
+    return []
+
+
+def _without_key(text: str) -> str:
+    """Return the text of an error beside its field, which has a label: without the key of the rig file."""
+    return re.sub(r"^(lab\.toml: )?(\[floor\] |reference point A: )?(\w+_m = )?", "", text)
+
+
+def rig_warnings(rig: Rig) -> list[str]:
+    """Return warnings on reference points that are possible, but give poor positions."""
+    points, floor = rig.reference_points, rig.floor
+    if floor is None or len(points) < len(_USUAL):
+        return []
+    warnings = [
+        f"reference point {point.name} is outside the floor"
+        for point in points
+        if not (0 <= point.x_m <= floor.width_m and 0 <= point.y_m <= floor.depth_m)
+    ]
+    apart_m = max(math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) for a, b in combinations(points, 2))
+    # Two circles of radius r around points at a distance b cross at an angle of about b / r.
+    growth = math.hypot(floor.width_m, floor.depth_m) / apart_m
+    if growth > _MOST_GROWTH:
+        warnings.append(
+            f"the reference points are {apart_m:.2f} m apart: far from them, an error of the tape grows by a "
+            f"factor of up to {growth:.0f}; choose them further apart"
+        )
+    return warnings
+
+
+def save_rig_entry(path: Path, typed: Mapping[str, str]) -> list[Fault]:
+    """Write a typed rig into the rig file, which is made if it does not exist; return faults instead.
+
+    Raises
+    ------
+    IpsysError
+        The present rig file has a fault, or cannot be changed.
+    """
+    text = path.read_text(encoding="utf-8") if path.exists() else example_toml()
+    old = load_rig(path) if path.exists() else example_rig()
+    new, faults = check_rig_entry(typed, old)
+    if new is None:
+        return faults
+    values = {key: getattr(new, key) for key in ("name", "dictionary", "marker_length_m")}
+    text = replace_values(text, values)
+    for header, key in (("[[markers]]", "markers"), ("[[reference_points]]", "reference_points")):
+        if getattr(new, key) != getattr(old, key):
+            text = replace_tables(text, header, getattr(new, key))
+    if new.floor != old.floor:
+        text = replace_tables(text, "[floor]", [new.floor])
+    write_rig(path, text, new)
+    return []
+
+
+def _in_memory(text: str) -> Rig:
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory(prefix="ipsys-") as folder:
+        path = Path(folder) / _FILE
+        path.write_text(text, encoding="utf-8")
+        return load_rig(path)
+
+
+def _value(key: str, text: str) -> Any:
+    """Return the value of a field.
+
+    Raises
+    ------
+    IpsysError
+        The text is empty, or is not a number.
+    """
+    if key == "robots":
+        return [_marker_id(part) for part in re.split(r"[,;\s]+", text) if part]
+    if not text:
+        raise IpsysError("the field is empty; type a value")
+    if key not in _NUMBERS:
+        return text
+    try:
+        # A field has one number: a comma is its decimal point, as on the measuring page.
+        return float(re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", text))
+    except ValueError as error:
+        raise IpsysError(f"{text} is not a number; write 0.2, for example") from error
+
+
+def _marker_id(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) <= len("9999")):
+        raise IpsysError(f"marker id {text} is not a number; write the ids as 0, 1, 2")
+    return int(text)
+
+
+def _check_alone(key: str, value: Any, dictionary: str) -> None:
+    """Check one value in a rig without the others.
+
+    Raises
+    ------
+    IpsysError
+        The value is impossible, or has another unit.
+    """
+    rig = Rig("lab", "DICT_4X4_100", 0.2)
+    if key == "dictionary":
+        marker_detector(value)
+    field = key.removeprefix("first_").removeprefix("second_")
+    changed: dict[str, Callable[[], Rig]] = {
+        "marker_length_m": lambda: replace(rig, marker_length_m=value),
+        "width_m": lambda: replace(rig, floor=Floor(value, 1.0)),
+        "depth_m": lambda: replace(rig, floor=Floor(1.0, value)),
+        "x_m": lambda: replace(rig, reference_points=(ReferencePoint("A", value, 0.0),)),
+        "y_m": lambda: replace(rig, reference_points=(ReferencePoint("A", 0.0, value),)),
+        "robots": lambda: replace(
+            rig, dictionary=dictionary, markers=tuple(RigMarker(marker_id) for marker_id in value)
+        ),
+    }
+    if field in changed:
+        check_rig(changed[field](), _FILE)
+        check_units(changed[field](), _FILE)
+
+
+def _build(values: Mapping[str, Any], rig: Rig) -> Rig:
+    points = (*rig.reference_points[:2], *_USUAL[len(rig.reference_points) :])
+    placed = [
+        replace(point, x_m=values[f"{order}_x_m"], y_m=values[f"{order}_y_m"])
+        for order, point in zip(("first", "second"), points, strict=True)
+    ]
+    known = {marker.id: marker for marker in rig.markers}
+    robots = dict.fromkeys(values["robots"])
+    named = [_robot(known.get(marker_id, RigMarker(marker_id))) for marker_id in robots]
+    others = [marker for marker in rig.markers if marker.id not in robots and not marker.robot]
+    return replace(
+        rig,
+        name=values["name"],
+        dictionary=values["dictionary"],
+        marker_length_m=values["marker_length_m"],
+        floor=Floor(values["width_m"], values["depth_m"]),
+        reference_points=(*placed, *rig.reference_points[2:]),
+        markers=(*named, *others),
+    )
+
+
+def _robot(marker: RigMarker) -> RigMarker:
+    return marker if marker.robot else replace(marker, robot=f"robot_{marker.id}")

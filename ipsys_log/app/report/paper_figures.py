@@ -1,0 +1,240 @@
+"""The tables and figures of the paper, and some more, as files in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.quiver import Quiver
+
+from ipsys_log.app.report import calibration_figures
+from ipsys_log.app.report.accuracy import Accuracy
+from ipsys_log.app.report.advice import has_published, label
+from ipsys_log.app.report.figures import ERROR_COLOURS, png, scale_logarithmic, style_axes
+from ipsys_log.app.report.files import cross_validation_csv, paper_csv, write_files
+from ipsys_log.app.report.findings import Findings, PointErrors, errors_in, overall_row
+from ipsys_log.app.report.floor_figure import (
+    Square,
+    arrow_factor,
+    draw_arrows,
+    draw_ground,
+    draw_key,
+    show_square,
+    square_around,
+)
+from ipsys_log.app.report.learning_figure import learning_figure, mean_curves, published_figure
+from ipsys_log.app.report.points_figure import draw_hulls, places_figure
+from ipsys_log.app.report.styles import NOTE, model_styles
+from ipsys_log.app.report.tables import height_note
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import ErrorStatistics
+from ipsys_log.messages.arrays import Array
+from ipsys_log.messages.units import CM_PER_M
+
+# Largest factor by which the map is wider than the floor, to make room for arrows.
+_WIDER = 1.12
+
+
+class ResidualScale(NamedTuple):
+    """The scales of floor maps.
+
+    ``most_cm`` is the error in cm of the last colour, ``factor`` the factor of the arrows, and ``square`` the
+    part of the floor.
+    """
+
+    most_cm: float
+    factor: int
+    square: Square
+
+
+def shown_models(findings: Findings) -> list[Accuracy]:
+    """Return the models whose errors are drawn: ``poly``, a well-known model, and the best model.
+
+    Models without residuals are left out. Models with heights as input come last in the ranking.
+    """
+    ranked = [accuracy for accuracy in findings.ranked() if findings.point_errors(accuracy)]
+    poly = [accuracy for accuracy in ranked if accuracy.model == "poly"]
+    return list(dict.fromkeys([*poly, *ranked[:1]]))
+
+
+def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
+    """Return one scale for the maps of all these models, so that the maps can be compared by eye."""
+    missed = [missed for accuracy in accuracies for missed in findings.point_errors(accuracy)]
+    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
+    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
+    square = square_around(findings.rig, [places_m])
+    factor = arrow_factor(list(errors_m), 2 * square.half)
+    # Make room for the arrows, while the floor stays large.
+    reach_m = 1.01 * np.abs(places_m + factor * errors_m - square.middle).max()
+    half_m = float(np.clip(reach_m, square.half, _WIDER * square.half))
+    return ResidualScale(float(np.quantile(lengths_cm, 0.95)), factor, Square(square.middle, half_m))
+
+
+def residuals_figure(findings: Findings) -> Figure:
+    """Return a figure with one floor map per shown model, with the same scale of colours."""
+    accuracies = shown_models(findings)
+    figure = Figure(figsize=(5.6 * len(accuracies) + 0.9, 6.6), layout="constrained")
+    scale = residual_scale(findings, accuracies)
+    panels = figure.subplots(1, len(accuracies), squeeze=False)[0]
+    for axes, accuracy in zip(panels, accuracies, strict=True):
+        arrows = draw_residuals(axes, findings, accuracy, scale)
+    bar = figure.colorbar(arrows, ax=list(panels), shrink=0.8, pad=0.02, extend="max")
+    bar.set_label(f"{'3D' if findings.in_space else '2D'} error in cm")
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=3 * len(panels), frameon=False, fontsize=9,
+            title="area of the calibration points", title_fontsize=9,
+        )  # fmt: skip
+    return figure
+
+
+def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
+    """Draw one model's mean error at each point as an arrow on the floor, coloured by its length in space."""
+    missed = findings.point_errors(accuracy)
+    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
+    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
+    draw_ground(axes, findings.rig, [places_m])
+    draw_hulls(axes, findings)
+    show_square(axes, scale.square)
+    factor = scale.factor
+    # The largest errors are drawn last, on top of the others.
+    order = np.argsort(lengths_cm, kind="stable")
+    places_m, errors_m, lengths_cm = places_m[order], errors_m[order], lengths_cm[order]
+    look = {"cmap": ERROR_COLOURS, "norm": Normalize(0, scale.most_cm)}
+    arrows = draw_arrows(axes, places_m, errors_m, factor, lengths_cm, **look)
+    x_m, y_m = places_m.T
+    axes.scatter(x_m, y_m, c=lengths_cm, s=14, zorder=3.5, lw=0, **look)  # type: ignore[arg-type]
+    draw_key(axes, arrows, factor)
+    scheme = "cross-validated errors" if accuracy.rows(True) else "errors at held-out points"
+    times = f"arrows {factor} times true length" if factor > 1 else ""
+    axes.set_title(f"{label(accuracy.model)}: {scheme}\n{times}", loc="left", fontsize=10)
+    return arrows
+
+
+def _lengths_cm(findings: Findings, missed: PointErrors) -> Array:
+    return missed.lengths_m[:, 0 if findings.in_space else 1] * CM_PER_M
+
+
+_LOG_RATIO = 10.0
+_ROW_IN = 0.34
+HELD_OUT = {"marker": "D", "mfc": "white", "mec": NOTE, "ms": 5.5, "mew": 1.2, "ls": "none"}
+
+
+def models_figure(findings: Findings) -> Figure:
+    """Return a figure with a row per model, the best on top: mean and interval, in space and on the floor."""
+    spaces = (True, False) if findings.in_space else (False,)
+    ranked = findings.ranked()
+    figure = Figure(figsize=(1.8 + 4.2 * len(spaces), 1.7 + _ROW_IN * len(ranked)), layout="constrained")
+    panels = figure.subplots(1, len(spaces), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, in_space in zip(panels, spaces, strict=True):
+        draw_models(axes, ranked, in_space)
+        axes.set_title("3D" if in_space else "2D (on the floor)", fontsize=10, loc="left")
+    dot = Line2D([], [], color="black", marker="o", ms=6, lw=2)
+    held_out = Line2D([], [], **HELD_OUT)  # type: ignore[arg-type]
+    figure.legend(
+        [dot, held_out], ["cross-validation, with the 95 % interval", "held-out points"],
+        loc="outside lower center", ncols=2, frameon=False, fontsize=9,
+    )  # fmt: skip
+    if note := height_note(accuracy.model for accuracy in ranked):
+        figure.suptitle(note, x=0.01, ha="left", fontsize=9, color=NOTE)
+    return figure
+
+
+def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
+    """Draw one row per model, the first on top; the scale fits the errors in space and on the floor."""
+    styles = model_styles(accuracy.model for accuracy in ranked)
+    for y, accuracy in enumerate(ranked):
+        crossed = errors_in(overall_row(accuracy, True), in_space)
+        held_out = errors_in(overall_row(accuracy, False), in_space)
+        if crossed is not None:
+            colour = styles[accuracy.model].colour
+            axes.plot(_ends_cm(crossed), [y, y], color=colour, lw=2.4, solid_capstyle="butt", zorder=3)
+            axes.plot(crossed.mean_m * CM_PER_M, y, "o", color=colour, ms=6.5, zorder=3.5)
+        if held_out is not None:
+            axes.plot(held_out.mean_m * CM_PER_M, y, zorder=4, **HELD_OUT)  # type: ignore[arg-type]
+    rows = [overall_row(accuracy, scheme) for accuracy in ranked for scheme in (True, False)]
+    shown = [errors for row in rows if row for errors in (row.error_3d, row.error_2d) if errors]
+    ends_cm = [end for errors in shown for end in _ends_cm(errors)]
+    if ends_cm and max(ends_cm) > _LOG_RATIO * min(ends_cm):
+        scale_logarithmic(axes, "x", min(ends_cm) / 1.3, max(ends_cm) * 1.3)
+    else:
+        axes.set_xlim(0, 1.08 * max(ends_cm, default=1.0))
+    axes.set_yticks(range(len(ranked)), [label(accuracy.model) for accuracy in ranked])
+    axes.set_ylim(len(ranked) - 0.4, -0.6)
+    axes.set_xlabel("mean error in cm")
+    axes.tick_params(axis="y", length=0)
+    style_axes(axes, "x")
+    axes.spines["left"].set_visible(False)
+
+
+def _ends_cm(errors: ErrorStatistics) -> list[float]:
+    """Return the ends of the confidence interval of the mean, or the mean itself, in cm."""
+    ends_m = (errors.mean_low_m, errors.mean_high_m)
+    return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
+
+
+# For each file: the condition to write it, and the function that returns its bytes.
+_FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
+    "table_1.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=True)),
+    "table_2.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=False)),
+    "cross_validation.csv": (lambda f: any(a.rows(True) for a in f.accuracies), cross_validation_csv),
+    "figure_9.png": (lambda f: bool(f.training_m() or f.test_m()), lambda f: png(places_figure(f))),
+    "figure_10.png": (
+        lambda f: has_published(f.evaluations) and f.in_space,
+        lambda f: png(published_figure(f, in_space=True)),
+    ),
+    "figure_11.png": (lambda f: has_published(f.evaluations), lambda f: png(published_figure(f, False))),
+    "learning_curve.png": (lambda f: bool(mean_curves(f, False)), lambda f: png(learning_figure(f))),
+    "errors_floor.png": (lambda f: bool(shown_models(f)), lambda f: png(residuals_figure(f))),
+    "models.png": (lambda f: bool(f.accuracies), lambda f: png(models_figure(f))),
+    "camera_poses.png": (
+        lambda f: bool(f.calibrated),
+        lambda f: png(calibration_figures.poses_figure(f.calibrated, f.rig)),
+    ),
+    "clock_offsets.png": (
+        lambda f: calibration_figures.has_clocks(f.calibrated),
+        lambda f: png(calibration_figures.clocks_figure(f.calibrated)),
+    ),
+}
+
+
+def _image_residuals(findings: Findings) -> dict[str, bytes]:
+    """Return a map of the corner residuals in the image of each camera of the joint model."""
+    most_px = calibration_figures.residual_limit_px(findings.calibrated)
+    return {
+        f"image_residuals_{camera.camera}.png": png(calibration_figures.residuals_figure(camera, most_px))
+        for camera in findings.calibrated
+        if camera.residuals is not None
+    }
+
+
+def write_plots(findings: Findings, folder: Path) -> list[str]:
+    """Write all tables and figures that have data into a folder: all files, or none.
+
+    Returns
+    -------
+    The names of the files.
+
+    Raises
+    ------
+    IpsysError
+        No model was evaluated.
+    """
+    files = {name: draw(findings) for name, (has_data, draw) in _FILES.items() if has_data(findings)}
+    files.update(_image_residuals(findings))
+    if not files:
+        raise IpsysError(
+            f"{folder}: nothing to draw: no model was evaluated, because no calibration point is held out; "
+            "measure more points"
+        )
+    write_files(folder, files)
+    return list(files)

@@ -1,0 +1,79 @@
+"""The result of an import of ground truth, as text and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ipsys_log.app.report.rows import cm, counted, mm, wrap_text
+from ipsys_log.exchange.import_truth import ImportedTruth
+from ipsys_log.messages.units import NS_PER_S
+
+_MS_PER_S = 1000.0
+
+
+def truth_lines(imported: ImportedTruth) -> Iterator[str]:
+    """Yield the estimates with their standard deviations, and the residuals, for a terminal."""
+    poses = ", ".join(f"{count} poses of {robot}" for robot, count in imported.poses.items())
+    yield wrap_text(f"Ground truth: {poses}.")
+    found = imported.alignment
+    offset = f"Time offset: {imported.time_offset_ns / NS_PER_S:.6f} s"
+    sigma_s = found.offset_sigma_s if found is not None else None
+    known = "given" if sigma_s is None else f"sigma {sigma_s * _MS_PER_S:.3f} ms"
+    yield wrap_text(f"{offset} ({known}), added to the times of the file.")
+    align = imported.record.parameters["align"]
+    if found is None or align == "none":
+        yield "Alignment: none."
+    else:
+        yield wrap_text(f"Alignment {align}: {_motion_text(imported)}.")
+    if (residuals := imported.residuals) is not None:
+        yield wrap_text(
+            f"Residuals against run {imported.tracks_run}: RMSE {cm(residuals.rmse_2d_m)} cm on "
+            f"the floor, {cm(residuals.rmse_3d_m)} cm in 3D, at {residuals.instants} instants"
+            f"{_outliers(residuals.outliers)}."
+        )
+    if found is not None:
+        what = "offset" if align == "none" else "offset and alignment"
+        yield wrap_text(
+            f"Estimated from these tracks, {what} hide their constant errors: scores show the others only."
+        )
+
+
+def _motion_text(imported: ImportedTruth) -> str:
+    found = imported.alignment
+    assert found is not None
+    parts = [
+        f"rotation {name} {math.degrees(turn):.3f} deg (sigma {math.degrees(sigma):.3f})"
+        for name, turn, sigma in zip("xyz", found.turn_rad, found.turn_sigmas_rad, strict=True)
+        if np.isfinite(sigma)
+    ]
+    parts += [
+        f"{name} {cm(shift)} cm (sigma {mm(sigma)} mm)"
+        for name, shift, sigma in zip("xyz", found.motion.shift_m, found.shift_sigmas_m, strict=True)
+        if np.isfinite(sigma)
+    ]
+    return ", ".join(parts)
+
+
+def _outliers(count: int) -> str:
+    return f"; {counted(count, 'outlier')} not used for the estimate" if count else ""
+
+
+def truth_json(imported: ImportedTruth) -> dict[str, Any]:
+    """Return the result as plain data, in SI units; the names are those of the record of the run."""
+    numbers = {
+        name: int(text) if text.isdigit() else float(text)
+        for name, text in imported.record.parameters.items()
+        if name not in ("format", "files", "align")
+    }
+    summary: dict[str, Any] = {
+        "log": str(imported.path),
+        "run": imported.record.run,
+        "poses": imported.poses,
+        "align": imported.record.parameters["align"],
+    }
+    compared = {} if imported.tracks_run is None else {"tracks_run": imported.tracks_run}
+    return summary | compared | numbers

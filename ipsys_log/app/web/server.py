@@ -1,0 +1,258 @@
+"""The server of a page in a separate thread, and its unexpected exceptions."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import ipaddress
+import secrets
+import socket
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Thread
+from typing import Any
+
+import cv2
+import uvicorn
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from ipsys_log.app.web.access import Guard
+from ipsys_log.app.web.app import build_app
+from ipsys_log.app.web.connections import Connections, PageLimits, derive_limits
+from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.survey.scene import MeasuringScene
+
+
+class ServerExceptions:
+    """The unexpected exceptions in the server's thread: their number, and the first traceback."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first = ""
+
+    def add(self, error: BaseException) -> None:
+        """Count an exception."""
+        while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
+            (error,) = error.exceptions
+        self.count += 1
+        self.first = self.first or "".join(traceback.format_exception(error)).rstrip()
+
+    def watch_loop(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Count exceptions of an event loop that no other code handles."""
+
+        def handle(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+            self.add(context.get("exception") or RuntimeError(str(context.get("message"))))
+
+        loop.set_exception_handler(handle)
+
+    def watch_app(self, app: ASGIApp) -> ASGIApp:
+        """Count exceptions of an app; the server answers such a request with the status 500."""
+
+        async def call(scope: Scope, receive: Receive, send: Send) -> None:
+            try:
+                await app(scope, receive, send)
+            except Exception as error:
+                self.add(error)
+
+        return call
+
+
+_LOOPBACK = "127.0.0.1"
+_STEP_S = 0.02
+_TURN_S = 0.1
+_BACKLOG = 128
+_TOKEN_BYTES = 12
+# A browser also sends cookies of other programs on this machine, up to 4 kB each.
+_MAX_HEADER_BYTES = 64 << 10
+# The server prints nothing, because the recorder uses the terminal. ServerExceptions stores the exceptions.
+_SILENT: dict[str, Any] = {
+    "version": 1,
+    "disable_existing_loggers": False,
+    "handlers": {"none": {"class": "logging.NullHandler"}},
+    "loggers": {name: {"handlers": ["none"], "propagate": False} for name in ("uvicorn", "asyncio")},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PageServer:
+    """A running server of a page.
+
+    It has its address (with the token if needed), its thread and its exceptions. ``view_url`` is the address
+    for devices that may only read; None if the page has no secret for them.
+    """
+
+    url: str
+    thread: Thread
+    exceptions: ServerExceptions
+    view_url: str | None = None
+
+    def wait(self, stopped: Callable[[], bool]) -> None:
+        """Wait until the server ends, or until `stopped` is true."""
+        while self.thread.is_alive() and not stopped():
+            self.thread.join(_TURN_S)
+
+
+@contextmanager
+def serve(
+    scene: MeasuringScene, host: str | None = None, port: int = 8000, limits: PageLimits | None = None
+) -> Iterator[PageServer]:
+    """Serve the measuring page of a scene until the end of the with-block.
+
+    Parameters
+    ----------
+    scene : a finished log or live cameras.
+    host, port, limits : as for :func:`serve_app`.
+
+    Raises
+    ------
+    IpsysError
+        The errors of :func:`serve_app`.
+    """
+    with serve_app(build_app(scene), host, port, limits) as page:
+        yield page
+
+
+@contextmanager
+def serve_app(
+    app: ASGIApp,
+    host: str | None = None,
+    port: int = 8000,
+    limits: PageLimits | None = None,
+    has_viewers: bool = False,
+    option: str = "--port",
+) -> Iterator[PageServer]:
+    """Serve a page until the end of the with-block.
+
+    Parameters
+    ----------
+    app : the page, without a guard.
+    host : address to listen on. None: the page is only for this machine, and needs no token.
+    port : port to listen on; 0 means any free port.
+    limits : limits of connections. None: the limits of :func:`derive_limits`.
+    has_viewers : a page with a host has a second address, for devices that may only read.
+    option : the option of the port, in errors.
+
+    Raises
+    ------
+    IpsysError
+        The port is in use or not allowed, the host is not this machine, or the server does not start.
+    """
+    token = None if host is None else secrets.token_urlsafe(_TOKEN_BYTES)
+    view_token = secrets.token_urlsafe(_TOKEN_BYTES) if has_viewers and token is not None else None
+    with _listen(host or _LOOPBACK, port, option) as listening:
+        names = {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
+        names |= {host.lower()} if host else set()
+        exceptions = ServerExceptions()
+        config = uvicorn.Config(
+            exceptions.watch_app(Guard(app, frozenset(names), token, view_token)),
+            log_config=_SILENT, access_log=False, lifespan="off", ws="none", http="h11", loop="asyncio",
+            server_header=False, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
+        )  # fmt: skip
+        server = uvicorn.Server(config)
+        run = (server, listening, limits or derive_limits(), exceptions)
+        thread = Thread(target=_run, args=run, name="page", daemon=True)
+        thread.start()
+        while thread.is_alive() and not server.started:
+            thread.join(_STEP_S)
+        if not server.started:
+            raise IpsysError(f"the page cannot be served: {exceptions.first.splitlines()[-1]}")
+        own_port = listening.getsockname()[1]
+        view_url = None if view_token is None else _url(host, own_port, view_token)
+        try:
+            yield PageServer(_url(host, own_port, token), thread, exceptions, view_url)
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+def _run(
+    server: uvicorn.Server, listening: socket.socket, limits: PageLimits, exceptions: ServerExceptions
+) -> None:
+    """Serve until ``server.should_exit`` is true; an exception ends only this thread."""
+    try:
+        asyncio.run(_serve(server, listening, limits, exceptions))
+    except Exception as error:
+        exceptions.add(error)
+
+
+async def _serve(
+    server: uvicorn.Server, listening: socket.socket, limits: PageLimits, faults: ServerExceptions
+) -> None:
+    faults.watch_loop(asyncio.get_running_loop())
+    listening.setblocking(False)
+    server.config.load()
+    connections = Connections(limits, server.config, server.server_state)
+    async with asyncio.TaskGroup() as tasks:
+        accepting = tasks.create_task(connections.accept(listening))
+        try:
+            await server.serve(sockets=[])
+        finally:
+            accepting.cancel()
+            connections.abort()
+
+
+def check_port_free(host: str | None, port: int, option: str = "--port") -> None:
+    """Check that a page can be served at an address and a port; ``option`` names the port in errors.
+
+    Raises
+    ------
+    IpsysError
+        The errors of :func:`serve`.
+    """
+    _listen(host or _LOOPBACK, port, option).close()
+
+
+def _listen(host: str, port: int, option: str) -> socket.socket:
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
+    except (socket.gaierror, UnicodeError) as error:
+        raise IpsysError(
+            f"--host {host}: is not an address of this machine; use 0.0.0.0 for all its addresses"
+        ) from error
+    except OverflowError as error:
+        raise IpsysError(f"{option} {port}: is not a port; give one from 1024 to 65535") from error
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise IpsysError(f"{option} {port}: is in use by another program; give another port") from error
+        if error.errno == errno.EACCES:
+            raise IpsysError(f"{option} {port}: is not allowed; give one from 1024 to 65535") from error
+        raise IpsysError(
+            f"--host {host}: the server cannot listen on this address: {error.strerror}"
+        ) from error
+
+
+def _url(host: str | None, port: int, token: str | None) -> str:
+    name = host or _LOOPBACK
+    try:
+        if ipaddress.ip_address(name).is_unspecified:
+            name = _address()
+    except ValueError:
+        pass
+    if ":" in name:
+        name = f"[{name}]"
+    return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+
+
+def _address() -> str:
+    """Return the address that this machine sends from in its network; the probe sends no data."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # RFC 5737: an address reserved for documentation
+            return str(probe.getsockname()[0])
+        except OSError:
+            return socket.gethostname()
+
+
+def qr_code(text: str) -> str:
+    """Return a QR code as text of half blocks, readable as light on dark and as dark on light."""
+    modules = cv2.QRCodeEncoder.create().encode(text) == 0
+    if len(modules) % 2:
+        modules = cv2.copyMakeBorder(modules.astype("uint8"), 0, 1, 0, 0, cv2.BORDER_CONSTANT, value=0) == 1
+    blocks = {(False, False): "█", (True, False): "▄", (False, True): "▀", (True, True): " "}
+    return "\n".join(
+        "".join(blocks[bool(top), bool(low)] for top, low in zip(*rows, strict=True))
+        for rows in zip(modules[::2], modules[1::2], strict=True)
+    )

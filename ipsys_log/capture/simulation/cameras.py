@@ -1,0 +1,205 @@
+"""Cameras of the simulated lab: intrinsics like those of the paper, and poses that cover the floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.messages.arrays import Array
+from ipsys_log.vision.lenses import project
+from ipsys_log.vision.poses import look_down, transform
+
+# Distance of the outermost cameras from the wall. With three cameras, the distance between two is 1.59 m.
+_FROM_WALL_M = 0.85
+# The fields of view of a hall overlap by twice this, beside the diagonal of a marker.
+_BEYOND_M = 0.1
+_TRIES = 5000
+# Intrinsics for images of 1920 px width. The distortion is about that of the lenses in the paper.
+_FOCAL_PX = (1150.0, 1165.0)
+_OFF_CENTRE_PX = 60.0
+_DISTORTION = np.array([-0.13, 0.01, -0.03, 0.02])
+_DISTORTION_SPREAD = np.array([0.008, 0.006, 0.006, 0.004])
+_WIDEST_RAD = 1.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A camera with intrinsics ``lens`` and extrinsics ``camera_from_world`` (4, 4)."""
+
+    name: str
+    lens: CameraCalibration
+    camera_from_world: Array
+
+    @property
+    def origin_m(self) -> Array:
+        """Return the position of the camera in the world, (3,)."""
+        origin: Array = -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        return origin
+
+
+def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
+    """Return the cameras in a row above the middle of the floor, or in the grid of a hall.
+
+    Parameters
+    ----------
+    settings : settings of the lab.
+    time_ns : time of the calibrations.
+
+    Raises
+    ------
+    IpsysError
+        A camera cannot see its part of the floor with any intrinsics and tilt.
+    """
+    if settings.grid is not None:
+        return tuple(
+            _mount(settings, index, middle_m, _cell_of_floor(settings, middle_m), time_ns)
+            for index, middle_m in enumerate(_grid_middles(*settings.grid, settings.spacing_m))
+        )
+    count = len(settings.cameras)
+    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
+    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    return tuple(
+        _mount(settings, index, (FLOOR_M / 2, y_m), _part_of_floor(settings, y_m, spacing_m), time_ns)
+        for index, y_m in enumerate(ys_m.tolist())
+    )
+
+
+def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return the middles of the parts of the floor, column after column, in m."""
+    return [
+        ((column + 0.5) * spacing_m[0], (row + 0.5) * spacing_m[1])
+        for column in range(columns)
+        for row in range(rows)
+    ]
+
+
+def aim_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
+    """Return cameras with large tilts, each aimed at the point of the floor below its place in the row.
+
+    A camera with a tilt of t stands ``height * tan(t)`` beside its place, at most at the walls.
+    :func:`mount_cameras` refuses such tilts, because a tilted camera does not see its part of the floor.
+
+    Parameters
+    ----------
+    settings : settings of the lab.
+    time_ns : time of the calibrations.
+    """
+    count = len(settings.cameras)
+    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
+    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    return tuple(_aim(settings, index, float(y_m), time_ns) for index, y_m in enumerate(ys_m))
+
+
+def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the world points, (n, 3) in m, that are in the image."""
+    points_c = transform(camera.camera_from_world, points_m)
+    # Outside the widest angle, the polynomial of the lens distortion is not valid.
+    in_front = np.hypot(points_c[:, 0], points_c[:, 1]) < np.tan(_WIDEST_RAD) * points_c[:, 2]
+    px = project(np.where(in_front[:, None], points_c, [0.0, 0.0, 1.0]), camera.lens)
+    last = np.array([camera.lens.width - 1, camera.lens.height - 1])
+    inside: NDArray[np.bool_] = in_front & (px >= 0).all(axis=1) & (px <= last).all(axis=1)
+    return inside
+
+
+def _mount(
+    settings: LabSettings, index: int, place_m: tuple[float, float], wanted_m: Array, time_ns: int
+) -> Camera:
+    """Draw intrinsics and poses of a camera until it sees all wanted points."""
+    rng = random_stream(settings.seed, Purpose.CAMERA, index)
+    name = settings.cameras[index]
+    for _ in range(_TRIES):
+        lens = _draw_lens(rng, settings, name, time_ns)
+        tilt = np.radians(rng.uniform(*settings.tilt_deg))
+        towards = rng.uniform(0, 2 * np.pi)
+        tilt_rad = tilt * np.array([np.cos(towards), np.sin(towards), 0.0])
+        nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
+        origin_m = np.array([*place_m, settings.mount_height_m]) + nudge_m
+        camera = Camera(name, lens, look_down(origin_m, tilt_rad))
+        if _reaches(lens) and sees(camera, wanted_m).all():
+            return camera
+    raise IpsysError(
+        f"simulator: camera {name!r} cannot see its part of the floor from {settings.mount_height_m:g} m "
+        f"with a tilt of {settings.tilt_deg[0]:g} to {settings.tilt_deg[1]:g} degrees; "
+        "tilt it less, hang it higher, or use a frame of 16:9 and lower markers"
+    )
+
+
+def _aim(settings: LabSettings, index: int, y_m: float, time_ns: int) -> Camera:
+    rng = random_stream(settings.seed, Purpose.GEOMETRY, index)
+    name = settings.cameras[index]
+    for _ in range(_TRIES):
+        lens = _draw_lens(rng, settings, name, time_ns)
+        if _reaches(lens):
+            break
+    tilt = np.radians(rng.uniform(*settings.tilt_deg))
+    towards = rng.uniform(0, 2 * np.pi)
+    axis = np.array([np.cos(towards), np.sin(towards), 0.0])
+    aside = look_down(np.zeros(3), tilt * axis)[2, :3]
+    place_m = np.array([FLOOR_M / 2, y_m]) + settings.mount_height_m * aside[:2] / aside[2]
+    nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
+    origin_m = np.append(np.clip(place_m, 0.0, FLOOR_M), settings.mount_height_m) + nudge_m
+    return Camera(name, lens, look_down(origin_m, tilt * axis))
+
+
+def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array:
+    """Return the points that a camera must see: its strip of the floor, and the overlap above it.
+
+    The overlap is at the greatest height. It reaches half the diagonal of a marker beyond the middle between
+    two cameras.
+    """
+    across = np.linspace(0, FLOOR_M, 13)
+    along = np.clip(y_m + _FROM_WALL_M * np.linspace(-1, 1, 5), 0, FLOOR_M)
+    top_m = max(*settings.heights_m, settings.drive_height_m)
+    reach_m = spacing_m / 2 + settings.marker_length_m / np.sqrt(2)
+    # A raised marker near a wall may be outside the image. The selection of calibration points avoids such
+    # markers.
+    across_top = np.linspace(0.15 * FLOOR_M, 0.85 * FLOOR_M, 9)
+    along_top = y_m + reach_m * np.linspace(-1, 1, 3)
+    low = np.stack(np.meshgrid(across, along, [0.0]), axis=-1).reshape(-1, 3)
+    high = np.stack(np.meshgrid(across_top, along_top, [top_m]), axis=-1).reshape(-1, 3)
+    return np.vstack([low, high])
+
+
+def _cell_of_floor(settings: LabSettings, middle_m: tuple[float, float]) -> Array:
+    """Return the points that a camera of a hall must see: the edge of its part of the floor, with an overlap.
+
+    The overlap is at the greatest height.
+    """
+    top_m = max(*settings.heights_m, settings.drive_height_m)
+    beyond_m = settings.marker_length_m / np.sqrt(2) + _BEYOND_M
+    reach_m = np.array(settings.spacing_m) / 2 + beyond_m
+    share = np.linspace(-1, 1, 9)
+    edge = np.array([(x, y) for x in share for y in share if max(abs(x), abs(y)) == 1])
+    flat_m = np.clip(middle_m + edge * reach_m, 0.0, settings.floor_m)
+    return np.column_stack([flat_m, np.full(len(flat_m), top_m)])
+
+
+def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:
+    scale = settings.width / 1920
+    fx = scale * rng.uniform(*_FOCAL_PX)
+    fy = fx * rng.uniform(0.998, 1.002)
+    cx, cy = (np.array([settings.width, settings.height]) - 1) / 2 + scale * _OFF_CENTRE_PX * rng.uniform(
+        -1, 1, 2
+    )
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    D = _DISTORTION + _DISTORTION_SPREAD * rng.uniform(-1, 1, 4)
+    P = np.hstack([K, np.zeros((3, 1))])
+    return CameraCalibration(
+        time_ns, name, settings.width, settings.height, "kannala_brandt", D, K, np.eye(3), P
+    )
+
+
+def _reaches(lens: CameraCalibration) -> bool:
+    """Return whether the lens distortion is monotone up to an angle outside the image."""
+    theta = np.linspace(0, _WIDEST_RAD, 200)
+    powers = theta[:, None] ** np.array([2, 4, 6, 8])
+    slope = 1 + powers @ (np.array([3, 5, 7, 9]) * lens.D)
+    widest = theta[-1] * (1 + powers[-1] @ lens.D)
+    frame = np.array([[0, 0], [lens.width, 0], [0, lens.height], [lens.width, lens.height]])
+    corner = np.linalg.norm((frame - lens.K[:2, 2]) / lens.K.diagonal()[:2], axis=1).max()
+    return bool(slope.min() > 0.1 and widest > 1.05 * corner)

@@ -1,0 +1,239 @@
+"""Simulated session: rig, camera intrinsics, calibration points, driving robots, and ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from ipsys_log.capture.simulation.calibration_points import (
+    SimulatedPose,
+    cameras_seeing,
+    measure,
+    place_marker,
+    plan_points,
+    reference_points,
+    split,
+)
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.drive import Drive, plan_drive
+from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.pixel_shares import exposure_interval
+from ipsys_log.capture.simulation.render import encode_jpeg, render
+from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    TRUTH_TOPIC,
+    CompressedImage,
+    Floor,
+    Measurement,
+    Message,
+    Rig,
+    RigCamera,
+    RigMarker,
+    Track,
+    Tracks,
+    calibration_topic,
+    image_topic,
+)
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker
+
+# Start of the simulated clock: 2023-11-14 22:13:20 UTC.
+EPOCH_NS = 1_700_000_000 * NS_PER_S
+# The heights of the robots are exact; a standard deviation must be above 0.
+ROBOT_HEIGHT_SIGMA_M = 0.0001
+# Pause of the recording, for the transport of the markers to their next calibration points.
+_PAUSE_NS = 3 * NS_PER_S
+# From the end of the exposure of the last row to the arrival of the frame.
+_LATENCY_NS = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A time at which all cameras take a frame, with the measurements that follow it.
+
+    ``places`` are the poses of the markers at ``time_ns``, the middle of the exposure of the first row.
+    ``prints`` are the markers for the renderer.
+    """
+
+    time_ns: int
+    places: tuple[SimulatedPose, ...]
+    prints: tuple[PlacedMarker | MovingMarker, ...]
+    measured: tuple[Measurement, ...] = ()
+
+
+def simulate(
+    settings: LabSettings,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Iterator[Message]:
+    """Yield the messages of a session of the simulated lab, in log order.
+
+    With the same versions of OpenCV and NumPy, equal settings give equal messages, byte for byte. The
+    function reads no clock: the simulated clock starts at :data:`EPOCH_NS`.
+
+    Parameters
+    ----------
+    settings : settings of the lab.
+    progress : called with the step (``views`` of the cameras, then ``simulate`` for frames), the number of
+        finished items, and the number of all items.
+
+    Yields
+    ------
+    Message
+        The rig; a calibration per camera; then, per instant, the ground truth, a frame per camera and the
+        measurements. ``publish_time_ns`` is the time of the instant. For a frame, it is the middle of the
+        exposure of its first row.
+
+    Raises
+    ------
+    IpsysError
+        The settings contradict one another.
+
+    Examples
+    --------
+    >>> lab = LabSettings(width=640, height=360, cameras=("red",), markers=1, stations=1, drive_s=0.0)
+    >>> [message.topic for message in simulate(lab)][:4]
+    ['/rig', '/cameras/red/calibration', '/truth/tracks', '/cameras/red/image']
+    """
+    log_time_ns = EPOCH_NS
+    latency_ns = _LATENCY_NS + round(exposure_interval(0, settings.height - 1, settings)[1] * NS_PER_S)
+    for topic, payload, publish_time_ns, camera in _payloads(settings, progress):
+        log_time_ns = max(publish_time_ns + latency_ns, log_time_ns + 1)
+        yield Message(topic, log_time_ns, publish_time_ns, payload, camera)
+
+
+def build_rig(settings: LabSettings) -> Rig:
+    """Return the rig of the simulated lab; each marker is on its own robot."""
+    return Rig(
+        name="simulated_lab" if settings.grid is None else "simulated_hall",
+        dictionary=settings.dictionary,
+        marker_length_m=settings.marker_length_m,
+        markers=tuple(RigMarker(index, robot=f"robot_{index}") for index in range(settings.markers)),
+        cameras=tuple(RigCamera(name, row_time_ns=settings.row_time_ns or None) for name in settings.cameras),
+        reference_points=reference_points(settings),
+        floor=Floor(*settings.floor_m),
+        marker_height_m=settings.drive_height_m,
+        marker_height_sigma_m=ROBOT_HEIGHT_SIGMA_M,
+        tape_sigma_m=settings.tape_sigma_m or None,
+    )
+
+
+def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
+    """Return the start time of the robots.
+
+    The true poses at a time are ``drive.places_at`` of the seconds since this start.
+
+    Parameters
+    ----------
+    settings : settings of the lab.
+    cameras : from :func:`~ipsys_log.capture.simulation.cameras.mount_cameras`.
+
+    Returns
+    -------
+    The time of the first frame of the drive, in ns.
+
+    Examples
+    --------
+    >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
+    >>> cameras = mount_cameras(lab)
+    >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
+    1.0
+    """
+    return _start_ns(settings, len(plan_points(settings, cameras)))
+
+
+def _payloads(
+    settings: LabSettings, progress: Callable[[str, int, int], None]
+) -> Iterator[tuple[str, Any, int, str | None]]:
+    rig = build_rig(settings)
+    cameras = mount_cameras(settings, EPOCH_NS)
+    yield RIG_TOPIC, rig, EPOCH_NS, None
+    for camera in cameras:
+        yield calibration_topic(camera.name), camera.lens, EPOCH_NS, camera.name
+    with ThreadPoolExecutor(len(cameras)) as pool:
+        progress("views", 0, len(cameras))
+        views = []
+        for view in pool.map(lambda camera: prepare_view(camera, settings), cameras):
+            views.append(view)
+            progress("views", len(views), len(cameras))
+        instants = list(_instants(settings, cameras))
+        for index, instant in enumerate(instants):
+            progress("simulate", index * len(views), len(instants) * len(views))
+            yield TRUTH_TOPIC, _truth(instant, rig, cameras, settings), instant.time_ns, None
+            for image in pool.map(_Shutter(settings, instant, index), range(len(views)), views):
+                yield image_topic(image.frame_id), image, instant.time_ns, image.frame_id
+            for measurement in instant.measured:
+                yield MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None
+        progress("simulate", len(instants) * len(views), len(instants) * len(views))
+
+
+@dataclass(frozen=True, slots=True)
+class _Shutter:
+    """The renderer of the frames of an instant; the frames do not depend on the threads."""
+
+    settings: LabSettings
+    instant: Instant
+    index: int
+
+    def __call__(self, number: int, view: FloorView) -> CompressedImage:
+        rng = random_stream(self.settings.seed, Purpose.FRAME, number, self.index)
+        data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
+        return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
+
+
+def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
+    sets = plan_points(settings, cameras)
+    splits = split(sets, settings.seed)
+    for number, points in enumerate(sets):
+        places = tuple(point.pose for point in points)
+        lying = tuple(place_marker(pose, settings) for pose in places)
+        times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
+        first = number * settings.markers
+        measured = tuple(
+            measure(pose, settings, index, times_ns, splits[index])
+            for index, pose in enumerate(places, first)
+        )
+        for time_ns in times_ns[:-1]:
+            yield Instant(time_ns, places, lying)
+        yield Instant(times_ns[-1], places, lying, measured)
+    drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
+    for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
+        time_s = (time_ns - start_ns) / NS_PER_S
+        prints = tuple(moving_marker(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
+        yield Instant(time_ns, drive.poses_at(time_s), prints)
+
+
+def moving_marker(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> MovingMarker:
+    """Return a moving marker of the drive, for the frame at a time after the start."""
+    return lambda since_s: place_marker(drive.pose_at(marker_id, time_s + since_s), settings)
+
+
+def _start_ns(settings: LabSettings, number: int) -> int:
+    """Return the first time of a set of calibration points; after the last set, the start of the drive."""
+    last_ns = _times(settings, 0, settings.frames_per_station)[-1]
+    return EPOCH_NS + NS_PER_S + number * (last_ns + _PAUSE_NS)
+
+
+def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:
+    return [start_ns + round(index * NS_PER_S / settings.rate_hz) for index in range(count)]
+
+
+def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabSettings) -> Tracks:
+    return Tracks(
+        instant.time_ns,
+        tuple(
+            Track(
+                robot=rig.robot_of(pose.marker_id),
+                id=pose.marker_id,
+                x_m=pose.x_m,
+                y_m=pose.y_m,
+                z_m=pose.z_m,
+                heading_rad=pose.heading_rad,
+                cameras=cameras_seeing(pose, cameras, settings),
+            )
+            for pose in instant.places
+        ),
+    )

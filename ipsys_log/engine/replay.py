@@ -1,0 +1,126 @@
+"""The stages of a replay in order: those that all models share, and then those of each model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ipsys_log.engine.blas import one_blas_thread
+from ipsys_log.engine.checks import check_earlier_runs, describe_changed_images
+from ipsys_log.engine.execute import compute_messages, run_stage
+from ipsys_log.engine.graph import Task, copy_model, is_of_model, plan_stage
+from ipsys_log.engine.model_checks import check_fits
+from ipsys_log.engine.options import Progress, Request
+from ipsys_log.engine.pieces import DividedRun, PieceWorkers, divide_run
+from ipsys_log.engine.provenance import Outcome, imported_inputs
+from ipsys_log.errors import FitError
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
+from ipsys_log.messages import Message
+from ipsys_log.messages.channels import IMAGES, MODEL, RUN_EVENTS, Channel
+from ipsys_log.messages.stage import Stage
+from ipsys_log.statistics.model_kinds import model_kind
+
+
+@dataclass(slots=True, eq=False)
+class Replay:
+    """The work of one replay.
+
+    Attributes
+    ----------
+    request : the options of the stages.
+    stages, models : those to compute, in order.
+    logs, target : the logs to read as one, and the log that gets the results.
+    workers : they compute the pieces of a long log.
+    progress, say : called with the state of the work, and with remarks.
+    unchecked : several models of which it is not known yet if all can be fitted.
+    outcomes : one for each stage so far.
+    divided : the run in work, if the workers compute it.
+    """
+
+    request: Request
+    stages: Sequence[Stage]
+    models: Sequence[str]
+    logs: Sequence[LogLocation]
+    target: Path
+    workers: PieceWorkers
+    progress: Progress
+    say: Callable[[str], None]
+    unchecked: list[str] = field(init=False)
+    outcomes: list[Outcome] = field(default_factory=list, init=False)
+    divided: DividedRun | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self.unchecked = list(self.models) if len(self.models) > 1 else []
+
+    def compute(self) -> None:
+        """Run the stages that all models share, and then those of each model.
+
+        Raises
+        ------
+        IpsysError
+            The input has a fault that the user must correct.
+        """
+        of_model = [stage for stage in self.stages if is_of_model(stage)]
+        with Session(self.logs) as session:
+            shared = imported_inputs(session)
+        first = [stage for stage in self.stages if stage not in of_model]
+        self._run_stages(first, shared, None)
+        for model in self.models:
+            try:
+                self._run_stages(of_model, dict(shared), model)
+            except FitError as error:
+                if model in self.request.models or model_kind(model).is_checked:
+                    raise
+                self.say(f"{model} is left out: {error}")
+
+    def _run_stages(self, stages: Sequence[Stage], inputs: dict[Channel, str], model: str | None) -> None:
+        """Run some stages in order, and note the runs of their channels."""
+        for stage in stages:
+            run = self._run_stage(stage, inputs, model)
+            inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
+
+    def _run_stage(self, stage: Stage, inputs: Mapping[Channel, str], model: str | None) -> str:
+        """Run a stage, or find its result; return its run."""
+        request = self.request
+        with Session(self.logs) as session:
+            check_earlier_runs(session, self.outcomes)
+            if MODEL in stage.writes and request.model_from is not None:
+                task: Task | str = copy_model(request, str(model))[0]
+            else:
+                options = request.options(model)
+                task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
+            if isinstance(task, str):
+                return task
+            until, target = self.stages[-1], self.target
+            outcome = run_stage(
+                session, target, task, request, until, self._messages, self.say, self._prepare
+            )
+        self.outcomes.append(outcome)
+        return outcome.run
+
+    def _prepare(self, task: Task, session: Session) -> None:
+        """Divide a long run, and check its images while the workers load libraries and open the log."""
+        self.divided = divide_run(task, session, self.workers)
+        if self.divided is not None:
+            self.divided.workers.prepare(self.divided.plan)
+        if IMAGES in task.stage.reads:
+            for remark in describe_changed_images(session):
+                self.say(remark)
+
+    def _messages(self, task: Task, session: Session, name: str) -> Iterator[Message]:
+        """Compute a run. Before the first fit, check that all models can be fitted."""
+        progress = self.progress
+        if len(self.models) > 1 and is_of_model(task.stage):
+            progress = _name_run(progress, name)
+        with one_blas_thread():
+            if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
+                check_fits(session, self.request, task.inputs, self.unchecked)
+                self.unchecked.clear()
+            yield from compute_messages(task, session, name, progress, self.divided)
+
+
+def _name_run(progress: Progress, run: str) -> Progress:
+    """Return a progress function whose steps name their run: with several models, a stage has several."""
+    return lambda stage, done, total: progress(f"{stage} {run}", done, total)

@@ -1,0 +1,139 @@
+"""Selection of models and settings in a log: wanted, fitted and copied models, the rig with edge offsets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ipsys_log.engine.options import Request
+from ipsys_log.engine.provenance import complete_runs, newest_run
+from ipsys_log.engine.view import LogView
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import run_of_topic
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
+from ipsys_log.messages import Model, Rig
+from ipsys_log.messages.channels import MARKERS, MODEL, RIG
+from ipsys_log.models.table import CORNER_MODELS, MODELS, check_name
+from ipsys_log.plain_text import shell_words
+from ipsys_log.statistics.calibration_points import has_measurements
+
+# The median edge offset of a camera needs 10 markers; an offset below 0.05 px counts as zero.
+MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
+
+
+def wanted_models(
+    request: Request, paths: Sequence[LogLocation] = (), usual: Sequence[str] = ("poly",)
+) -> tuple[str, ...]:
+    """Return the names of the models to fit or apply.
+
+    The first of these cases applies:
+
+    - the models of the request;
+    - ``poly``, or another model of ``model_from``;
+    - the models that were copied into the logs of ``paths``, if these have no measurements to fit to;
+    - the ``usual`` models.
+
+    Raises
+    ------
+    IpsysError
+        A name is not in the table, or a log has no fitted model to apply.
+    """
+    for name in request.models:
+        check_name(name)
+    if request.models:
+        return request.models
+    if request.model_from is not None:
+        with Session([request.model_from]) as other:
+            names = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
+            return ("poly" if "poly" in names else fitted_in(other, None)[0].name,)
+    if paths:
+        with Session(paths) as session:
+            copied = _copied_models(session)
+        if copied:
+            return copied
+    return tuple(usual)
+
+
+def has_corners(session: Session) -> bool:
+    """Return whether a log has the corners of markers, or images to detect them in."""
+    return bool(session.images) or newest_run(session, MARKERS) is not None
+
+
+def evaluated_models(paths: Sequence[LogLocation]) -> tuple[str, ...]:
+    """Return all models that the logs of ``paths`` can have: those of corners only if they have corners."""
+    with Session(paths) as session:
+        return (*MODELS, *(CORNER_MODELS if has_corners(session) else ()))
+
+
+def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
+    """Return the newest model in another log, of the given name if there is one, and its topic.
+
+    Raises
+    ------
+    IpsysError
+        There is no such model.
+    """
+    for topic in reversed(_model_topics(other)):
+        model: Model = other.payloads([topic])[-1]
+        if name in (None, model.name):
+            return model, topic
+    wanted = f"model {name}" if name else "model"
+    option = f" --model {name}" if name else ""
+    raise IpsysError(
+        f"{other}: has no fitted {wanted}; to fit one: "
+        f"ipsys replay {shell_words(*other.paths)} --until fit{option}"
+    )
+
+
+def _model_topics(session: Session) -> list[str]:
+    """Return the topics of the models of complete runs, oldest first."""
+    runs = [(run.run, {output.topic for output in run.outputs}) for run in complete_runs(session)]
+    return [topic for run, written in runs for topic in session.topics(MODEL, run) if topic in written]
+
+
+def _copied_models(session: Session) -> tuple[str, ...]:
+    """Return the names of the models that were copied into a log without measurements, oldest first."""
+    if has_measurements(LogView(session)):
+        return ()
+    return tuple(dict.fromkeys(session.payloads([topic])[-1].name for topic in _model_topics(session)))
+
+
+def copied_run(session: Session, model: str) -> str | None:
+    """Return the newest run with a model that was copied into a log without measurements."""
+    if has_measurements(LogView(session)):
+        return None
+    for topic in reversed(_model_topics(session)):
+        if session.payloads([topic])[-1].name == model:
+            return run_of_topic(topic)
+    return None
+
+
+def rig_with_offsets(session: Session) -> Rig:
+    """Return the newest rig of a log, with the edge offsets of its cameras.
+
+    If the rig has no edge offset for a camera, the offset is the median over the newest detection.
+
+    Raises
+    ------
+    IpsysError
+        The log holds no rig.
+    """
+    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    if not rigs:
+        raise IpsysError(f"{session}: has no rig; to write an example: ipsys init lab.toml")
+    run = newest_run(session, MARKERS)
+    offsets_by_camera: dict[str, list[float]] = {}
+    for message in session.messages(session.topics(MARKERS, run) if run else []):
+        offsets = offsets_by_camera.setdefault(str(message.camera), [])
+        offsets += [m.edge_offset_px for m in message.payload.markers if m.edge_offset_px is not None]
+    cameras = {
+        name: rigs[-1].camera(name) for name in [c.name for c in rigs[-1].cameras] + sorted(offsets_by_camera)
+    }
+    for name, offsets in offsets_by_camera.items():
+        offset_px = float(np.median(offsets)) if len(offsets) >= MIN_OFFSETS else 0.0
+        if abs(offset_px) >= LEAST_OFFSET_PX and cameras[name].edge_offset_px is None:
+            cameras[name] = replace(cameras[name], edge_offset_px=round(offset_px, 3))
+    return replace(rigs[-1], cameras=tuple(cameras.values()))

@@ -1,1 +1,0 @@
-"""Stateless functions on arrays: lens distortion, markers, poses, trilateration."""

@@ -1,1 +1,0 @@
-"""Image decoding: JPEG, PNG, raw images and video, with limits on the size."""

@@ -1,0 +1,247 @@
+"""The player: it plays logs in a thread, to streams and to a loop of the user."""
+
+from __future__ import annotations
+
+import heapq
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from itertools import chain
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from ipsys_log.capture.frames import Clock
+from ipsys_log.engine.provenance import Outcome
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.live_runs.tracker import LiveTracks, Tracker
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.location import LogLocation
+from ipsys_log.messages import Message, Rig
+from ipsys_log.messages.rig_file import check_robots
+from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
+from ipsys_log.sinks.selection import (
+    PlayedScene,
+    PlayedTopics,
+    choose_topics,
+    dashboard_topics,
+    read_first,
+    read_scene,
+    rig_in_force,
+    viewed_topics,
+)
+from ipsys_log.sinks.sink import FanOut, Sink
+from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
+
+if TYPE_CHECKING:
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
+
+_TURN_S = 0.1
+
+
+class Player:
+    """A playback of logs in a thread. A context manager, made by :func:`ipsys_log.api.python_api.play`.
+
+    Iterate over the newest tracks, each at its time. The end of the block ends the playback.
+
+    Attributes
+    ----------
+    runs : the runs of the played tracks; none: ground truth.
+    lines : a line for each stream about its receivers, and one if the rig names no robots.
+    scene : the constant parts of the first log; None without a dashboard.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[LogLocation],
+        run: str | None = None,
+        topics: Sequence[str] = (),
+        options: PlaybackOptions | None = None,
+        settings: StreamSettings | None = None,
+        clock: Clock | None = None,
+        say: Callable[[str], None] = lambda text: None,
+        has_dashboard: bool = False,
+    ) -> None:
+        if not paths:
+            raise IpsysError("no log is given; name at least one")
+        self._say, self._ended, self._stack = say, threading.Event(), ExitStack()
+        self._first: list[Message] = []
+        self.scene: PlayedScene | None = None
+        try:
+            # Each log by itself: two logs may have runs of one name.
+            sessions = [self._stack.enter_context(Session([path])) for path in paths]
+            logs = [(session, choose_topics(session, run, topics)) for session in sessions]
+            settings, options = settings or StreamSettings(), options or PlaybackOptions()
+            rigs = [_rig_of(session, chosen, settings) for session, chosen in logs]
+            robots = {name: m for rig in rigs if rig for name, m in rig.robot_heights_m().items()}
+            if settings.has_viewer:
+                logs = [
+                    (session, viewed_topics(session, chosen, settings.images)) for session, chosen in logs
+                ]
+                self._first = [
+                    row
+                    for (session, _), rig in zip(logs, rigs, strict=True)
+                    for row in read_first(session, rig)
+                ]
+            page = self._stack.enter_context(closing(_open_page())) if settings.rerun else None
+            viewed = logs[0]
+            if has_dashboard:
+                self.scene = read_scene(*logs[0], rigs[0])
+                logs = [(session, dashboard_topics(session, chosen)) for session, chosen in logs]
+            playback = self._playback = _open_playback(logs, options, clock)
+            tracks = {chosen.tracks for _, chosen in logs}
+            number, is_replayed = playback.session, not options.restamp
+            self._streams: Sequence[Stream] = self._stack.enter_context(
+                open_streams(settings, tracks, playback.now_ns, self._warn, number, robots, is_replayed)
+            )
+        except BaseException:
+            self._stack.close()
+            raise
+        self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
+        self._viewers: list[Sink] = [] if page is None else [_viewer(*viewed, rigs[0], page, say)]
+        lines = [stream.describe() for stream in self._streams]
+        lines += [] if page is None else [page.describe()]
+        if settings and not robots:
+            lines.append("the rig names no robots; the streams name them marker_<id>")
+        self.lines = tuple(lines)
+        self._tracker = Tracker(self._play)
+
+    def __enter__(self) -> Player:
+        self._tracker.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            self._tracker.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[LiveTracks]:
+        return iter(self._tracker)
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """The open streams."""
+        return self._streams
+
+    def show_on(self, sink: Sink) -> None:
+        """Send the messages to a further sink; call this before the start."""
+        self._viewers.append(sink)
+
+    def now_ns(self) -> int:
+        """Return the time by which the age of a played message is computed."""
+        return self._playback.now_ns()
+
+    @property
+    def duration_s(self) -> float:
+        """The time from the first to the last message, in s."""
+        return self._playback.duration_s
+
+    @property
+    def position_s(self) -> float:
+        """The time since the first message, in s; set by :meth:`seek`."""
+        return self._playback.position_s
+
+    @property
+    def session(self) -> int:
+        """The number of the session; a start, a seek and a loop increase it."""
+        return self._playback.session
+
+    @property
+    def is_paused(self) -> bool:
+        """True while the player waits for :meth:`resume` or :meth:`step`."""
+        return self._playback.is_paused
+
+    @property
+    def rate(self) -> float:
+        """The seconds of the log in a second; set it to play faster or slower."""
+        return self._playback.rate
+
+    @rate.setter
+    def rate(self, rate: float) -> None:
+        self._playback.rate = rate
+
+    @property
+    def loop(self) -> bool:
+        """True to begin again at the end; it can be set."""
+        return self._playback.loop
+
+    @loop.setter
+    def loop(self, loop: bool) -> None:
+        self._playback.loop = loop
+
+    def pause(self) -> None:
+        """Hold the playback."""
+        self._playback.pause()
+
+    def resume(self) -> None:
+        """Continue after a pause."""
+        self._playback.resume()
+
+    def step(self) -> None:
+        """Pause, and play the messages of the next capture time."""
+        self._playback.step()
+
+    def seek(self, position_s: float) -> None:
+        """Continue at a time since the first message, in s."""
+        self._playback.seek(position_s)
+
+    def stop(self) -> None:
+        """End the playback."""
+        self._playback.stop()
+
+    def wait(self) -> None:
+        """Wait until the log has ended, or until :meth:`stop`."""
+        while not self._ended.wait(_TURN_S):
+            pass
+
+    def _play(self, tracker: Tracker) -> list[Outcome]:
+        try:
+            tracker.begin(self._playback.stop)
+            with FanOut([*self._streams, *self._viewers, tracker], self._warn) as show:
+                for message in chain(self._first, self._playback):
+                    show(message)
+            show.check()
+        finally:
+            self._ended.set()
+        return []
+
+    def _warn(self, _: str, text: str) -> None:
+        self._say(text)
+
+
+def _rig_of(session: Session, chosen: PlayedTopics, settings: StreamSettings) -> Rig | None:
+    """Return the rig of a log; check that it has the robots of the settings."""
+    rig = rig_in_force(session, [] if chosen.run is None else [chosen.run])
+    if rig is not None:
+        check_robots(rig, settings.named_robots, str(session))
+    return rig
+
+
+def _open_page() -> ViewerPage:
+    """Open the viewer in a browser; its library is optional, and loaded only here."""
+    check_installed("--rerun needs", "rerun")
+    from ipsys_log.sinks.rerun.viewer import ViewerPage
+
+    return ViewerPage()
+
+
+def _viewer(
+    session: Session, chosen: PlayedTopics, rig: Rig | None, page: ViewerPage, say: Callable[[str], None]
+) -> Sink:
+    from ipsys_log.sinks.rerun.live import LiveView
+
+    cameras = [name for name, topic in session.images.items() if topic in chosen.topics]
+    return LiveView(rig, cameras, chosen.run, say, page.show, page.name)
+
+
+def _open_playback(
+    logs: Sequence[tuple[Session, PlayedTopics]], options: PlaybackOptions | None, clock: Clock | None
+) -> Playback:
+    def read(start_ns: int | None = None) -> Iterator[Message]:
+        streams = (session.messages(chosen.topics, start_ns) for session, chosen in logs)
+        return heapq.merge(*streams, key=lambda message: message.log_time_ns)
+
+    first_ns = next(in_capture_order(read())).publish_time_ns
+    last_ns = max(session.last(chosen.topics)[1] for session, chosen in logs)
+    return Playback(read, first_ns, last_ns, options, clock)

@@ -1,0 +1,175 @@
+"""The step from the markers of a frame to world positions, by the joint model of their camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ipsys_log.calibration.joint.locate import LevelPositions, locate_markers
+from ipsys_log.calibration.joint.locate_poses import Poses, hold_heights, locate_poses
+from ipsys_log.calibration.joint.model import JointModel
+from ipsys_log.calibration.joint.payload import restore_joint
+from ipsys_log.calibration.joint.settings import JointSettings
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
+from ipsys_log.messages.arrays import Array
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
+
+# Corners without a covariance have about this error.
+_CORNER_SIGMA_PX = 0.25
+_HEIGHT_SIGMA_M = JointSettings().robot_height_sigma_m
+# A marker that is not where its corners say that it is has larger residuals. One in a million is larger by
+# chance: with five degrees of freedom at a known height, and with two for a full pose.
+MOST_CHI2 = 37.0
+MOST_CHI2_OF_POSE = 27.6
+# A height by the corners that differs by more than this multiple of its uncertainty contradicts the rig.
+_MOST_SIGMAS = 4.0
+
+
+class _Located(NamedTuple):
+    """A located marker.
+
+    ``fits`` is True if its residuals are usual. ``noise_m2`` (3, 3) and ``heading_noise_rad`` are the part of
+    the uncertainty that changes from frame to frame. ``height`` is a height that contradicts the rig.
+    """
+
+    point_m: Array
+    heading_rad: float
+    covariance_m2: Array
+    fits: bool
+    noise_m2: Array
+    heading_noise_rad: float
+    height: HeightSighting | None = None
+
+
+def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
+    """Return the covariances (n, 8, 8) of corners, with the usual one for those that have none."""
+    unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
+    return np.array([unknown if one is None else one for one in covariances_px2]).reshape(-1, 8, 8)
+
+
+class LocateCorners:
+    """The step from markers to positions. A camera that is not in the model has no positions.
+
+    A marker whose height is in the rig is level, at this height. If its corners contradict this, it gets its
+    full pose: at this height if only its tilt is unusual, otherwise at the height by its corners, which an
+    event names. Markers without a height get their full pose. Reference markers are no robots: they have no
+    positions.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._name = model.name
+        self._cameras = restore_joint(model)
+        self._rig: Rig | None = None
+        self._heights = ContradictedHeights(model)
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        if isinstance(message.payload, Rig):
+            self._rig = message.payload
+            return
+        if not isinstance(message.payload, Markers):
+            return
+        camera = self._cameras.get(str(message.camera))
+        if camera is not None:
+            rig = self._rig
+            markers = [m for m in message.payload.markers if rig is None or not rig.is_reference(m.id)]
+            located = self._locate(camera, markers)
+            heights = [row.height for row in located if row.height is not None]
+            yield from self._heights(message.publish_time_ns, message.camera, heights)
+            rows = zip(markers, located, strict=True)
+            positions = tuple(_position(camera, *row) for row in rows if np.isfinite(row[1].point_m).all())
+            yield Positions(message.publish_time_ns, positions)
+
+    def _locate(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
+        if markers and self._rig is None:
+            raise IpsysError(f"{self._name} needs the size of the markers; give a rig with --rig lab.toml")
+        located: dict[int, _Located] = {}
+        for by_height in (True, False):
+            rows = [n for n, marker in enumerate(markers) if self._has_height(marker) is by_height]
+            own = [markers[row] for row in rows]
+            if own:
+                locate = self._locate_at_height if by_height else self._locate_poses
+                located.update(zip(rows, locate(camera, own), strict=True))
+        return [located[n] for n in range(len(markers))]
+
+    def _has_height(self, marker: Marker) -> bool:
+        return self._rig is not None and self._rig.height_of(marker.id) is not None
+
+    def _locate_at_height(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
+        assert self._rig is not None
+        sigmas_m = [self._rig.height_sigma_of(marker.id) for marker in markers]
+        heights_m = np.array([self._rig.height_of(marker.id) for marker in markers], dtype=np.float64)
+        known_m = np.array([_HEIGHT_SIGMA_M if sigma_m is None else sigma_m for sigma_m in sigmas_m])
+        lengths_m = np.array([self._rig.length_of(marker.id) for marker in markers])
+        found = locate_markers(camera, *_corners(markers), heights_m, lengths_m, known_m)
+        rows = _rows(found, MOST_CHI2)
+        odd = [n for n, row in enumerate(rows) if not row.fits]
+        if odd:
+            poses = locate_poses(camera, *_corners([markers[n] for n in odd]), lengths_m[odd])
+            own = [markers[n] for n in odd]
+            for n, row in zip(
+                odd, _contradictions(camera, own, poses, heights_m[odd], known_m[odd]), strict=True
+            ):
+                rows[n] = rows[n] if row is None else row
+        return rows
+
+    def _locate_poses(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
+        assert self._rig is not None
+        lengths_m = np.array([self._rig.length_of(marker.id) for marker in markers])
+        return _rows(locate_poses(camera, *_corners(markers), lengths_m), MOST_CHI2_OF_POSE)
+
+
+def _rows(located: LevelPositions | Poses, most_chi2: float) -> list[_Located]:
+    """Return the rows of located markers; residuals above ``most_chi2`` are unusual."""
+    columns = (
+        located.points_m,
+        located.headings_rad.tolist(),
+        located.covariances_m2,
+        (located.chi2 < most_chi2).tolist(),
+        located.noise_m2,
+        located.heading_noise_rad.tolist(),
+    )
+    return [_Located(*row) for row in zip(*columns, strict=True)]
+
+
+def _contradictions(
+    camera: JointModel, markers: Sequence[Marker], poses: Poses, heights_m: Array, sigmas_m: Array
+) -> list[_Located | None]:
+    """Return the rows of markers that are not level at their heights; None for corners of no pose."""
+    held, above_m, apart_m = hold_heights(camera, poses, heights_m, sigmas_m)
+    free, tilted = _rows(poses, MOST_CHI2_OF_POSE), _rows(held, MOST_CHI2_OF_POSE)
+    rows: list[_Located | None] = []
+    for n, marker in enumerate(markers):
+        if not free[n].fits:
+            rows.append(None)
+        elif abs(above_m[n] - heights_m[n]) <= _MOST_SIGMAS * apart_m[n]:
+            rows.append(tilted[n])
+        else:
+            numbers = heights_m[n], free[n].point_m, above_m[n], apart_m[n]
+            rows.append(free[n]._replace(height=HeightSighting(marker.id, *numbers)))
+    return rows
+
+
+def _position(camera: JointModel, marker: Marker, located: _Located) -> Position:
+    x_m, y_m, z_m = located.point_m.tolist()
+    time_offset_ns = _time_offset_ns(camera, marker)
+    inside = located.fits and camera.is_certain and not marker.contradicted
+    own = located.heading_rad, located.covariance_m2, inside
+    noise = located.noise_m2, located.heading_noise_rad
+    return Position(marker.id, x_m, y_m, z_m, *own, time_offset_ns, *noise)
+
+
+def _corners(markers: Sequence[Marker]) -> tuple[Array, Array]:
+    """Return the corners (n, 4, 2) of markers, and their covariances (n, 8, 8)."""
+    corners_px = np.array([marker.corners_px for marker in markers], dtype=np.float64)
+    return corners_px, corner_covariances([marker.covariance_px2 for marker in markers])
+
+
+def _time_offset_ns(camera: JointModel, marker: Marker) -> int | None:
+    """Return the time from the stamp of the frame to the exposure of the marker, by the common clock."""
+    rows = float(marker.corners_px[:, 1].mean())
+    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s + camera.clock_s) * NS_PER_S)
+    return offset_ns if offset_ns or marker.time_offset_ns is not None else None

@@ -1,0 +1,138 @@
+"""The recent sightings of one robot in order of time, each with the state after it."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.models.tracking.filter import Sightings, States
+
+# A sighting that is older than the newest one by more than this is left out.
+HISTORY_NS = NS_PER_S // 2
+# More instants than this are checked for those that no late sighting can reach.
+_MOST_ROWS = 256
+_SLACK_NS = HISTORY_NS // 5
+# A camera, and whether the position is inside the calibrated volume.
+Seen = tuple[str, bool | None]
+
+
+class Sighted(NamedTuple):
+    """An accepted sighting: a row of the sightings of a message.
+
+    ``inside`` is the flag of the position, see :class:`ipsys_log.messages.Position`.
+    """
+
+    time_ns: int
+    camera: str
+    inside: bool | None
+    sightings: Sightings
+    sighting: int
+
+
+class Record(NamedTuple):
+    """An accepted sighting, and the state after it: one row each of the arrays of a message.
+
+    ``inside`` is the flag of the position, see :class:`ipsys_log.messages.Position`.
+    """
+
+    time_ns: int
+    camera: str
+    inside: bool | None
+    sightings: Sightings
+    sighting: int
+    states: States
+    state: int
+
+    @property
+    def sighted(self) -> Sighted:
+        """The sighting without the state."""
+        return Sighted(self.time_ns, self.camera, self.inside, self.sightings, self.sighting)
+
+
+@dataclass(slots=True)
+class History:
+    """The records of one robot, for as long as a late sighting can change them.
+
+    ``times_ns`` are the times of the records, and ``rows_ns`` the instants of the poses that were given out.
+    ``began_ns`` is the time of the first record. ``last_ns`` has the time of the last sighting by each camera
+    with each flag. A ``complete`` history keeps the ``older`` sightings without their states, for processing
+    after the recording.
+    """
+
+    records: list[Record] = field(default_factory=list)
+    times_ns: list[int] = field(default_factory=list)
+    rows_ns: set[int] = field(default_factory=set)
+    complete: bool = False
+    began_ns: int = 0
+    last_ns: dict[Seen, int] = field(default_factory=dict)
+    older: list[Sighted] = field(default_factory=list)
+
+    @property
+    def newest(self) -> Record:
+        """The record with the latest time."""
+        return self.records[-1]
+
+    def place_of(self, time_ns: int) -> int:
+        """Return the number of records at or before a time; those of the same time come first."""
+        return bisect_right(self.times_ns, time_ns)
+
+    def append(self, record: Record) -> None:
+        """Add a record after the others, and forget those that no late sighting can reach."""
+        if not self.records:
+            self.began_ns = record.time_ns
+        self.records.append(record)
+        self.times_ns.append(record.time_ns)
+        self.last_ns[record.camera, record.inside] = record.time_ns
+        self._forget()
+
+    def replace_from(self, place: int, records: list[Record]) -> None:
+        """Replace the records from a place on, and forget those that no late sighting can reach."""
+        self.began_ns = min(self.began_ns, records[0].time_ns)
+        self.records[place:] = records
+        self.times_ns[place:] = [record.time_ns for record in records]
+        for record in records:
+            seen = record.camera, record.inside
+            self.last_ns[seen] = max(self.last_ns.get(seen, 0), record.time_ns)
+        self._forget()
+
+    def _forget(self) -> None:
+        oldest_ns = self.times_ns[-1] - HISTORY_NS
+        if self.times_ns[0] > oldest_ns - _SLACK_NS:  # mostly: several records are forgotten together
+            return
+        # The last record before the oldest time stays: a sighting at that time starts from it.
+        forgotten = max(bisect_right(self.times_ns, oldest_ns) - 1, 0)
+        if forgotten:
+            if self.complete:
+                self.older += [record.sighted for record in self.records[:forgotten]]
+            del self.records[:forgotten], self.times_ns[:forgotten]
+        if len(self.rows_ns) > _MOST_ROWS:
+            self.rows_ns = {time_ns for time_ns in self.rows_ns if time_ns >= oldest_ns}
+
+    def everything(self) -> list[Sighted]:
+        """Return all sightings in order of time; of a ``complete`` history."""
+        return [*self.older, *(record.sighted for record in self.records)]
+
+    def recent(self, time_ns: int, window_ns: int) -> tuple[Record, tuple[str, ...], bool | None]:
+        """Return the last record of a window that ends at a time, and the sightings of the window, combined.
+
+        Parameters
+        ----------
+        time_ns : of a record.
+        window_ns : at most :data:`HISTORY_NS`.
+        """
+        first_ns, newest = time_ns - window_ns, self.records[-1]
+        if newest.time_ns == time_ns:  # mostly
+            seen = tuple([one for one, last_ns in self.last_ns.items() if last_ns >= first_ns])
+            return newest, *combine_seen(seen)
+        records = self.records[bisect_left(self.times_ns, first_ns) : self.place_of(time_ns)]
+        return records[-1], *combine_seen(tuple((one.camera, one.inside) for one in records))
+
+
+@lru_cache(maxsize=1024)  # robots have few combinations of cameras, again and again
+def combine_seen(seen: tuple[Seen, ...]) -> tuple[tuple[str, ...], bool | None]:
+    """Return the cameras of sightings, sorted, and whether one of them is inside; None if no camera tells."""
+    flags = [inside for _, inside in seen if inside is not None]
+    return tuple(sorted({camera for camera, _ in seen})), any(flags) if flags else None

@@ -1,1 +1,0 @@
-"""The rig file: cameras, robots and markers of a lab."""

@@ -1,1 +1,0 @@
-"""Runs of stages on logs: their plan, provenance, state, execution and verification."""

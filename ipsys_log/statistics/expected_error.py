@@ -1,0 +1,204 @@
+"""Expected error over the floor of a joint calibration, and its gaps.
+
+The covariance of a joint calibration gives the expected error at each node of a grid, without ground truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import JointModel
+from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.statistics.floor_grid import FloorGrid
+from ipsys_log.statistics.plan import mean_length
+from ipsys_log.vision.lenses import in_image, project
+from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.rotations import level_turns
+
+# A marker counts as visible if a square of this multiple of its side is wholly in the image.
+WHOLE_PRINT = 1.4
+# A node is covered if the camera saw a marker nearer than this: the floor changes little over this distance.
+_COVERED_M = 0.35
+# Smaller gaps are not reported.
+_LEAST_GAP_M2 = 0.1
+# So many nodes at once have modes of a few dozen megabytes, in a hall of 24 cameras.
+_AT_ONCE = 1000
+_ALL = slice(None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExpectedErrors:
+    """Expected errors of the positions by one camera.
+
+    Attributes
+    ----------
+    camera : its name.
+    seen : (b * a,), mask of the nodes of the grid at which the image contains a whole marker.
+    errors_m : (n,), expected 2D errors at the n seen nodes, by the calibration alone.
+    model, view, length_m : the calibrated camera, the markers at these nodes, and their side.
+    """
+
+    camera: str
+    seen: Mask
+    errors_m: Array
+    model: JointModel
+    view: VisibleMarkers
+    length_m: float
+
+    def modes_m(self, rows: slice = _ALL) -> Array:
+        """Return the errors at some nodes as functions of the m normal numbers of the calibration, (r, 2, m).
+
+        They are computed again in each call: those of all nodes of a hall take gigabytes.
+        """
+        return _modes_at(self.model, self.view, self.length_m, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorGap:
+    """A part of the floor that a camera sees, but where it saw no marker.
+
+    ``low_m`` and ``high_m`` (2,) are its corners, ``error_m`` is the mean expected error in it.
+    """
+
+    camera: str
+    area_m2: float
+    low_m: Array
+    high_m: Array
+    error_m: float
+
+
+def expect_errors(
+    models: Mapping[str, JointModel],
+    sizes_px: Mapping[str, tuple[int, int]],
+    grid: FloorGrid,
+    height_m: float,
+    length_m: float,
+) -> list[ExpectedErrors]:
+    """Return the expected errors of each camera, for markers at a height above the floor.
+
+    Parameters
+    ----------
+    models : by camera.
+    sizes_px : width and height of the images, by camera.
+    grid : nodes of the floor.
+    height_m : height of the markers.
+    length_m : side of the markers.
+    """
+    expected = []
+    for camera, model in models.items():
+        view = see_markers(model, sizes_px[camera], grid.nodes_m, height_m, length_m)
+        errors_m = np.zeros(len(view.corners_px))
+        for first in range(0, len(errors_m), _AT_ONCE):
+            rows = slice(first, first + _AT_ONCE)
+            modes_m = _modes_at(model, view, length_m, rows)
+            errors_m[rows] = mean_lengths(modes_m @ modes_m.swapaxes(1, 2))
+        expected.append(ExpectedErrors(camera, view.seen, errors_m, model, view, length_m))
+    return expected
+
+
+def camera_modes(
+    model: JointModel, size_px: tuple[int, int], points_m: Array, heights_m: Array | float, length_m: float
+) -> tuple[Mask, Array]:
+    """Return a mask (p,) of the points (p, 2) at which a camera sees a whole marker, and their modes.
+
+    ``heights_m`` is a number or (p,).
+    """
+    view = see_markers(model, size_px, points_m, heights_m, length_m)
+    return view.seen, _modes_at(model, view, length_m, _ALL)
+
+
+def _modes_at(model: JointModel, view: VisibleMarkers, length_m: float, rows: slice) -> Array:
+    """Return the modes (r, 2, m) of some of the seen markers."""
+    corners_px, heights_m = view.corners_px[rows], view.heights_m[rows]
+    count = len(corners_px)
+    if not count:
+        return np.zeros((0, 2, model.modes.shape[1]))
+    exact = np.broadcast_to(1e-6 * np.eye(8), (count, 8, 8))
+    lengths_m = np.full(count, length_m)
+    located = locate_markers(model, corners_px, exact, heights_m, lengths_m, 0.0, tilt_sigma_rad=0.0)
+    return located.modes_m[:, :2]
+
+
+class VisibleMarkers(NamedTuple):
+    """Markers on the floor as a camera sees them: a mask (p,), and the n seen ones.
+
+    ``corners_px`` (n, 4, 2) are exact, ``centres_m`` (n, 3) and ``turns`` (n, 3, 3) are the poses in the
+    world, ``heights_m`` (n,) the heights above the floor.
+    """
+
+    seen: Mask
+    corners_px: Array
+    centres_m: Array
+    turns: Array
+    heights_m: Array
+
+
+def see_markers(
+    model: JointModel,
+    size_px: tuple[int, int],
+    points_m: Array,
+    heights_m: Array | float,
+    length_m: float,
+    headings_rad: Array | float = 0.0,
+) -> VisibleMarkers:
+    """Return the markers at points (p, 2) that are whole in the image of a camera, with their margins."""
+    lens = replace(model.calibration, width=size_px[0], height=size_px[1])
+    floor_m = model.floor.heights(points_m, model.amplitudes)[0]
+    heights_m = np.broadcast_to(heights_m, floor_m.shape)
+    centres_m = np.column_stack([points_m, heights_m + floor_m])
+    turns = level_turns(np.broadcast_to(headings_rad, floor_m.shape))
+
+    def corners_c(side_m: float, rows: Mask) -> Array:
+        corners_m = centres_m[rows, None] + marker_corners(side_m) @ turns[rows].swapaxes(1, 2)
+        return np.asarray((corners_m.reshape(-1, 3) - model.origin_m) @ model.camera_from_world.T)
+
+    everywhere = np.ones(len(points_m), dtype=np.bool_)
+    around = corners_c(WHOLE_PRINT * length_m, everywhere)
+    seen: Mask = np.asarray(in_image(around, lens).reshape(-1, 4).all(axis=1), dtype=np.bool_)
+    corners_px = project(corners_c(length_m * model.scale, seen), lens).reshape(-1, 4, 2)
+    return VisibleMarkers(seen, corners_px, centres_m[seen], turns[seen], heights_m[seen])
+
+
+def mean_lengths(covariances_m2: Array) -> Array:
+    """Return the mean lengths (n,) of errors in the plane with covariances (n, 2, 2)."""
+    return mean_length(covariances_m2[:, [0, 1, 0], [0, 1, 1]].T)
+
+
+def find_floor_gaps(
+    expected: ExpectedErrors, grid: FloorGrid, places_m: Array
+) -> tuple[float, list[FloorGap]]:
+    """Return the share of the seen floor where a camera saw a marker, and the gaps, largest first.
+
+    Parameters
+    ----------
+    expected : of the camera.
+    grid : nodes of the floor.
+    places_m : (k, 2), positions of the markers that the camera saw.
+    """
+    if not expected.seen.any():
+        return 0.0, []
+    nodes_m = grid.nodes_m[expected.seen]
+    apart_m = cKDTree(places_m).query(nodes_m)[0] if len(places_m) else np.full(len(nodes_m), np.inf)
+    open_nodes: Mask = np.asarray(apart_m > _COVERED_M)
+    shape = len(grid.ys_m), len(grid.xs_m)
+    mask = np.zeros(len(expected.seen), dtype=np.bool_)
+    mask[expected.seen] = open_nodes
+    errors_m = np.full(len(mask), np.nan)
+    errors_m[expected.seen] = expected.errors_m
+    gaps = [
+        FloorGap(
+            expected.camera,
+            patch.area_m2,
+            patch.low_m,
+            patch.high_m,
+            float(errors_m.reshape(shape)[patch.inside].mean()),
+        )
+        for patch in grid.patches(mask.reshape(shape), _LEAST_GAP_M2)
+    ]
+    return float(1 - open_nodes.mean()), gaps

@@ -1,0 +1,279 @@
+"""Evaluation of the joint model: errors on points that are not in its fit, learning curve, and outliers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ipsys_log.calibration.joint.diagnosis import find_faults, point_covariances
+from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.model import JointModel, build_models
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.payload import restore_joint
+from ipsys_log.errors import FitError
+from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
+from ipsys_log.messages.arrays import Array
+from ipsys_log.statistics.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
+from ipsys_log.statistics.cross_validation import (
+    FOLDS,
+    Study,
+    gather_points,
+    learning_curve,
+    learning_sizes,
+    make_folds,
+    published_curve,
+)
+from ipsys_log.statistics.joint_calibration import fit_without
+from ipsys_log.statistics.outliers import describe_outlier
+from ipsys_log.statistics.tape import RiggedMeasurement
+
+Models = Mapping[str, JointModel]
+
+# Random subsets of each size. A fit takes seconds with a drive, so these are fewer than for other models.
+JOINT_SUBSETS = 3
+# Kinds of faults that concern the measurement of a point.
+_OF_A_POINT = ("distance", "height", "place", "swapped", "side")
+# Error of the place of a point that is not in the fit, by the shape of all points.
+_SHAPE_SIGMA_M = 0.01
+
+
+def evaluate_joint(
+    model: Model,
+    observations: Observations,
+    study: Study,
+    excluded: tuple[Suspect, ...],
+    time_ns: int,
+    notes: list[str],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Evaluation:
+    """Compute errors on held-out points and by cross-validation, the learning curve, and outliers.
+
+    All fits use all drives. The cross-validation has one repeat, because a fit takes seconds.
+
+    Parameters
+    ----------
+    model : the fitted joint model.
+    observations : all observations of the log.
+    study : the calibration points; ``seed`` is None for a model of another log, which is not fitted again.
+    excluded : the gross outliers. The errors and the learning curve are without them.
+    time_ns : of the last input.
+    notes : list of remarks; each impossible step adds a remark.
+    progress : called with the number of steps done, and the number of all steps.
+    """
+    study = replace(study, pairs=_located(observations, study.pairs))
+    cameras: Mapping[str, JointModel] = restore_joint(model)
+    used = {pair.measurement for camera in model.cameras for pair in camera.pairs}
+    if study.seed is None:
+        rows = _held_out_rows(model, cameras, observations, study, used)
+        return Evaluation(time_ns, model.name, tuple(rows))
+    gross = {suspect.measurement for suspect in excluded}
+    clean, reduced = study, cameras
+    if gross:
+        try:
+            reduced = _refit_without(gross, observations, used)
+            clean = _without(study, gross)
+        except FitError as error:
+            notes.append(f"gross outliers are not excluded: {error}")
+            excluded, gross = (), set()
+    points = gather_points(clean.pairs)
+    sizes = learning_sizes(model.name, points) if points else []
+    steps = _Steps(FOLDS * (1 + bool(gross)) + len(sizes) + 1, progress)
+    rows = _held_out_rows(model, reduced, observations, clean, used)
+    rows += _cross_validated_rows(model, observations, clean, gross, notes, steps)
+    learning = _learning(model.name, observations, clean, gross, steps)
+    with_excluded: list[CameraEvaluation] = []
+    if gross:
+        with_excluded = _held_out_rows(model, cameras, observations, study, used)
+        with_excluded += _cross_validated_rows(model, observations, study, set(), [], steps)
+    suspects = _suspects(observations, study, notes)
+    steps.done()
+    return Evaluation(
+        time_ns, model.name, tuple(rows), tuple(learning), suspects, excluded, tuple(with_excluded)
+    )
+
+
+def _refit_without(names: set[str], observations: Observations, used: Collection[str]) -> Models:
+    """Return the models of a fit to the points ``used``, without some of them."""
+    unused = {point.name for point in observations.points} - set(used)
+    return build_models(fit_without(observations, unused | names))
+
+
+class _Steps:
+    """The steps of an evaluation, and how many of them are done."""
+
+    def __init__(self, total: int, progress: Callable[[int, int], None]) -> None:
+        self._count, self._total, self._progress = 0, total, progress
+        progress(0, total)
+
+    def done(self) -> None:
+        self._count += 1
+        self._progress(min(self._count, self._total), self._total)
+
+
+def _located(observations: Observations, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, list[Pair]]:
+    """Return the pairs whose corners a camera saw in the stationary interval."""
+    located = {}
+    for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
+        seen = {observations.points[point].name for point in sightings.point.tolist() if point >= 0}
+        located[camera.name] = [pair for pair in pairs.get(camera.name, ()) if pair.measurement in seen]
+    return located
+
+
+def _without(study: Study, names: Collection[str]) -> Study:
+    pairs = {
+        camera: [pair for pair in own if pair.measurement not in names] for camera, own in study.pairs.items()
+    }
+    return replace(study, pairs=pairs, held_out=study.held_out - set(names))
+
+
+def _held_out_rows(
+    model: Model, cameras: Models, observations: Observations, study: Study, used: Collection[str]
+) -> list[CameraEvaluation]:
+    predicted = _predict(cameras, observations, study, study.held_out - set(used))
+    return _error_rows(model, [predicted], study, HELD_OUT)
+
+
+def _cross_validated_rows(
+    model: Model,
+    observations: Observations,
+    study: Study,
+    left_out: set[str],
+    notes: list[str],
+    steps: _Steps,
+) -> list[CameraEvaluation]:
+    assert study.seed is not None
+    parts = []
+    try:
+        for fold in make_folds(gather_points(study.pairs), FOLDS, np.random.default_rng(study.seed)):
+            fitted = build_models(fit_without(observations, fold | left_out))
+            parts.append(_predict(fitted, observations, study, fold))
+            steps.done()
+    except FitError as error:
+        notes.append(f"no cross-validation: {error}")
+        return []
+    return _error_rows(model, parts, study, CROSS_VALIDATION)
+
+
+def _learning(
+    name: str, observations: Observations, study: Study, excluded: set[str], steps: _Steps
+) -> list[LearningPoint]:
+    """Return the errors by the number of calibration points, each with all drives."""
+    assert study.seed is not None
+    cameras = gather_points(study.pairs)
+    if not cameras:
+        return []
+
+    def predict(left_out: Collection[str]) -> dict[str, Array]:
+        models = build_models(fit_without(observations, {*left_out, *excluded}))
+        # A camera without a sighting has no model: then this subset counts for no camera.
+        if missing := cameras.keys() - models.keys():
+            raise FitError(f"camera {min(missing)}: it saw no point of the subset")
+        everything = {name for places in cameras.values() for name in places.names}
+        predicted = _predict(models, observations, study, everything)
+        return {camera: points_m for camera, (_, points_m, _) in predicted.items()}
+
+    points = published_curve(name, cameras, study.subsets, study.held_out, predict)
+    for more in learning_curve(name, cameras, study.seed, predict, JOINT_SUBSETS):
+        points += more
+        steps.done()
+    return points
+
+
+def _suspects(observations: Observations, study: Study, notes: list[str]) -> tuple[Suspect, ...]:
+    """Return the measurements that contradict a fit to all points."""
+    try:
+        return _find_joint_outliers(fit_without(observations, ()), study.places)
+    except FitError as error:
+        notes.append(f"no search for outliers: {error}")
+        return ()
+
+
+# Pairs of a camera, with their predictions (n, 3) and covariances (n, 3, 3).
+_Predicted = dict[str, tuple[list[Pair], Array, Array]]
+
+
+def _predict(cameras: Models, observations: Observations, study: Study, names: Collection[str]) -> _Predicted:
+    """Locate the markers at some calibration points by their mean corners and measured heights."""
+    predicted: _Predicted = {}
+    for camera, sightings in zip(observations.cameras, observations.sightings, strict=True):
+        row_of = {
+            observations.points[point].name: row
+            for row, point in enumerate(sightings.point.tolist())
+            if point >= 0
+        }
+        own = [pair for pair in study.pairs.get(camera.name, ()) if pair.measurement in names]
+        model = cameras.get(camera.name)
+        if model is None or not own:
+            continue
+        rows = [row_of[pair.measurement] for pair in own]
+        points = [observations.points[int(sightings.point[row])] for row in rows]
+        located = locate_markers(
+            model,
+            sightings.pixels[rows],
+            sightings.covariances_px2[rows],
+            np.array([pair.world_m[2] for pair in own]),
+            np.array([observations.bodies[point.body].length_m for point in points]),
+            np.array([point.height_sigma_m for point in points]),
+        )
+        predicted[camera.name] = (own, located.points_m, located.covariances_m2)
+    return predicted
+
+
+def _error_rows(
+    model: Model, parts: Sequence[_Predicted], study: Study, scheme: str
+) -> list[CameraEvaluation]:
+    found: dict[str, tuple[list[Pair], Array]] = {}
+    covariances: dict[str, Array | None] = {}
+    for camera in sorted({camera for part in parts for camera in part}):
+        own = [part[camera] for part in parts if camera in part]
+        predicted_m = np.concatenate([points_m for _, points_m, _ in own])[None]
+        found[camera] = ([pair for kept, _, _ in own for pair in kept], predicted_m)
+        covariances[camera] = np.concatenate([c for _, _, c in own])
+    return error_rows(model, found, covariances, study.truth, scheme)
+
+
+def _find_joint_outliers(fit: JointFit, places: Sequence[RiggedMeasurement]) -> tuple[Suspect, ...]:
+    """Return the measurements that contradict a joint fit, the one with the largest error first.
+
+    The loss of the fit is robust: a wrong reading has nearly no weight in the estimated point. So this point
+    is the prediction from all other observations, and no further fit is necessary.
+
+    Parameters
+    ----------
+    fit : the fit to all measurements.
+    places : the measurements, each with the rig in force.
+
+    Raises
+    ------
+    IpsysError
+        A measurement forms no world point.
+    """
+    by_id = {place.measurement.id: place for place in places}
+    numbers = {point.name: number for number, point in enumerate(fit.observations.points)}
+    floor_m = fit.problem.layout.floor.heights(
+        fit.state.positions_m[:, :2], fit.state.values[fit.problem.layout.modes]
+    )[0]
+    usual_m2 = point_covariances(fit)
+    outliers = []
+    for fault in find_faults(fit):
+        if fault.kind not in _OF_A_POINT or fault.subject not in by_id:
+            continue
+        number = numbers.get(fault.subject, -1)
+        if fault.place_m is not None:
+            predicted_m = np.array([*fault.place_m, by_id[fault.subject].measurement.height_m or 0.0])
+            covariance_m2 = _SHAPE_SIGMA_M**2 * np.eye(3)
+        else:
+            predicted_m, covariance_m2 = fit.state.positions_m[number].copy(), usual_m2[number]
+            # A measured height is that above the floor, and not that above the plane z = 0.
+            predicted_m[2] -= floor_m[number]
+        cameras = tuple(
+            camera.name
+            for camera, sightings in zip(fit.observations.cameras, fit.observations.sightings, strict=True)
+            if number >= 0 and (sightings.point == number).any()
+        )
+        place = by_id[fault.subject]
+        outliers.append(describe_outlier(place, cameras, predicted_m, covariance_m2, fault.score))
+    return tuple(sorted(outliers, key=lambda suspect: -float((suspect.residual_m**2).sum())))

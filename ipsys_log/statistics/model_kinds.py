@@ -1,0 +1,210 @@
+"""The two kinds of models, with one interface: models of camera points, and models of corners.
+
+A model of camera points maps those of one camera. A model of corners is a joint calibration of all cameras.
+The rest of the program asks :func:`model_kind` what a model reads, and lets it fit, evaluate and apply it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from ipsys_log.errors import FitError
+from ipsys_log.messages import Evaluation, Model, Pair, Rig
+from ipsys_log.messages.arrays import Array
+from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG, Channel
+from ipsys_log.messages.stage import Progress, StageView, Step
+from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.models.locate_points import LocatePoints
+from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
+from ipsys_log.statistics.calibration_points import training_pairs
+from ipsys_log.statistics.camera_models import check_different, check_line, check_pairs, fit_model
+from ipsys_log.statistics.cross_validation import REPEATS, Study, gather_points
+from ipsys_log.statistics.pairs import level_cameras
+from ipsys_log.statistics.point_evaluation import evaluate_model, fitted_pairs, gross_outliers
+
+if TYPE_CHECKING:
+    from ipsys_log.calibration.joint.model import JointModel
+
+# The channels that a joint calibration reads.
+JOINT_READS = (RIG, CALIBRATIONS, MARKERS, CAMERA_POINTS, MEASUREMENTS)
+
+
+class PointModels:
+    """The models of camera points.
+
+    Attributes
+    ----------
+    fit_reads : the channels that a fit reads.
+    repeats : number of repeats of a cross-validation.
+    is_checked : the checks before a fit find all its faults.
+    """
+
+    fit_reads: tuple[Channel, ...] = (RIG, CAMERA_POINTS, MEASUREMENTS)
+    repeats = REPEATS
+    is_checked = True
+
+    def reads(self, name: str) -> tuple[Channel, ...]:
+        """Return the channels that positions follow from."""
+        return (RIG, CAMERA_POINTS) if reads_height(name) else (CAMERA_POINTS,)
+
+    def fit_part(self, rig: Rig) -> object:
+        """Return the part of the rig on which a fit and its evaluation depend."""
+        return rig.reference_points, {m.id for m in rig.markers}
+
+    def place_part(self, rig: Rig) -> object:
+        """Return the part of the rig on which positions depend."""
+        heights = {(m.id, m.height_m, m.height_sigma_m) for m in rig.markers}
+        return rig.marker_height_m, rig.marker_height_sigma_m, heights
+
+    def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
+        """Check that a log has what a fit to points (n, 3) needs; ``where`` is the start of an error text."""
+        if len(train_m) < min_pairs(name):
+            raise FitError(
+                f"{where}: {name} needs at least {min_pairs(name)} calibration points for each camera, "
+                f"but the log has {len(train_m)} in all; measure more"
+                + ("" if name == "rigid" else ", or use --model rigid")
+            )
+        check_different(name, where, train_m)
+        check_line(where, train_m)
+
+    def check_pairs(self, name: str, pairs: Mapping[str, Sequence[Pair]]) -> None:
+        """Check that the observations of each camera are enough for a fit, if that is known before."""
+        check_pairs(name, pairs)
+
+    def fit(
+        self, name: str, view: StageView, train: Collection[str], notes: list[str], progress: Progress
+    ) -> Model:
+        """Fit a model of a log to the calibration points ``train``; add remarks to ``notes``."""
+        pairs = training_pairs(view, train)
+        fitted = fit_model(name, pairs, view.last_ns(*self.fit_reads), progress)
+        notes.extend(_unused_points(pairs, train))
+        notes.extend(
+            f"camera {camera}: all calibration points have the height {height_m * CM_PER_M:.1f} cm: the "
+            "model is valid for x and y, and returns only this height"
+            for camera, height_m in level_cameras(fitted).items()
+        )
+        return fitted
+
+    def evaluate(
+        self,
+        model: Model,
+        view: StageView,
+        study: Study,
+        time_ns: int,
+        notes: list[str],
+        progress: Progress,
+    ) -> Evaluation:
+        """Compute the errors of a model; add remarks to ``notes``."""
+        return evaluate_model(model, study, time_ns, notes, progress)
+
+    def step(self, model: Model) -> Step:
+        """Return the step from messages to positions."""
+        return LocatePoints(model)
+
+    def restore(self, model: Model) -> Mapping[str, AppliedModel]:
+        """Return the fitted model of each camera."""
+        return {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
+
+
+def _unused_points(pairs: Mapping[str, list[Pair]], train: Collection[str]) -> list[str]:
+    """Return remarks on points that no camera saw, and on cameras that saw no point."""
+    seen = {pair.measurement for camera_pairs in pairs.values() for pair in camera_pairs}
+    unseen = sorted(set(train) - seen)
+    lines = [
+        f"camera {name} saw no calibration point: it has no model"
+        for name, camera_pairs in pairs.items()
+        if not camera_pairs
+    ]
+    if unseen:
+        names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")
+        lines.append(
+            f"{len(unseen)} of {len(train)} calibration points have no stationary interval in any "
+            f"camera: {names}"
+        )
+    return lines
+
+
+class CornerModels:
+    """The models of corners, with the interface of :class:`PointModels`.
+
+    One fit has all cameras, drives and calibration points. Its modules are imported late: scipy takes 1 s,
+    and most commands need no such model.
+    """
+
+    fit_reads: tuple[Channel, ...] = JOINT_READS
+    repeats = 1  # a fit takes seconds
+    is_checked = False  # only a fit shows if the corners determine all cameras
+
+    def reads(self, name: str) -> tuple[Channel, ...]:
+        return RIG, MARKERS
+
+    def fit_part(self, rig: Rig) -> object:
+        markers = {
+            (m.id, rig.length_of(m.id), rig.height_of(m.id), rig.height_sigma_of(m.id)) for m in rig.markers
+        }
+        cameras = {(camera.name, camera.row_time_ns) for camera in rig.cameras}
+        tape = rig.tape_sigma_m, rig.tape_scale_sigma, rig.ab_sigma_m
+        return _POINT_KIND.fit_part(rig), markers, cameras, tape
+
+    def place_part(self, rig: Rig) -> object:
+        references = {m.id for m in rig.reference_markers}
+        lengths = {(m.id, m.length_m) for m in rig.markers}
+        return _POINT_KIND.place_part(rig), rig.marker_length_m, lengths, references
+
+    def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
+        if not has_corners:
+            raise FitError(
+                f"{where}: {name} is fitted to the corners of markers, but the log has only camera points; "
+                "use --model best"
+            )
+
+    def check_pairs(self, name: str, pairs: Mapping[str, Sequence[Pair]]) -> None:
+        """Check nothing: a drive is enough."""
+
+    def fit(
+        self,
+        name: str,
+        view: StageView,
+        train: Collection[str],
+        notes: list[str],
+        progress: Progress,
+    ) -> Model:
+        from ipsys_log.statistics.joint_calibration import fit_joint_model
+
+        return fit_joint_model(view, train, view.last_ns(*self.fit_reads), notes, progress)
+
+    def evaluate(
+        self, model: Model, view: StageView, study: Study, time_ns: int, notes: list[str], progress: Progress
+    ) -> Evaluation:
+        """Compute the errors without the gross outliers that all models leave out."""
+        from ipsys_log.statistics.joint_calibration import observe
+        from ipsys_log.statistics.joint_evaluation import evaluate_joint
+
+        cameras = gather_points(fitted_pairs(model, study))
+        excluded = () if study.seed is None else gross_outliers(cameras, study.places)
+        return evaluate_joint(model, observe(view), study, excluded, time_ns, notes, progress)
+
+    def step(self, model: Model) -> Step:
+        from ipsys_log.models.locate_corners import LocateCorners
+
+        return LocateCorners(model)
+
+    def restore(self, model: Model) -> Mapping[str, JointModel]:
+        from ipsys_log.calibration.joint.payload import restore_joint
+
+        return restore_joint(model)
+
+
+ModelKind = PointModels | CornerModels
+_POINT_KIND, _CORNER_KIND = PointModels(), CornerModels()
+
+
+def model_kind(name: str) -> ModelKind:
+    """Return the kind of a model by its name."""
+    return _CORNER_KIND if reads_corners(name) else _POINT_KIND
+
+
+def joint_models(model: Model) -> Mapping[str, JointModel]:
+    """Return the joint model of each camera; none for a model of camera points."""
+    return _CORNER_KIND.restore(model) if reads_corners(model.name) else {}

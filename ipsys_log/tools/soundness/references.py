@@ -1,0 +1,148 @@
+"""References between the messages of a log: rig, cameras, intrinsics, measurements and withdrawals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from ipsys_log.engine.checks import image_sizes
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import camera_of_topic
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Measurement, Rig
+from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MEASUREMENTS_TOPIC, RIG, RIG_TOPIC
+from ipsys_log.messages.rig_file import check_rig
+from ipsys_log.plain_text import join_names
+from ipsys_log.tools.soundness.finding import REMARK, LogFinding
+from ipsys_log.vision.lenses import check_calibration
+from ipsys_log.vision.plausible_lenses import calibration_remarks
+
+
+def check_rigs(session: Session) -> Iterator[LogFinding]:
+    """Check that a log with images, markers or measurements has a valid rig."""
+    topics = session.topics(RIG)
+    if not topics:
+        if session.images or session.topics(MEASUREMENTS) or _marker_cameras(session):
+            advice = "give one to each command: --rig lab.toml"
+            yield LogFinding("reference", REMARK, "the log has no rig", advice, RIG_TOPIC)
+        return
+    for message in session.messages(topics):
+        try:
+            check_rig(message.payload, "the rig")
+        except IpsysError as error:
+            advice = "give a correct rig to each command: --rig lab.toml"
+            yield LogFinding("reference", REMARK, str(error), advice, message.topic, message.log_time_ns, 1)
+
+
+def _marker_cameras(session: Session) -> dict[str, str]:
+    """Return the cameras with markers in a run, each with one topic of its markers."""
+    topics = [topic for run in sorted(session.run_names()) for topic in session.topics(MARKERS, run)]
+    return {str(camera_of_topic(topic)): topic for topic in topics}
+
+
+def _cameras(session: Session) -> dict[str, str]:
+    """Return the cameras with images or markers, each with its topic."""
+    return _marker_cameras(session) | session.images
+
+
+def check_cameras(session: Session) -> Iterator[LogFinding]:
+    """Check that the rig has each camera with images or markers."""
+    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    known = {camera.name for rig in rigs for camera in rig.cameras}
+    if not known:  # a rig may leave out the cameras
+        return
+    for camera, topic in sorted(_cameras(session).items()):
+        if camera not in known:
+            text = f"camera {camera} is not in the rig, which has {join_names(sorted(known))}"
+            yield LogFinding("reference", REMARK, text, "add it to lab.toml as [[cameras]]", topic)
+
+
+def check_intrinsics(session: Session) -> Iterator[LogFinding]:
+    """Check that each camera has valid intrinsics for the size of its images."""
+    sizes_px = image_sizes(session)
+    for camera, topic in sorted(_cameras(session).items()):
+        advice = f"calibrate it, and give its intrinsics: --calibration {camera}=FILE"
+        if camera not in session.calibrations:
+            text = f"camera {camera} has no intrinsics"
+            yield LogFinding("reference", REMARK, text, advice, topic)
+            continue
+        stored = session.calibrations[camera]
+        message = next(session.messages([stored]))
+        lens = message.payload
+        place = stored, message.log_time_ns
+        try:
+            check_calibration(replace(lens, frame_id=camera), "the intrinsics")
+            unusual = calibration_remarks(lens)
+        except IpsysError as error:
+            unusual = [str(error)]
+        for text in unusual:
+            yield LogFinding("reference", REMARK, f"camera {camera}: {text}", advice, *place)
+        if camera in sizes_px and sizes_px[camera] != (lens.width, lens.height):
+            width, height = sizes_px[camera]
+            text = (
+                f"the intrinsics of camera {camera} are for {lens.width} x {lens.height} px, but its images "
+                f"have {width} x {height} px"
+            )
+            yield LogFinding("reference", REMARK, text, advice, *place)
+
+
+def check_measurements(session: Session) -> Iterator[LogFinding]:
+    """Check that measurements name markers and reference points of the rig, and withdrawals measurements."""
+    rigs: list[Rig] = session.payloads(session.topics(RIG))[:1]
+    active: set[str] = set()
+    withdrawn: set[str] = set()
+    faults: dict[tuple[str, str], list[tuple[str, int]]] = {}
+    for message in session.messages([*session.topics(RIG), *session.topics(MEASUREMENTS)]):
+        payload = message.payload
+        if isinstance(payload, Rig):
+            rigs[:] = [payload]
+        elif isinstance(payload, Measurement):
+            for fault in _faults(payload, active, withdrawn, rigs[0] if rigs else None):
+                faults.setdefault(fault, []).append((payload.id, message.log_time_ns))
+            _follow(payload, active, withdrawn)
+    for (text, advice), places in faults.items():
+        ids = join_names([name for name, _ in places])
+        title = "measurement" if len(places) == 1 else "measurements"
+        place = MEASUREMENTS_TOPIC, places[0][1], len(places)
+        yield LogFinding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
+
+
+def _follow(measurement: Measurement, active: set[str], withdrawn: set[str]) -> None:
+    """Move the id of a message about a measurement to the valid or to the withdrawn ids."""
+    if measurement.refers_to is None:
+        active.add(measurement.id)
+    elif measurement.withdraws is not None and measurement.withdraws in active:
+        active.remove(measurement.withdraws)
+        withdrawn.add(measurement.withdraws)
+    elif measurement.readmits in withdrawn:
+        withdrawn.remove(measurement.readmits)
+        active.add(measurement.readmits)
+
+
+def _faults(
+    measurement: Measurement, active: set[str], withdrawn: set[str], rig: Rig | None
+) -> Iterator[tuple[str, str]]:
+    """Yield the wrong references of a measurement, each with the advice."""
+    again = "withdraw it and measure again: ipsys measure"
+    complete = "add it to lab.toml, and give --rig lab.toml"
+    no_effect = "it has no effect: check the id"
+    if measurement.withdraws is not None:
+        if measurement.withdraws not in active:
+            yield f"withdraws {measurement.withdraws}, which is not in the log", no_effect
+        return
+    if measurement.readmits is not None:
+        if measurement.readmits not in withdrawn:
+            yield f"re-admits {measurement.readmits}, which is not withdrawn", no_effect
+        return
+    if measurement.id in active:
+        yield "an earlier measurement has the same id", "withdraw one of them"
+    if measurement.from_reference is None and measurement.marker_id is None:
+        yield "has no marker", again
+        return
+    if rig is None:
+        return
+    if measurement.marker_id is not None and not rig.knows(measurement.marker_id):
+        yield f"marker {measurement.marker_id} is not in the rig", complete
+    points = {point.name for point in rig.reference_points}
+    for name in sorted({distance.reference for distance in measurement.distances} - points):
+        yield f"reference point {name} is not in the rig", complete

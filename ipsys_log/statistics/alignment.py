@@ -29,7 +29,7 @@ _LOOSE = math.radians(1.0)
 _FAR = 4.0
 # Least number of markers to identify one outside the plane: of four, each three fit a plane exactly.
 _LEAST_TO_NAME = 5
-# Of more triples of markers, a random subset is tried.
+# With more triples of markers, a random subset of this size is tried.
 _MOST_TRIPLES = 2000
 # Triples of a smaller area do not determine a plane: a share of the largest one, and m^2.
 _SLENDER = 0.05

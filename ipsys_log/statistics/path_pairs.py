@@ -24,7 +24,7 @@ _JUMP = 10.0
 _LEAST_JUMP_M = 0.01
 # and needs a larger acceleration than a robot has.
 _LARGEST_ACCELERATION_M_S2 = 10.0
-# Of neighbouring jumps, each pass removes the largest only.
+# Each pass removes only the largest of neighbouring jumps.
 _PASSES = 4
 
 

@@ -29,7 +29,7 @@ _MOST_PAIRS = 24
 _DEGREES = (5, 4, 3, 2)
 # A map needs this many instants for each coefficient: with fewer, it follows the noise.
 _INSTANTS_PER_TERM = 3
-# Of more instants in a path, only every n-th counts: this bounds the time of a fit.
+# With more instants in a path, only every n-th counts: this bounds the time of a fit.
 _MOST_INSTANTS = 4000
 # A marker moves if its speed is at least this share of its 90th percentile.
 _MOVING_SHARE = 0.1

@@ -87,7 +87,9 @@ def record(
     ] = None,
     seconds: Seconds = None,
     force: Force = False,
-    as_json: Annotated[bool, typer.Option("--json", hidden=True)] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", hidden=True, help="With --points-only: print JSON.")
+    ] = False,
 ) -> None:
     """Record the camera frames, unchanged, until Ctrl-C.
 

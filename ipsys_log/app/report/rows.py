@@ -84,7 +84,7 @@ def cm(length_m: float | None, digits: int = 2) -> str:
 
     Examples
     --------
-    >>> cm(0.01234), cm(0.01234, 3), cm(1.2345), cm(1.2345, 1), cm(None)
+    >>> cm(0.01234), cm(0.01234, 3), cm(1.2346), cm(1.2346, 1), cm(None)
     ('1.23', '1.234', '123', '123.5', '-')
     """
     if length_m is None:

@@ -16,7 +16,7 @@ from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
 from ipsys_log.messages.channels import SMOOTHED_TRACKS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from tests.sinks.autopilots import Reading

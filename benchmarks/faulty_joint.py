@@ -28,7 +28,7 @@ from ipsys_log.messages import (
     Run,
 )
 from ipsys_log.messages.channels import MARKERS, POSITIONS
-from ipsys_log.messages.units import MM_PER_M, NS_PER_S
+from ipsys_log.units import MM_PER_M, NS_PER_S
 from ipsys_log.vision.poses import make_pose, rotation
 from ipsys_log.vision.trilateration import multilaterate
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

@@ -28,7 +28,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, POSITIONS
-from ipsys_log.messages.units import MM_PER_M
+from ipsys_log.units import MM_PER_M
 from ipsys_log.vision.lenses import undistort
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session

@@ -180,8 +180,8 @@ def _speed(path: Path, frames: int, options: argparse.Namespace, report: Report)
 def _latency(path: Path, report: Report) -> None:
     from ipsys_log.messages.channels import CALIBRATIONS, RIG
     from ipsys_log.messages.stage import Resets
-    from ipsys_log.messages.units import NS_PER_S
     from ipsys_log.stages.detect import EDGES, Detect
+    from ipsys_log.units import NS_PER_S
 
     resets = Resets(NS_PER_S // 2)
     times_ms: dict[bool, list[float]] = {True: [], False: []}

@@ -30,7 +30,7 @@ from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.locate import locate_markers
 from ipsys_log.calibration.joint.model import JointModel, build_models
 from ipsys_log.calibration.joint.parameters import CameraBlock, Layout
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab
 
 __all__ = ["COVERAGE_SCENES", "coverage_table", "error_sources", "measure_coverage"]

@@ -19,7 +19,7 @@ from rounds import Row
 
 from ipsys_log.capture.node_clock import ClockHistory, Exchange
 from ipsys_log.capture.nodes.centre import exchange_period_s
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 __all__ = ["measure"]
 

@@ -30,7 +30,7 @@ from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.geometric.session import MARKERS_RUN
 
 __all__ = ["play"]

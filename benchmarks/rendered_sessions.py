@@ -23,8 +23,8 @@ from ipsys_log.capture.simulation.settings import Purpose, random_stream
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Markers, Message, Rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect import STAGE, FrameDetector
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker
 from tests.geometric.lab import GeometricLab
 from tests.geometric.session import simulate_session

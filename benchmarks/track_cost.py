@@ -24,8 +24,8 @@ from track_drives import CALIBRATIONS, Condition, calibrate
 from ipsys_log.capture.simulation.lab import EPOCH_NS, build_rig
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Message, Model, Position, Positions, RigMarker
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.fuse import Fuse
+from ipsys_log.units import NS_PER_S
 
 __all__ = ["measure"]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from track_contenders import CONTENDERS, RobotTrack
 from track_drives import Condition, SeenDrive, calibrate, cover, drive_through
 
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.geometric.floor_error import region_shares
 
 __all__ = ["COVERAGE_DRIVE_S", "coverage_of_lab", "coverage_table"]

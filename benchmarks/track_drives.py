@@ -19,11 +19,11 @@ from ipsys_log.calibration.joint.payload import JOINT, joint_payload
 from ipsys_log.capture.simulation.pace import Pace, Stops, draw_pace
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.locate_corners import LocateCorners
 from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.statistics.camera_models import fit_model
+from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns

@@ -28,7 +28,7 @@ from ipsys_log.messages import (
     Run,
     WorldPoint,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.messages import CompressedImage, Message, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 WAIT_LIMIT_S = 240.0
 _READING_NS = 1000

@@ -18,7 +18,7 @@ import pytest
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Distance, Measurement, Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
-from ipsys_log.messages.units import format_time
+from ipsys_log.units import format_time
 from tests.changed_logs import rewrite
 from tests.conftest import Ipsys
 from tests.tiers import first_fast

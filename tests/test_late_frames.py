@@ -20,8 +20,8 @@ from ipsys_log.messages import (
     Event,
 )
 from ipsys_log.messages.channels import POSITIONS
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect import Detect
+from ipsys_log.units import NS_PER_S
 from tests.live_recordings import RATE_HZ, again, go_live, lenses, sent, slow
 from tests.playing import SteppedClock, cameras, playing
 

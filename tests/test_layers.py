@@ -9,8 +9,8 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors", "piped_process"),
-    ("plain_text", "extras"),
+    ("errors",),
+    ("units", "plain_text", "extras"),
     ("messages",),
     ("vision",),
     ("log",),

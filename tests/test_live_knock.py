@@ -17,8 +17,8 @@ from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CAMERA_MOVED, Event, Markers, ReferenceMarker
 from ipsys_log.messages.channels import EVENTS, MARKERS
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.verify import verify
+from ipsys_log.units import NS_PER_S
 from tests.live_recordings import lenses, sent
 from tests.playing import SteppedClock, cameras, playing
 

@@ -24,7 +24,7 @@ from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Measurement, Message
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import foreign_read
 from tests.tiers import first_fast

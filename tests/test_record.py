@@ -172,7 +172,7 @@ HANGING = """
 import os, sys, time
 from contextlib import contextmanager
 from pathlib import Path
-from ipsys_log import pipeline
+from ipsys_log.live_runs import pipeline
 from ipsys_log.app.cli import open_cameras
 from ipsys_log.app.cli.signals import InterruptError, interruptible, runs_until_stopped
 from ipsys_log.errors import IpsysError

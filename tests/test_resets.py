@@ -13,9 +13,9 @@ from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers, Message
 from ipsys_log.messages.stage import Resets
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect import Detect
 from ipsys_log.tools.verify import verify
+from ipsys_log.units import NS_PER_S
 from tests.live_recordings import attached_in_steps, sent
 from tests.stages.drawing import FISHEYE, Look, at_px, calibrated, draw, frame, jpeg, rig
 

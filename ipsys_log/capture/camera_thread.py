@@ -28,8 +28,8 @@ from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.messages.events import NODE_AWAITED, NODE_REFUSED
-from ipsys_log.messages.units import NS_PER_S, format_time
 from ipsys_log.plain_text import hide_password
+from ipsys_log.units import NS_PER_S, format_time
 
 # The run of markers that nodes have detected.
 NODES_RUN = "nodes"

@@ -15,8 +15,8 @@ from ipsys_log.capture.frames import CameraState
 from ipsys_log.errors import LogError, WriteError, is_full
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S, format_bytes, format_duration
 from ipsys_log.plain_text import shell_words
+from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
 # A power cut loses the data of this time, of the second that waits to be written, and of a sync.
 SYNC_EVERY_S = 2.0

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 
 class SourceError(IpsysError):

@@ -21,7 +21,7 @@ from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.receiver import passing_period_s
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # Most bytes of frames that wait to be written: some seconds of three cameras.
 _LIMIT_BYTES = 256 << 20

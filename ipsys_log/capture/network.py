@@ -27,8 +27,8 @@ from ipsys_log.capture.frames import (
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import hide_password
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from av.container import InputContainer

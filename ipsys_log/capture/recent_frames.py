@@ -9,7 +9,7 @@ from ipsys_log.capture.disk import Confirm
 from ipsys_log.capture.recorder import Recording
 from ipsys_log.errors import WriteError
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # Longer than the stationary interval of a measurement and the delay of the stages.
 BUFFER_NS = 5 * NS_PER_S

@@ -22,7 +22,7 @@ from ipsys_log.capture.simulation.pixel_shares import exposure_interval
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000

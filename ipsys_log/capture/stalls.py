@@ -13,7 +13,7 @@ from statistics import median
 from typing import NamedTuple
 
 from ipsys_log.capture.frames import Clock
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # Threads of a busy machine wait for a shorter time. A robot at 1 m/s moves 25 cm in this time.
 STALL_NS = NS_PER_S // 4

@@ -25,7 +25,7 @@ from ipsys_log.capture.frames import (
     report_refused_settings,
 )
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # The driver's names of JPEG images.
 _JPEG = ("MJPG", "JPEG")

@@ -28,7 +28,7 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import MAX_PIXELS
 
 if TYPE_CHECKING:

@@ -37,9 +37,9 @@ from ipsys_log.messages.channels import (
 )
 from ipsys_log.messages.rig_file import check_rig
 from ipsys_log.messages.stage import Stage
-from ipsys_log.messages.units import format_time
 from ipsys_log.plain_text import shell_words
 from ipsys_log.stages.detect import usual_corners
+from ipsys_log.units import format_time
 from ipsys_log.vision.decode import frame_size
 from ipsys_log.vision.lenses import check_calibration, check_size
 from ipsys_log.vision.video import Video

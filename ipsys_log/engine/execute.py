@@ -38,7 +38,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MODEL, Channel, channel_of
 from ipsys_log.messages.rig_file import hide_passwords
 from ipsys_log.messages.stage import Stage, Timed
-from ipsys_log.messages.units import format_time
+from ipsys_log.units import format_time
 
 
 class OtherContentError(Exception):

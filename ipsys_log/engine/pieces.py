@@ -29,8 +29,8 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import ANNOTATIONS, RIG
 from ipsys_log.messages.stage import Pieces, Resets
-from ipsys_log.messages.units import format_time
 from ipsys_log.stages import load_stage
+from ipsys_log.units import format_time
 
 if TYPE_CHECKING:
     from ipsys_log.engine.graph import Task

@@ -14,7 +14,7 @@ from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
 from ipsys_log.messages.channels import MARKERS, POSITIONS
 from ipsys_log.messages.events import CONTRADICTIONS
-from ipsys_log.messages.units import format_time
+from ipsys_log.units import format_time
 
 
 class Remarks:

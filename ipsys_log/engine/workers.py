@@ -17,8 +17,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 from ipsys_log.engine.pieces import Piece, PiecePlan, PieceResult, PieceRun
+from ipsys_log.engine.piped_process import PipedProcess, parent_pipe
 from ipsys_log.errors import IpsysError
-from ipsys_log.piped_process import PipedProcess, parent_pipe
 
 # With fewer waiting pieces for each worker, none gets a second one: it could wait behind a slow one.
 _FEW_PIECES = 2

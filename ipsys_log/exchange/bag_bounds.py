@@ -20,7 +20,7 @@ from ipsys_log.log.bounds import ReadLimits, chunk_excess
 from ipsys_log.log.chunks import unpack
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import parse_chunk_head
-from ipsys_log.messages.units import format_bytes
+from ipsys_log.units import format_bytes
 
 _PIECE = 1 << 20  # bytes
 _MCAP = ".mcap"

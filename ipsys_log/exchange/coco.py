@@ -25,7 +25,7 @@ from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Marker, Markers, Message, RawImage
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import Video
 

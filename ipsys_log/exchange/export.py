@@ -16,7 +16,7 @@ from ipsys_log.exchange.data_frames import read_table_parts
 from ipsys_log.extras import check_installed
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,7 +20,7 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.messages.rig_file import check_name
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 NAMES = "names"
 _COLUMNS = ("file", "time")

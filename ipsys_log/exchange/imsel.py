@@ -38,7 +38,7 @@ from ipsys_log.messages import (
     WorldPoint,
     calibration_topic,
 )
-from ipsys_log.messages.units import CM_PER_M, NS_PER_S
+from ipsys_log.units import CM_PER_M, NS_PER_S
 
 _HEAD = 128  # bytes
 _LITTLE_ENDIAN = b"\x00\x01IM"

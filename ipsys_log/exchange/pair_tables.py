@@ -25,7 +25,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, RECORD
 from ipsys_log.messages.rig_file import check_name
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _RUN = "imported"
 _CAMERA_AXES = ("xc_m", "yc_m", "zc_m")

@@ -8,7 +8,7 @@ logs stay far below every limit. Each byte of their file unpacks to 2 to 4 bytes
 from dataclasses import dataclass, field
 
 from ipsys_log.errors import LogError
-from ipsys_log.messages.units import format_bytes
+from ipsys_log.units import format_bytes
 
 _MIB = 1 << 20
 LARGEST_CHUNK = 256 * _MIB  # bytes, uncompressed

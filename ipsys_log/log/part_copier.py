@@ -30,7 +30,7 @@ from ipsys_log.log.survey import Kind, Part, Survey
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages.channels import EVENTS_TOPIC
 from ipsys_log.messages.events import DAMAGED, Event
-from ipsys_log.messages.units import format_time
+from ipsys_log.units import format_time
 
 _BLOCK = 1 << 20
 _SECTOR_BYTES = 512

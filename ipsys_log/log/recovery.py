@@ -27,7 +27,7 @@ from ipsys_log.log.records import (
 from ipsys_log.log.summary import load_contents, read_intact_summary
 from ipsys_log.log.survey import Kind, Survey
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.messages.units import format_bytes
+from ipsys_log.units import format_bytes
 
 _BLOCK = 1 << 20
 _SECTOR = 512

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogUrl
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import plain_text
+from ipsys_log.units import NS_PER_S
 
 _PAUSES_S = (0.1, 0.4, 1.6, 4.0)
 _SELF_REPEATING = ("s3", "s3a", "gs", "gcs")  # their file systems repeat a request some times themselves

@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import PartCounter
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 ROS2_PAYLOADS: dict[str, type] = {
     "sensor_msgs/msg/CameraInfo": CameraCalibration,

@@ -11,7 +11,7 @@ import numpy as np
 from ipsys_log.messages import Event, Model
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.events import CONTRADICTED_HEIGHT
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # A calibration point has its own height, which is not that of a marker on its robot.
 _SAME_POINT_M = 0.05

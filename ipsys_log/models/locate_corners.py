@@ -15,8 +15,8 @@ from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
+from ipsys_log.units import NS_PER_S
 
 # Corners without a covariance have about this error.
 _CORNER_SIGMA_PX = 0.25

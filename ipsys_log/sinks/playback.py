@@ -12,8 +12,8 @@ from typing import Any
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import FrameTransforms, Latency, Message
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import NewSession, first_session
+from ipsys_log.units import NS_PER_S
 
 # A message is logged at most so long after its capture; a later one is played late.
 _LOGGED_AFTER_NS = NS_PER_S

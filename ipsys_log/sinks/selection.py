@@ -35,8 +35,8 @@ from ipsys_log.messages.channels import (
     TRACKS,
     TRUTH,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import shell_words
+from ipsys_log.units import NS_PER_S
 
 _FADE_STEPS = 3
 

@@ -11,8 +11,8 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Distance, Measurement, Rig, WorldPoint
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.statistics.tape import reference_points
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import SIDES, are_collinear, multilaterate, side_of
 
 # A lower predicted height is impossible for a marker. Noise can move a prediction slightly below the floor.

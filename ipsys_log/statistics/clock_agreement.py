@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.messages import ClockEstimate, Model
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.calibrated_cameras import CalibratedCamera, describe_cameras
+from ipsys_log.units import NS_PER_S
 
 _SIGMAS = 3.0
 _MS_PER_S = 1000.0

@@ -24,7 +24,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Positions
 from ipsys_log.messages.arrays import Array, Times
 from ipsys_log.messages.channels import POSITIONS, RIG
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.time_brackets import bracket_times
 
 # Longest time between two sightings of a camera, for a position in between.

@@ -14,7 +14,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import LATENCY_TOPIC, Latency, Message
 from ipsys_log.messages.channels import LATENCY, MARKERS, POSITIONS, TRACKS, Channel
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 STEPS = ("captured", "received", "detected", "located", "fused", "published")
 # Frames whose times are kept: more than those that wait for the stages, of 24 cameras too.

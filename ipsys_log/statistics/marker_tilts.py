@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.square_pose import fit_squares
 
 # Tops of robots are tilted by up to 2 degrees, and turn: two of them differ by up to 4 degrees.

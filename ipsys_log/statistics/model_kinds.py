@@ -14,7 +14,6 @@ from ipsys_log.messages import Evaluation, Model, Pair, Rig
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG, Channel
 from ipsys_log.messages.stage import Progress, StageView, Step
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
 from ipsys_log.statistics.calibration_points import training_pairs
@@ -22,6 +21,7 @@ from ipsys_log.statistics.camera_models import check_different, check_line, chec
 from ipsys_log.statistics.cross_validation import REPEATS, Study, gather_points
 from ipsys_log.statistics.pairs import level_cameras
 from ipsys_log.statistics.point_evaluation import evaluate_model, fitted_pairs, gross_outliers
+from ipsys_log.units import CM_PER_M
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.joint.model import JointModel

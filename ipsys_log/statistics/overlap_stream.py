@@ -10,8 +10,8 @@ import numpy as np
 
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import Message, Position, Positions, Rig
-from ipsys_log.messages.units import MM_PER_M
 from ipsys_log.statistics.disagreement import LONGEST_GAP_NS
+from ipsys_log.units import MM_PER_M
 
 # Number of the last differences of a pair that a summary uses.
 _REMEMBERED = 5_000

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoints, Measurement, Message, Model, Pair, Rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.tape import RiggedMeasurement, world_point
+from ipsys_log.units import NS_PER_S
 
 # A marker is stationary if it stays within these distances from its position at the measurement. They are
 # above the noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).

@@ -14,8 +14,8 @@ from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.drift import MeanCorners
+from ipsys_log.units import NS_PER_S
 
 # A log has at most so many windows. A longer log is read in part: a camera that has moved stays there.
 _MOST_WINDOWS = 60

@@ -10,7 +10,7 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Distance, Measurement, Rig
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import (
     ON_REFERENCE_SIGMA_M,
     USUAL_TAPE_SIGMA_M,

@@ -19,8 +19,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo
 from ipsys_log.messages.arrays import Times
 from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, MERGES, POSITIONS, RECORD, RIG
-from ipsys_log.messages.units import NS_PER_S, format_time
 from ipsys_log.tools.differences import marker_ids
+from ipsys_log.units import NS_PER_S, format_time
 from ipsys_log.vision.video import is_keyframe
 
 _MOST_NAMES = 12

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraPoints, Markers, Message, Positions, Tracks
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S, format_time
+from ipsys_log.units import NS_PER_S, format_time
 
 
 @dataclass(frozen=True, slots=True)

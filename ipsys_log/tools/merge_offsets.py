@@ -16,11 +16,11 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages.channels import MARKERS
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import shell_words
 from ipsys_log.tools.clock_offset import MarkerPath, estimate_clock_offset
 from ipsys_log.tools.merge import open_logs
 from ipsys_log.tools.merge_plan import LogOffset, check_logs_differ
+from ipsys_log.units import NS_PER_S
 
 _STEP = "clocks"
 _LARGEST_S = 1_000_000_000

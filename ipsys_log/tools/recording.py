@@ -13,7 +13,7 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event
 from ipsys_log.messages.channels import EVENTS, RUN_EVENTS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # A gap is this many times longer than the usual interval between frames.
 _GAP_FACTOR = 3

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import ErrorStatistics
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, last_poses
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.time_brackets import TimeBrackets, bracket_times
 
 Places = NDArray[np.int64]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ipsys_log.app.report.alignment_text import advise
 from ipsys_log.messages import CameraPoint, CameraPoints, Interval, Measurement
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.alignment import LEVEL_M, Alignment, align_camera
 from ipsys_log.statistics.stationary import StationaryMarker, find_stationary
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.markers import camera_point, marker_corners
 from ipsys_log.vision.poses import look_down, pose_facing_up, rotation, transform
 from tests.ladder import follow

@@ -21,7 +21,6 @@ from ipsys_log.messages import (
     Rig,
     Run,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.disagreement import (
     CameraPositions,
     compare_cameras,
@@ -30,6 +29,7 @@ from ipsys_log.statistics.disagreement import (
     read_disagreement,
 )
 from ipsys_log.statistics.overlap_stream import OverlapStream, OverlapSummary
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 
 STEP_NS = NS_PER_S // 30

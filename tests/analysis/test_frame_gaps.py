@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.recording import find_gaps
+from ipsys_log.units import NS_PER_S
 
 RATE_HZ = 10.0
 PASS_S = 0.001  # the time that a recorder needs for a frame that waits

@@ -13,8 +13,8 @@ from ipsys_log.capture.knocks import Knock, KnockMonitor
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Marker, Markers, Message, Position, Positions, ReferenceMarker, Rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.floor_cameras import shift_floor_map
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.posed_camera import PosedCamera

@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 
 from ipsys_log.capture.node_clock import ClockHistory, Exchange, fit_clock
 from ipsys_log.capture.nodes.centre import exchange_period_s
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
 MS = NS_PER_S // 1000

@@ -19,7 +19,7 @@ from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Rig, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, small_disk
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2)

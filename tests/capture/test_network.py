@@ -21,7 +21,7 @@ from ipsys_log.capture.devices import OPENERS
 from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.capture.network import _PROTOCOLS, open_network
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs, serve, serve_rtsp
 from tests.ports import free_port
 from tests.tiers import first_fast

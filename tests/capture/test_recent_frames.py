@@ -44,9 +44,9 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.calibration_points import find_pairs
 from ipsys_log.statistics.calibration_points import measured as measured_places
+from ipsys_log.units import NS_PER_S
 from tests import labs
 from tests.capture.test_recorder import Noted
 from tests.conftest import Ipsys

@@ -32,7 +32,7 @@ from ipsys_log.messages import (
     Rig,
     image_topic,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.playing import WAIT_LIMIT_S
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.capture.network import open_network
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs
 from tests.capture.test_network import LIMIT_S, MOST_REPORTS
 from tests.tiers import first_fast

@@ -14,7 +14,7 @@ from ipsys_log.capture.frames import Clock, Frame, Say
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.stalls import STALL_NS, Heartbeat, LateFrameDetector
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 MS = 1_000_000
 

@@ -18,7 +18,7 @@ from ipsys_log.capture import devices, v4l2, v4l2_camera
 from ipsys_log.capture.devices import open_usb
 from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.capture.camera_driver import Driver
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Video for Linux")

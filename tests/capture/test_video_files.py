@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.image_folders import find_images, find_times, parse_time, read_images
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs
 from tests.conftest import Ipsys
 

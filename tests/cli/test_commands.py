@@ -259,7 +259,7 @@ def test_replay_that_is_done_imports_no_library_of_models(lab: Path) -> None:
     """A command that finds everything up to date answers at once."""
     pipeline.replay([lab], Request(models=("poly",)), "fit")
     program = (
-        "import sys; from pathlib import Path; from ipsys_log import pipeline\n"
+        "import sys; from pathlib import Path; from ipsys_log.live_runs import pipeline\n"
         "from ipsys_log.engine.options import Request\n"
         f"(*_, fit) = pipeline.replay([Path({str(lab)!r})], Request(models=('poly',)), 'fit')\n"
         "print(fit.fresh, sorted({'sklearn', 'pandas', 'matplotlib'} & sys.modules.keys()))"

@@ -29,7 +29,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.messages.rig_file import load_rig
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.test_measure_now import Lab, measuring
 

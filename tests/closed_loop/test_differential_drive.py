@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.capture.simulation.differential_drive import STEP_NS, Chassis, DifferentialDrive, Pose2d
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 IDEAL = Chassis(slip=0.0, slip_sigma=0.0, noise=0.0)
 START_NS = 1_700_000_000 * NS_PER_S

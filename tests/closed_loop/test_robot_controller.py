@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ipsys_log.capture.simulation.differential_drive import DifferentialDrive, Pose2d
 from ipsys_log.live_runs.robot_runs.settings import PATHS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import FOLDER, example
 
 controllers: Any = example("controller")

@@ -15,9 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.robot_runs.ros2_relay import open_ros2
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
+from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import example
 from tests.ports import free_port
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, send_all, track, tracks

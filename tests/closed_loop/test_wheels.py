@@ -16,7 +16,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.robot_runs import wheels as wheels_module
 from ipsys_log.live_runs.robot_runs.relay import Relay
 from ipsys_log.live_runs.robot_runs.wheels import Wheels
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import example
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ipsys_log.engine.output import write_log
 from ipsys_log.messages import ChannelWritten, Message, RigMarker, Run, Track, Tracks
 from ipsys_log.messages.channels import RECORD, RIG_TOPIC, TRACKS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.labs import RIG
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
 STEP_NS = NS_PER_S // 10

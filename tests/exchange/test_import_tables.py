@@ -20,7 +20,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RIG_TOPIC, CameraCalibration, Rig, RigCamera, RigMarker
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.messages.rig_file import rig_toml
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S

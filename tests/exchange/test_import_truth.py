@@ -16,7 +16,7 @@ from ipsys_log.exchange.import_truth import ImportedTruth, TruthOptions, import_
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, Run, Track, Tracks
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, data_section
 from tests.exchange.driven_lab import LAB, ROBOTS, START_NS, OtherSystem, instants_ns, path_of, write_lab
 

@@ -15,7 +15,7 @@ from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_s
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import transform
 from tests.geometric.points import choose_points

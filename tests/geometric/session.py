@@ -30,7 +30,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.arrays import Times
 from ipsys_log.messages.channels import MARKERS, RECORD
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, PlacedMarkers
 from tests.geometric.sightings import (
     drive_times_ns,

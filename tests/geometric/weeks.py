@@ -25,7 +25,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import MARKERS, RECORD
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import make_pose, rotation, transform

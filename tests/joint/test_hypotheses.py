@@ -16,8 +16,8 @@ from ipsys_log.calibration.joint.observations import Observations, seeing_camera
 from ipsys_log.calibration.joint.payload import joint_payload, restore_joint
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Marker, Markers, Message, Rig, RigMarker
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.locate_corners import LocateCorners
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import make_pose, rotation
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session

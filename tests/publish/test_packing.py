@@ -216,7 +216,9 @@ def test_pack_with_images_detects_markers_again(replayed_log: Path, packed: Path
 
 
 def test_images_without_markers_are_named(lab_log: Path, packed: Path, tmp_path: Path) -> None:
-    with pytest.raises(IpsysError, match="has no markers, which a pack without images needs; run: ipsys replay --until det"):
+    with pytest.raises(
+        IpsysError, match="has no markers, which a pack without images needs; run: ipsys replay --until det"
+    ):
         pack([lab_log], tmp_path / "x", packed / "card.toml", without_images=True)
     assert list(tmp_path.iterdir()) == []
 

@@ -15,7 +15,7 @@ from ipsys_log.app.report.html import render_report
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Event, Latency, Message
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.report.browser import visit
 

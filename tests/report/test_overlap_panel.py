@@ -10,8 +10,8 @@ import pytest
 from ipsys_log.app.report.html_figures import overlap_pictures
 from ipsys_log.app.report.html_sections import overlap_tables
 from ipsys_log.messages import Floor, Rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.disagreement import CameraPositions, PairDisagreement, compare_cameras
+from ipsys_log.units import NS_PER_S
 
 
 def pairs(

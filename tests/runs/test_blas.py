@@ -9,13 +9,13 @@ import sys
 
 import pytest
 
-from ipsys_log.piped_process import ONE_THREAD
+from ipsys_log.engine.piped_process import ONE_THREAD
 
 # Models are imported within the block, as a command does.
 LATE = """
 import json
 from threadpoolctl import threadpool_info
-from ipsys_log import pipeline
+from ipsys_log.live_runs import pipeline
 from ipsys_log.engine.blas import one_blas_thread
 with one_blas_thread():
     from ipsys_log.models.table import create

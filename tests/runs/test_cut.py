@@ -35,9 +35,9 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.cut import cut
 from ipsys_log.tools.cut_selection import CutOptions
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S

@@ -30,9 +30,9 @@ from ipsys_log.messages import (
     RigCamera,
     RigMarker,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.merge import merge
 from ipsys_log.tools.merge_plan import LogOffset
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S

@@ -34,7 +34,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Rig, RigMarker, kind_of
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.messages.stage import Resets
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 Row = tuple[str, int, int, bytes]
 

@@ -27,7 +27,7 @@ from ipsys_log.messages import (
     Rig,
     WorldPoint,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import scale_intrinsics
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys

@@ -19,7 +19,7 @@ from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Marker, Markers, Message, Rig, Tracks
 from ipsys_log.messages.channels import MODEL
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
 

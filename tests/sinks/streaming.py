@@ -12,8 +12,8 @@ import numpy as np
 from ipsys_log.capture.frames import Clock
 from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.sink import InlineSink
+from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
 STEP_NS = NS_PER_S // 25

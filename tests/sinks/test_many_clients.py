@@ -24,10 +24,10 @@ from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Tracks
 from ipsys_log.messages.channels import EVENTS, TRACKS
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.poses import STALE_S
 from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
+from ipsys_log.units import NS_PER_S
 from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
 from tests.ports import free_port

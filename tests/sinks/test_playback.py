@@ -14,9 +14,9 @@ import pytest
 import ipsys_log as ipsys
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
 from ipsys_log.sinks.streams.poses import NewSession
+from ipsys_log.units import NS_PER_S
 from tests.sinks.streaming import START_NS, STEP_NS, WaitingClock, tracks, write_tracks
 
 _LIMIT_S = 60.0

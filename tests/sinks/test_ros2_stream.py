@@ -19,11 +19,11 @@ import zenoh
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Qos, attachment, gid, topic_key
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.sinks.streams.ros2_messages import type_hash
+from ipsys_log.units import NS_PER_S
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, send_all, track, tracks

@@ -19,10 +19,10 @@ import pytest
 import ipsys_log as ipsys
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.sink import FanOut
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.udp import UdpStream, encode_pose
+from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
 from tests.sinks.streaming import (
     START_NS,

@@ -18,9 +18,9 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.sinks.streams.vrpn import VrpnStream
+from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
 from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, send_all, track, tracks
 from tests.waiting import wait_until

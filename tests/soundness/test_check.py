@@ -29,10 +29,10 @@ from ipsys_log.messages import (
     Rig,
     RigCamera,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.soundness.check import check_logs
 from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
 from ipsys_log.tools.soundness.times import MessageTimes
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import scale_intrinsics
 from tests.changed_logs import rewrite
 from tests.conftest import ROOT, Ipsys

@@ -19,10 +19,10 @@ from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import Guess
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.follow import MarkerTracker
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.marker_cells import project_corners
 from tests.stages.drawing import (
     FISHEYE,

@@ -10,7 +10,7 @@ from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
 from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.messages import CameraPoint, CameraPoints, CompressedImage, Markers, Message
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests import labs
 
 PLACE = TypedEntry("0", {"A": "170", "B": "190"}, "left", "10")

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.filter import Sightings
 from ipsys_log.models.tracking.tracks import Pose, RobotTracks, TrackSettings
+from ipsys_log.units import NS_PER_S
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.tracks import Pose, RobotTracks, TrackSettings
+from ipsys_log.units import NS_PER_S
 from tests.tracking.driving import (
     CAMERAS,
     MS,

@@ -36,7 +36,7 @@ from ipsys_log.messages import (
     Tracks,
     image_topic,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.playing import WAIT_LIMIT_S
 from tests.stages.drawing import jpeg
 

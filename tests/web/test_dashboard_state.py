@@ -20,7 +20,7 @@ from ipsys_log.app.web.dashboard.map import describe_floor, ellipse_of
 from ipsys_log.app.web.dashboard.pictures import shrink
 from ipsys_log.app.web.dashboard.status import RecentEvents
 from ipsys_log.messages import CameraCalibration, CameraModel, CompressedImage, Model, Pair
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.stages.drawing import jpeg
 from tests.web.dashboards import (
     BEGIN_NS,

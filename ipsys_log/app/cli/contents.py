@@ -213,7 +213,7 @@ def _ns(seconds: float | None, start_ns: int = 0) -> int | None:
         The value is not a number of seconds of these centuries.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.messages.units import NS_PER_S
+    from ipsys_log.units import NS_PER_S
 
     if seconds is None:
         return None

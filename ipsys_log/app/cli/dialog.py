@@ -269,7 +269,7 @@ def _ask_point(scene: MeasuringScene, interval: int | None, before: TypedEntry |
 
 
 def _show(checked: EntryCheck) -> None:
-    from ipsys_log.messages.units import CM_PER_M
+    from ipsys_log.units import CM_PER_M
 
     for fault in checked.faults:
         console.print(fault.text, style="red")
@@ -317,7 +317,7 @@ def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
 
 def _agreed_to_withdraw(measurement: Measurement) -> bool:
     """Ask before a measurement of an earlier session is withdrawn; a letter means no."""
-    from ipsys_log.messages.units import CM_PER_M
+    from ipsys_log.units import CM_PER_M
 
     tapes = ", ".join(f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances)
     text = f"{measurement.id} (marker {measurement.marker_id}{': ' if tapes else ''}{tapes})"

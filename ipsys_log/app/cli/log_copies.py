@@ -105,9 +105,9 @@ def cut(
         ipsys cut calibration.mcap --compact --dry-run     # which runs, how much?
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.messages.units import format_bytes
     from ipsys_log.tools.cut import cut as cut_logs
     from ipsys_log.tools.cut_selection import CutOptions
+    from ipsys_log.units import format_bytes
 
     chosen: dict[str, Any] = {name: value for name, value in selection.items() if value is not None}
     options = CutOptions(**chosen)
@@ -202,14 +202,14 @@ def merge(
         print_json(_merge_json(output, result))
         return
     _show_offsets(logs, offsets)
-    from ipsys_log.messages.units import format_bytes
+    from ipsys_log.units import format_bytes
 
     console.print(f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}")
     say(f"next: ipsys replay {shell_words(output)}")
 
 
 def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> None:
-    from ipsys_log.messages.units import format_bytes
+    from ipsys_log.units import format_bytes
 
     if not dropped:
         console.print(f"{log}: no run is superseded or unfinished; nothing is written")
@@ -226,7 +226,7 @@ def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> Non
 
 
 def _show_saving(before: int, output: Path) -> None:
-    from ipsys_log.messages.units import format_bytes
+    from ipsys_log.units import format_bytes
 
     after = output.stat().st_size
     console.print(f"{output} written: {format_bytes(after)} instead of {format_bytes(before)}")

@@ -99,7 +99,7 @@ def node(
 def _new_log(camera: str) -> Path:
     """Return the name of a new log: the camera and the time, in UTC."""
     from ipsys_log.capture.frames import Clock
-    from ipsys_log.messages.units import format_time
+    from ipsys_log.units import format_time
 
     digits = "".join(sign for sign in format_time(Clock().now_ns())[:19] if sign.isdigit())
     return Path(f"{camera}_{digits[:8]}_{digits[8:]}.mcap")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from ipsys_log.app.cli.console import console, remarks, say, warn
 from ipsys_log.app.cli.lab_inputs import load_lab, split_calibration
 from ipsys_log.app.cli.signals import Interrupted, stop_on_signal
-from ipsys_log.messages.units import format_bytes
+from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.cameras import LiveStatus

@@ -22,8 +22,8 @@ from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.messages import CompressedVideo, Rig, RigCamera
 from ipsys_log.messages.rig_file import check_name, check_rig, load_rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import hide_password
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import decode_keyframe, is_keyframe
 

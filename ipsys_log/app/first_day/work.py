@@ -40,9 +40,9 @@ from ipsys_log.messages import (
     Message,
     Model,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.settings import Stream, check_streams, open_live_streams, settings_of_rig
+from ipsys_log.units import NS_PER_S
 
 _LAST_STAGE = "camera-frame"
 # Durations of recordings, by the time stamps of the frames, and the least number of frames of each camera.

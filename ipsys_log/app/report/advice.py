@@ -27,9 +27,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.messages import Evaluation, LearningPoint
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.models.table import is_known, min_pairs, reads_height
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, POOLED
+from ipsys_log.units import CM_PER_M
 
 
 class CurvePoint(NamedTuple):

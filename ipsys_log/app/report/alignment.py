@@ -14,13 +14,13 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.statistics.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.statistics.calibration_points import find_pairs, measured
 from ipsys_log.statistics.coverage import FloorCoverage, Overlap, cover_floor, find_overlaps
 from ipsys_log.statistics.stationary import find_stationary
 from ipsys_log.statistics.tape import RiggedMeasurement
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.posed_camera import PosedCamera
 

@@ -16,9 +16,9 @@ from ipsys_log.app.report.figures import add_panel, legend_label, name_cameras, 
 from ipsys_log.app.report.floor_figure import draw_ground
 from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.statistics.alignment import Alignment
 from ipsys_log.statistics.coverage import FloorCoverage
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.lenses import project
 
 _DPI = 100

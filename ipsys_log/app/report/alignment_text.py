@@ -11,9 +11,9 @@ from rich.text import Text
 from ipsys_log.app.report.alignment import AlignedLab
 from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, cm
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.statistics.alignment import LEVEL_M, Alignment
 from ipsys_log.statistics.coverage import FloorCoverage, Overlap, Patch
+from ipsys_log.units import CM_PER_M
 
 _GOOD, _BAD = "green", "red"
 _LEVEL_CM = f"{LEVEL_M * CM_PER_M:g} cm"

@@ -23,8 +23,8 @@ from ipsys_log.app.report.floor_figure import draw_ground
 from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.messages import Rig
-from ipsys_log.messages.units import MM_PER_M
 from ipsys_log.statistics.calibrated_cameras import CalibratedCamera
+from ipsys_log.units import MM_PER_M
 
 _MS_PER_S = 1000.0
 # A page with many cameras shows so many images first.

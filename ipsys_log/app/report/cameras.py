@@ -17,11 +17,11 @@ from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
-from ipsys_log.messages.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 from ipsys_log.plain_text import plain_text
 from ipsys_log.statistics.latency import Percentiles
 from ipsys_log.statistics.overlap_stream import OverlapSummary
 from ipsys_log.tools.differences import Comparison
+from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 
 # After this time, the measured growth of a log is better than the estimate.
 _SETTLED_S = 5.0

@@ -8,9 +8,9 @@ import numpy as np
 
 from ipsys_log.app.report.rows import Rows, mm, wrap_text
 from ipsys_log.live_runs.survey.drift_reading import DriftReading
-from ipsys_log.messages.units import format_time
 from ipsys_log.statistics.camera_moves import CameraState, MarkerMove, Move
 from ipsys_log.statistics.drift import LEAST_SHIFT_M, Motion
+from ipsys_log.units import format_time
 
 # A normal distribution has 95 % within this many standard deviations.
 _NORMAL_95 = 1.96

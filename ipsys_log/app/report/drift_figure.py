@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from ipsys_log.app.report.figures import save_figure, style_axes
 from ipsys_log.app.report.styles import NOTE, camera_styles, shorten
 from ipsys_log.live_runs.survey.drift_reading import DriftReading
-from ipsys_log.messages.units import MM_PER_M, NS_PER_S
 from ipsys_log.statistics.camera_moves import CameraState
 from ipsys_log.statistics.drift import LEAST_SHIFT_M
+from ipsys_log.units import MM_PER_M, NS_PER_S
 
 _NORMAL_95 = 1.96
 # Rows of the legend; further cameras are in further columns.

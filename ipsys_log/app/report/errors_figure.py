@@ -18,8 +18,8 @@ from ipsys_log.app.report.figures import add_panel
 from ipsys_log.app.report.findings import in_space
 from ipsys_log.app.report.rows import cm
 from ipsys_log.messages import ErrorStatistics
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.statistics.accuracy import POOLED
+from ipsys_log.units import CM_PER_M
 
 _TRACKS = "tracks"
 # Instants at which a marker does not have the height that its model takes it to be at.

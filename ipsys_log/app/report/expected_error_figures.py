@@ -21,8 +21,8 @@ from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.live_runs.survey.floor_plan import PlannedFloor, mesh
 from ipsys_log.live_runs.survey.lab_calibration import CameraResult, LabCalibration
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import CM_PER_M, MM_PER_M
 from ipsys_log.statistics.joint_plan import PlannedDrive
+from ipsys_log.units import CM_PER_M, MM_PER_M
 
 # Colours from pale (small error) to dark. They differ from the camera colours, and are distinct in grey too.
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])

@@ -10,7 +10,7 @@ from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, cm, counted, means_cm, mm
 from ipsys_log.live_runs.survey.floor_plan import PlannedFloor
 from ipsys_log.live_runs.survey.lab_calibration import CameraResult, LabCalibration
-from ipsys_log.messages.units import CM_PER_M, MM_PER_M
+from ipsys_log.units import CM_PER_M, MM_PER_M
 
 if TYPE_CHECKING:
     from ipsys_log.statistics.joint_plan import PlannedDrive

@@ -15,7 +15,7 @@ from ipsys_log.extras import check_installed
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.log.lock import describe_broken_link
-from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.units import CM_PER_M
 
 # Names of the methods in Tables I and II of the paper.
 _PAPER_NAMES = {

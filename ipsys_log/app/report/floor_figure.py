@@ -32,11 +32,11 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION
 from ipsys_log.statistics.ground_truth import gather_tracks
 from ipsys_log.statistics.pairs import Place, locate_measurements
+from ipsys_log.units import CM_PER_M
 
 _GRID_M = 0.5
 # The factor of the arrows is so large that most arrows are shorter than this part of the floor.

@@ -28,7 +28,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.messages.channels import EVALUATION, LATENCY, MEASUREMENTS, POSITIONS, TRACKS
-from ipsys_log.messages.units import NS_PER_S, format_bytes, format_duration, format_time
 from ipsys_log.models.table import CORNER_MODELS, MODELS
 from ipsys_log.plain_text import plain_text, shell_words
 from ipsys_log.statistics.calibration_points import measured
@@ -37,6 +36,7 @@ from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
 from ipsys_log.statistics.latency import latency_percentiles, step_times_s
 from ipsys_log.statistics.tape import RiggedMeasurement
 from ipsys_log.tools.recording import CameraRecording, EventGroup, group_events, read_cameras
+from ipsys_log.units import NS_PER_S, format_bytes, format_duration, format_time
 
 # Number of gaps in the table; the figure shows all of them.
 _MOST_GAPS = 8

@@ -36,8 +36,8 @@ from ipsys_log.app.report.tables import height_note
 from ipsys_log.app.report.tracks_figure import draw_tracks, read_drawn_tracks
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
-from ipsys_log.messages.units import CM_PER_M, MM_PER_M, NS_PER_S
 from ipsys_log.statistics.disagreement import PairDisagreement, divide_floor, divide_time
+from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 
 if TYPE_CHECKING:
     from ipsys_log.statistics.calibrated_cameras import CalibratedCamera

@@ -22,7 +22,7 @@ from ipsys_log.app.report.advice import (
 from ipsys_log.app.report.figures import has_legend, scale_logarithmic, set_ticks, style_axes
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.styles import NOTE, ModelStyle, model_styles, shorten
-from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.units import CM_PER_M
 
 Curves = Mapping[str, Curve]
 

@@ -16,9 +16,9 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.channel_sizes import ChannelSize
 from ipsys_log.log.contents import RawMessage, StoredChannel
 from ipsys_log.messages import Message
-from ipsys_log.messages.units import format_bytes, format_time
 from ipsys_log.plain_text import plain_text
 from ipsys_log.tools.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
+from ipsys_log.units import format_bytes, format_time
 
 _LONGEST_VALUE = 200
 _TIME = "timestamp"  # every payload repeats its publish time

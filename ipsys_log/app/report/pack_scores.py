@@ -12,12 +12,12 @@ from ipsys_log.app.report.advice import label
 from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, counted, name_cell, wrap_text
 from ipsys_log.app.report.tables import height_note
-from ipsys_log.messages.units import MM_PER_M, format_bytes
 from ipsys_log.plain_text import shell_words
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION
 from ipsys_log.tools.publish.packing import PackResult
 from ipsys_log.tools.publish.scores import Score
 from ipsys_log.tools.publish.scoring import ScoreComparison, ScoreResult
+from ipsys_log.units import MM_PER_M, format_bytes
 
 _HEADS = ("mean", "median", "p95", "RMSE")
 _NAMED = 3  # differences that the answer names

@@ -11,7 +11,7 @@ import numpy as np
 from ipsys_log.calibration.board import Board, black_squares, board_markers
 from ipsys_log.messages import Rig
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import MM_PER_M
+from ipsys_log.units import MM_PER_M
 from ipsys_log.vision.marker_cells import cell_outlines
 from ipsys_log.vision.markers import white_cells
 

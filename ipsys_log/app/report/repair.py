@@ -10,7 +10,7 @@ from ipsys_log.log.chunk_builder import IMAGE_SCHEMAS
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import RepairReport
-from ipsys_log.messages.units import NS_PER_S, format_bytes, format_time
+from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 # A recorder flushes its messages at least once in this time.
 _FLUSH_NS = NS_PER_S

@@ -12,8 +12,8 @@ from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, cm
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ErrorStatistics
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.robot_run import RobotResult, RobotRunResult, Stop, read_robot_run
+from ipsys_log.units import NS_PER_S
 
 # The panels hold photographs: more pixels would only make the page larger.
 _PANELS_DPI = 110

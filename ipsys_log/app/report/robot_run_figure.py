@@ -17,8 +17,8 @@ from ipsys_log.app.report.styles import NOTE, TEST, robot_colour, shorten
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Marker, Markers, Rig
 from ipsys_log.messages.channels import MARKERS, RIG
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.robot_run import RobotResult, RobotRunResult
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import check_encoded
 
 Image = NDArray[np.uint8]

@@ -11,8 +11,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from ipsys_log.messages.units import CM_PER_M, MM_PER_M
 from ipsys_log.plain_text import plain_text
+from ipsys_log.units import CM_PER_M, MM_PER_M
 
 _WIDTH = 80
 _UNKNOWN = "-"

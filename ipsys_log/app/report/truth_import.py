@@ -10,7 +10,7 @@ import numpy as np
 
 from ipsys_log.app.report.rows import cm, counted, mm, wrap_text
 from ipsys_log.exchange.import_truth import ImportedTruth
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _MS_PER_S = 1000.0
 

@@ -11,7 +11,7 @@ from ipsys_log.calibration.joint.prior_sigmas import tape_contradiction
 from ipsys_log.calibration.joint.robust import limit_of, robust_loss
 from ipsys_log.calibration.joint.trajectories import Kind
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.units import CM_PER_M
 
 # A reading is wrong if its error exceeds this many standard deviations.
 _WRONG = 4.5

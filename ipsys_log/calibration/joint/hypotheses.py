@@ -42,7 +42,7 @@ from ipsys_log.calibration.joint.tape_explanations import (
     side_contradicts,
 )
 from ipsys_log.errors import FitError
-from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.units import CM_PER_M
 
 Progress = Callable[[int, float], None]
 # The decrease of the sum of squares by a motion of a camera, or by free row times (None).

@@ -30,7 +30,7 @@ from ipsys_log.capture.nodes.wire import (
 )
 from ipsys_log.messages import RigCamera
 from ipsys_log.messages.rig_file import check_name
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     import zenoh

@@ -28,7 +28,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.growing_channel import GrowingChannel
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # Frames that wait to be sent, and the newest frames, which need not be read from the disk.
 _MOST_WAITING_BYTES, _MOST_RECENT_BYTES = 32 << 20, 64 << 20

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, Self
 from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage
 from ipsys_log.capture.nodes.centre import Centre, describe_no_answer, is_of_node
 from ipsys_log.capture.nodes.network import NodeNetwork
+from ipsys_log.engine.piped_process import PipedProcess, parent_pipe
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
-from ipsys_log.piped_process import PipedProcess, parent_pipe
+from ipsys_log.units import NS_PER_S
 
 _LEAST_PERIOD_S, _MOST_PERIOD_S, _PERIOD_OF_NODE_S = 0.001, 0.005, 0.0002
 # The readers of all cameras ask one after the other. One look at the pipe is enough for all of them.

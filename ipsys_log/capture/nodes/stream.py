@@ -16,7 +16,7 @@ from ipsys_log.capture.nodes.wire import FrameHeader, FrameRequest, NodeState, S
 from ipsys_log.capture.video_packets import is_decodable_start
 from ipsys_log.messages import EVENTS_TOPIC, ClockEstimate, Event, RigCamera, clock_topic
 from ipsys_log.messages.events import NODE_ANSWERS, NODE_REFUSED
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _VIDEO = ("h264", "h265")
 _FRAMES_PER_REQUEST = 16

@@ -8,7 +8,7 @@ from math import atan2, cos, exp, sin, sqrt
 
 import numpy as np
 
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 # Time between two steps of the motion.
 STEP_NS = NS_PER_S // 200

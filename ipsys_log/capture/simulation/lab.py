@@ -38,7 +38,7 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker
 
 # Start of the simulated clock: 2023-11-14 22:13:20 UTC.

@@ -17,7 +17,7 @@ from ipsys_log.capture.simulation.lab import build_rig
 from ipsys_log.capture.simulation.render import add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.messages import Rig, RigCamera, Track, Tracks, Waypoint
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.marker_cells import MovingMarker, PlacedBoard
 from ipsys_log.vision.poses import pose_facing_up
 

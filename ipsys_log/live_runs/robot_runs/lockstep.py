@@ -28,8 +28,8 @@ from ipsys_log.messages import (
     WheelCommand,
     image_topic,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import PoseSource
+from ipsys_log.units import NS_PER_S
 
 _TURN_S = 0.5
 

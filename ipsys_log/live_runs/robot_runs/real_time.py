@@ -15,7 +15,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.robot_runs.settings import RobotRun
 from ipsys_log.live_runs.robot_runs.steering import Steering
 from ipsys_log.messages import COMMANDS_TOPIC, TRUTH_TOPIC, RigCamera, WheelCommand
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _TURN_S = 0.4
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.simulation.settings import Purpose, random_stream
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _LOOPBACK = "127.0.0.1"
 _TURN_S = 0.005

@@ -11,7 +11,7 @@ from ipsys_log.live_runs.robot_runs.programs import Programs
 from ipsys_log.live_runs.robot_runs.settings import RobotRun
 from ipsys_log.live_runs.robot_runs.wheels import Wheels
 from ipsys_log.messages import FINISHED, HOLDING, STOPPED, WheelCommand
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 
 class Steering:

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import WheelCommand
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import plain_text
+from ipsys_log.units import NS_PER_S
 
 LOOPBACK = "127.0.0.1"
 # A slow machine needs long for a program. After the first time it is named; the second is an error.

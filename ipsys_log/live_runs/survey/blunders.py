@@ -11,7 +11,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.scene import Prediction
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.statistics.blunders import Blunder, possible_blunders
 from ipsys_log.statistics.tape import (
     RiggedMeasurement,
@@ -21,6 +20,7 @@ from ipsys_log.statistics.tape import (
     with_usual_tape,
     world_point,
 )
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import SIDES, USUAL_TAPE_SIGMA_M, are_collinear
 
 # The name of a model from a log, in a warning.

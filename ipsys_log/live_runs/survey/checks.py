@@ -22,7 +22,6 @@ from ipsys_log.live_runs.survey.entry import Entry, Fault, check_references, par
 from ipsys_log.live_runs.survey.scene import MarkerObservations, Prediction, predict
 from ipsys_log.messages import Distance, Measurement, Model, Rig
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import CM_PER_M
 from ipsys_log.statistics.pairs import active_baselines, active_measurements, withdrawals
 from ipsys_log.statistics.tape import (
     TapePoint,
@@ -31,6 +30,7 @@ from ipsys_log.statistics.tape import (
     with_usual_tape,
     world_point,
 )
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import SIDES
 
 _NUMBERED = re.compile(r"p[0-9]{1,18}")  # the limit matters: an id in a log may have thousands of digits

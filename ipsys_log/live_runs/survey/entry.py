@@ -11,7 +11,7 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Distance, ReferencePoint, Rig
-from ipsys_log.messages.units import CM_PER_M
+from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import SIDES, are_collinear
 
 _NUMBER = re.compile(r"\d+(?:[.,]\d*)?|[.,]\d+")

@@ -30,9 +30,9 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, Channel
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.statistics.pairs import TimedPoints, gather_sightings
 from ipsys_log.statistics.stationary import stationary_intervals
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import decode_last
 

@@ -26,7 +26,7 @@ from ipsys_log.messages import (
     Model,
     Rig,
 )
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import decode_keyframe, is_keyframe
 

@@ -15,7 +15,7 @@ from ipsys_log.live_runs.survey.checks import check_entry
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
 from ipsys_log.live_runs.survey.scene import StationaryInterval
 from ipsys_log.messages import Rig
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 _PLAIN = ("id", "marker", "side", "height_cm", "place", "time", "split", "note")
 _NEEDED = ("marker", "height_cm")

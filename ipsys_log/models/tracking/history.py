@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.filter import Sightings, States
+from ipsys_log.units import NS_PER_S
 
 # A sighting that is older than the newest one by more than this is left out.
 HISTORY_NS = NS_PER_S // 2

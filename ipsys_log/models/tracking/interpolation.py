@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages.arrays import Array, Indices, Times
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.motion import MotionNoise, transition
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.time_brackets import bracket_times
 
 # Columns of the motion in the state: value, rate and acceleration; the last two have white acceleration.

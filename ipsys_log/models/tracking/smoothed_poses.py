@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Model, Position, Rig
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.filter import States
 from ipsys_log.models.tracking.frame_reader import FrameReader
 from ipsys_log.models.tracking.history import Sighted, combine_seen
 from ipsys_log.models.tracking.motion import MOTION
 from ipsys_log.models.tracking.smoother import smooth_track
 from ipsys_log.models.tracking.tracks import Pose, Robot, RobotTracks, TrackSettings, gather_sightings
+from ipsys_log.units import NS_PER_S
 
 
 class Frame(NamedTuple):

@@ -13,9 +13,9 @@ from ipsys_log.messages import STAMP_UNRELIABLE, Event, Message, Model, Rig, Tra
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import EVENTS, MODEL, POSITIONS, RIG, Channel
 from ipsys_log.messages.stage import StageView
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.interpolation import TrackRows
 from ipsys_log.models.tracking.tracks import Pose
+from ipsys_log.units import NS_PER_S
 
 TRACK_READS = (RIG, POSITIONS, MODEL, EVENTS)
 # A heading that was never measured has a larger standard deviation.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import hypot
 
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.models.tracking.history import History
 from ipsys_log.models.tracking.motion import MotionNoise, displacement
+from ipsys_log.units import NS_PER_S
 
 # A prediction of this duration is compared
 _AHEAD_NS = 400_000_000

@@ -10,11 +10,11 @@ import rerun as rr
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Event, Markers, Message, Positions, Rig, Tracks, image_topic
 from ipsys_log.messages.channels import IMAGES
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
 from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout, symbol_scale
 from ipsys_log.sinks.rerun.viewer import check_screen, show_in_viewer
 from ipsys_log.sinks.streams.poses import NewSession
+from ipsys_log.units import NS_PER_S
 
 Write = Callable[[bytes], object]
 

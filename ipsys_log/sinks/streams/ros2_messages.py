@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.rotations import quaternion
 
 if TYPE_CHECKING:

@@ -12,12 +12,12 @@ from contextlib import suppress
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, refuse_bind
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 from ipsys_log.sinks.streams.vrpn_client import Client
 from ipsys_log.sinks.streams.vrpn_messages import describe, pack_pose
+from ipsys_log.units import NS_PER_S
 
 PORT = 3883
 _MOST_CLIENTS, _MOST_CALLBACKS = 32, 4

@@ -11,8 +11,8 @@ import struct
 from math import cos, sin
 from typing import NamedTuple
 
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
+from ipsys_log.units import NS_PER_S
 
 _ALIGNMENT = 8
 _HEADER = struct.Struct(">IIIiiI")

@@ -10,11 +10,11 @@ from math import ceil
 import numpy as np
 
 from ipsys_log.messages import Markers, Message, Rig, Tracks
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.colours import camera_colours
 from ipsys_log.sinks.video.camera_panel import CameraPanel
 from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
 from ipsys_log.sinks.video.floor_map import FloorMap, MapLook, MapPart
+from ipsys_log.units import NS_PER_S
 
 _GROUND: RGB = (24, 24, 28)
 _TEXT: RGB = (235, 235, 238)

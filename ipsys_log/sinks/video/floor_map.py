@@ -11,9 +11,9 @@ import numpy as np
 
 from ipsys_log.messages import Rig, Track, Tracks
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.plain_text import plain_text
 from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.ellipses import covariance_ellipse
 
 _GROUND: RGB = (24, 24, 28)

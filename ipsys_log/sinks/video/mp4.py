@@ -18,12 +18,12 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Rig
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import MARKERS, TRACKS
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.colours import robot_colour
 from ipsys_log.sinks.selection import choose_runs, fade_ns, rig_in_force
 from ipsys_log.sinks.video.canvas import Picture
 from ipsys_log.sinks.video.composite import Composite, Scene
 from ipsys_log.sinks.video.floor_map import MapPart
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.ellipses import enlargement
 
 if TYPE_CHECKING:

@@ -38,7 +38,6 @@ from ipsys_log.messages.channels import (
 )
 from ipsys_log.messages.events import skipped_frames
 from ipsys_log.messages.stage import Pieces, Plan, Resets, Stage, StageView
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import MarkerFit
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.stages.detect.misprints import Inspection, Misprints
@@ -53,6 +52,7 @@ from ipsys_log.stages.detect.reports import (
     SeenSquares,
 )
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.lenses import check_calibration, check_size, same_intrinsics
 from ipsys_log.vision.video import Video

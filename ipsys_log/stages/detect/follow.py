@@ -8,7 +8,6 @@ import numpy as np
 
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.messages.arrays import Array, Grey
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.changes import ChangeDetector
 from ipsys_log.stages.detect.edges import fit_edges
@@ -24,6 +23,7 @@ from ipsys_log.stages.detect.search import (
     search_thoroughly,
     search_unexplained_areas,
 )
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_rows
 from ipsys_log.vision.lenses import check_size, project, undistort
 from ipsys_log.vision.markers import marker_corners

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import rotation, rotation_vector
 
 # After this time, an earlier motion predicts nothing.

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import IO, BinaryIO, cast
 
 from ipsys_log.errors import IpsysError, is_full
-from ipsys_log.messages.units import format_bytes
 from ipsys_log.plain_text import plain_text
 from ipsys_log.tools.publish.manifest import Manifest, parse_manifest
 from ipsys_log.tools.publish.members import (
@@ -35,6 +34,7 @@ from ipsys_log.tools.publish.members import (
     copy_member,
 )
 from ipsys_log.tools.publish.scores import StatedScores, parse_scores
+from ipsys_log.units import format_bytes
 
 _NAMED = 3  # files that an error names
 # Images and chunks of logs do not compress; texts shrink by a factor of ten.

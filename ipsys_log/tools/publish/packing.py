@@ -19,7 +19,6 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
 from ipsys_log.messages.channels import RIG
 from ipsys_log.messages.rig_file import hide_passwords, rig_toml
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.cut import cut
 from ipsys_log.tools.publish.blurred_images import blur_log, marker_corners
 from ipsys_log.tools.publish.card import Card, read_card
@@ -40,6 +39,7 @@ from ipsys_log.tools.publish.members import (
 )
 from ipsys_log.tools.publish.readme import readme_text
 from ipsys_log.tools.publish.scores import SCORE_FIELDS, Score, compute_scores, scores_json
+from ipsys_log.units import NS_PER_S
 
 # Times of members in an archive; with the clock of the machine, equal packs would differ.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from ipsys_log.engine.view import LogView
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
-from ipsys_log.messages.units import NS_PER_S, format_bytes, format_time
 from ipsys_log.statistics.calibration_points import measured
 from ipsys_log.tools.publish.card import Card, escape_markdown
 from ipsys_log.tools.publish.members import LOGS, RIG_FILE, SCORES
 from ipsys_log.tools.publish.scores import Score
+from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 _CARD_ROWS: dict[str, Callable[[Card], str]] = {
     "Authors": lambda card: ", ".join(card.authors),

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
-from ipsys_log.messages.units import format_bytes
 from ipsys_log.plain_text import hide_password, plain_text
+from ipsys_log.units import format_bytes
 
 # fsspec has file systems that read other files or combine several; these read one file from a server.
 _SCHEMES = ("http", "https", "s3", "gs", "gcs", "az", "abfs", "abfss")

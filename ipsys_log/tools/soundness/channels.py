@@ -27,9 +27,9 @@ from ipsys_log.messages.events import (
     STAMP_UNRELIABLE,
     TILTED_MARKER,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.recording import find_gaps
 from ipsys_log.tools.soundness.finding import NOTE, REMARK, LogFinding
+from ipsys_log.units import NS_PER_S
 
 _PROGRESS_EVERY = 1000
 # Events of the recorder or of a run that need no action.

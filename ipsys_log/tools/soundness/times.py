@@ -10,9 +10,9 @@ from ipsys_log.engine.provenance import complete_runs
 from ipsys_log.engine.states import is_fitted_here
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import CLOCKS, MODEL, clock_topic
-from ipsys_log.messages.units import NS_PER_S, format_time
 from ipsys_log.models.table import is_known, reads_corners
 from ipsys_log.tools.soundness.finding import REMARK, LogFinding
+from ipsys_log.units import NS_PER_S, format_time
 
 _DAY_NS = 86_400 * NS_PER_S
 # Messages so many days before or after all others are far from the rest, if they are less than a tenth.

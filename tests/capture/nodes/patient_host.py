@@ -22,7 +22,7 @@ from ipsys_log.capture.devices import OPENERS
 from ipsys_log.capture.frames import Clock, Frame, Say
 from ipsys_log.capture.nodes import centre, node
 from ipsys_log.messages import RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 PATIENCE_S, PERIOD_S = 600.0, 0.05
 _COMMENT = b"\xff\xfe\x00\x0a"

@@ -13,7 +13,7 @@ from ipsys_log.capture.frames import Frame, NodeRefusedError, SourceError, Sourc
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import FrameHeader, FrameRequest, NodeState, StateRequest
 from ipsys_log.messages import ClockEstimate, Event, RigCamera
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
 ONE, TWO, THREE = "00000000000000a1", "00000000000000b2", "00000000000000c3"

@@ -19,9 +19,9 @@ from ipsys_log.capture.frames import Clock, SourceError
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.receiver import Receiver, _Setup, serve
+from ipsys_log.engine.piped_process import PipedProcess
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CompressedImage, Event, RigCamera
-from ipsys_log.piped_process import PipedProcess
 from tests.capture.nodes.lab_of_nodes import PATIENCE_S, Feed, sending
 from tests.ports import free_port
 from tests.waiting import wait_until

@@ -11,7 +11,7 @@ from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
 from ipsys_log.capture.nodes.wire import StateRequest
 from ipsys_log.messages import CompressedImage, Message, image_topic
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from tests.log.conftest import create
 
 OTHER = "00112233445566ff"

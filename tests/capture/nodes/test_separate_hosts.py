@@ -15,8 +15,8 @@ import pytest
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.growing_channel import GrowingChannel
 from ipsys_log.messages import ClockEstimate, CompressedImage, clock_topic, image_topic
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.tools.soundness.check import check_logs
+from ipsys_log.units import NS_PER_S
 from tests.capture.nodes.lab_of_nodes import make_certificates
 from tests.capture.nodes.namespaces import CENTRE_IP, RELAY_IP, Hosts, in_host, three_hosts
 from tests.capture.nodes.tcp_relay import DELAYS_S

@@ -12,7 +12,7 @@ import simplejpeg
 
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RawImage
-from ipsys_log.messages.units import NS_PER_S
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import check_encoded, decode_grey
 from ipsys_log.vision.video import decode_keyframe, is_keyframe
 

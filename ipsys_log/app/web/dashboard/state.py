@@ -38,11 +38,11 @@ from ipsys_log.messages import (
     Rig,
     Tracks,
 )
-from ipsys_log.messages.units import NS_PER_S
 from ipsys_log.sinks.selection import PlayedScene
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.statistics.overlap_stream import OverlapSummary
+from ipsys_log.units import NS_PER_S
 
 _NS_PER_MS = 1_000_000
 # Number of the last positions whose latencies count.

@@ -23,7 +23,7 @@ ONE_THREAD = dict.fromkeys(
 # The path of modules is that of the parent: the folder of the user has no part in it.
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from ipsys_log.piped_process import end_with_parent; end_with_parent(); "
+    "from ipsys_log.engine.piped_process import end_with_parent; end_with_parent(); "
     "from {module} import {function}; {function}()"
 )
 

@@ -23,6 +23,8 @@ _KEPT = "complete results are kept; nothing else is changed"
 SAVED = "stopped; every saved point is in the log"
 _NOTHING_WRITTEN = "no file was changed"
 _AT_ONCE = "ended at once; if a log was being recorded, complete it with: ipsys repair LOG"
+# An interrupt within an import waits for this time, and tries again.
+_AFTER_IMPORT_S = 0.02
 _SHOW_CURSOR = "\x1b[?25h"
 
 
@@ -61,6 +63,7 @@ _state = _State()
 
 def hold_signals() -> None:
     """Note a signal without any effect, until the command sets its effect."""
+    signal.setitimer(signal.ITIMER_REAL, 0)
     _state.noted, _state.normal_text = None, None
     _handle(_note)
 
@@ -156,13 +159,25 @@ def _note(number: int, _: FrameType | None = None) -> None:
     _handle(_end_at_once)
 
 
-def _interrupt(number: int, _: FrameType | None = None) -> None:
-    # Other packages may suppress the exception: the import of an extension module does. So it stays noted.
-    text, _state.noted, _state.normal_text = _state.normal_text, number, None
+def _interrupt(number: int, frame: FrameType | None = None) -> None:
+    _state.noted = number
     _handle(_end_at_once)
+    if _is_importing(frame):  # the import of an extension module may suppress the exception
+        signal.signal(signal.SIGALRM, lambda _, later: _interrupt(number, later))
+        signal.setitimer(signal.ITIMER_REAL, _AFTER_IMPORT_S)
+        return
+    text, _state.normal_text = _state.normal_text, None
     if text is not None:
         raise Interrupted(0, text)
     raise Interrupted(128 + number, f"interrupted; {_state.kept_text}")
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _end_at_once(number: int, _: FrameType | None = None) -> None:

@@ -102,11 +102,11 @@ def replay(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
 @pytest.mark.slow
 def test_joint_model_halves_the_error_of_rayplane(ipsys: Ipsys, replayed: Path) -> None:
     models = replay(ipsys, replayed, "--model", "joint", "--model", "rayplane")
-    truth = {name: model["pooled"]["truth"]["2d"]["mean_cm"] for name, model in models.items()}
-    tracks = {name: model["tracks"]["truth"]["2d"]["mean_cm"] for name, model in models.items()}
+    truth = {name: model["pooled"]["truth"]["2d"]["mean_m"] for name, model in models.items()}
+    tracks = {name: model["tracks"]["truth"]["2d"]["mean_m"] for name, model in models.items()}
     assert truth["joint"] < 0.6 * truth["rayplane"]
     assert tracks["joint"] < 0.6 * tracks["rayplane"]
-    assert tracks["joint"] < 0.15
+    assert tracks["joint"] < 0.0015
     with Session([replayed]) as session:
         (evaluation,) = session.payloads(session.topics(EVALUATION, "joint"))
     curve = {(point.camera, point.pairs): point for point in evaluation.learning}
@@ -141,11 +141,11 @@ def test_drive_after_the_points_halves_the_error(ipsys: Ipsys, tmp_path: Path) -
     write_log(both, [*measured, *drive])
     assert ipsys("fit", points, "--model", "joint").code == 0
     before = ["-o", tmp_path / "before.mcap", "--model-from", points]
-    errors_cm = [
-        replay(ipsys, both, "--model", "joint", *more)["joint"]["tracks"]["truth"]["2d"]["mean_cm"]
+    errors_m = [
+        replay(ipsys, both, "--model", "joint", *more)["joint"]["tracks"]["truth"]["2d"]["mean_m"]
         for more in (before, [])
     ]
-    assert errors_cm[1] < 0.5 * errors_cm[0]
+    assert errors_m[1] < 0.5 * errors_m[0]
 
 
 def test_log_with_camera_points_only_is_refused(ipsys: Ipsys, tmp_path: Path, data: Path) -> None:
@@ -251,7 +251,7 @@ def test_wrong_tape_reading_is_an_outlier_of_joint(ipsys: Ipsys, tmp_path: Path)
     (suspect,) = model["suspects"]
     assert (suspect["measurement"], suspect["kind"]) == ("s004", "distance")
     assert "distance to A" in suspect["text"]
-    assert 5 < np.linalg.norm(suspect["residual_cm"]) < 25
+    assert 0.05 < np.linalg.norm(suspect["residual_m"]) < 0.25
     assert "Outliers: measure 1 point again" in ipsys("evaluate", log, "--model", "joint").out
 
 
@@ -291,8 +291,8 @@ def test_marker_without_a_height_gets_its_full_pose(ipsys: Ipsys, fitted: Path, 
     options = ("--model", "joint", "--model-from", fitted, "--rig", rig, "-o", located)
     tracks = replay(ipsys, drive, *options)["joint"]["tracks"]["truth"]
     assert drive.read_bytes() == before
-    assert tracks["2d"]["mean_cm"] < 0.4
-    assert tracks["3d"]["mean_cm"] < 1.5
+    assert tracks["2d"]["mean_m"] < 0.004
+    assert tracks["3d"]["mean_m"] < 0.015
     with Session([drive, located]) as session:
         positions = [p for one in session.payloads(session.topics(POSITIONS, "joint")) for p in one.positions]
     heights_m = np.array([p.z_m for p in positions])

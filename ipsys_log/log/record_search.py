@@ -55,6 +55,7 @@ _CANDIDATE = re.compile(
     re.DOTALL,
 )
 _SECTOR_BYTES = 512
+_NEAR_BYTES = 4096  # after damage, where a stray copy of a sector may fit to the records by chance
 _OVERLAP = 64  # bytes: longer than each candidate
 _DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA))
 _IN_CHUNK = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE))
@@ -79,14 +80,15 @@ class RecordSearch:
     """A search in one log.
 
     `channels` are the known channel ids, `span_ns` is the time range of the known messages. `frame_at` is the
-    offset of the last compressed data that were found without the head of their chunk. `budget` limits the
-    bytes that are searched without result.
+    offset of the last compressed data that were found without the head of their chunk. `damage_end` is the
+    end of the last damage. `budget` limits the bytes that are searched without result.
     """
 
     view: LogBytes
     channels: Container[int]
     span_ns: tuple[int, int] | None = None
     frame_at: int = -1
+    damage_end: int | None = None
     budget: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -106,22 +108,22 @@ class RecordSearch:
                     return offset
         return None
 
-    def inner_record(self, record: RecordAt, is_near_damage: bool = False) -> int | None:
+    def inner_record(self, record: RecordAt) -> int | None:
         """Return the offset of the first of other records within this one, if its length is wrong.
 
-        The length is right if a plausible record follows; near damage, this may be chance. Records within
-        this one prove the contrary if they lead to its end, or further than a stray copy of a sector.
+        The length is right if a plausible record follows; soon after damage, this may be chance. Records
+        within this one prove the contrary if they lead to its end, or further than a stray copy of a sector.
         """
         stop = record.offset + record.length
-        head = MESSAGE if record.opcode == Opcode.MESSAGE else HEADER
-        is_right = self._follows(stop) and not is_near_damage
-        inner = None if is_right else self.find(record.offset + head.size, stop)
-        while inner is not None and inner != self.frame_at and not self._leads_to(inner, stop):
+        is_near = self.damage_end is not None and record.offset - self.damage_end < _NEAR_BYTES
+        is_right = self._follows(stop) and not is_near
+        inner = None if is_right else self.find(record.offset + HEADER.size, stop)
+        while inner is not None and inner != self.frame_at and not self.leads_to(inner, stop):
             inner = self.find(inner + 1, stop)
         return inner
 
-    def _leads_to(self, start: int, stop: int) -> bool:
-        """Return whether records from `start` on lead to `stop`, or further than a sector."""
+    def leads_to(self, start: int, stop: int) -> bool:
+        """Return whether records from `start` on lead to `stop`, or further than a stray copy of a sector."""
         position = start
         while position < min(stop, start + _SECTOR_BYTES + 1):
             if not self._follows(position):
@@ -177,18 +179,21 @@ class RecordSearch:
             return True
         follows = self._follows(offset + record.length)
         if record.opcode == Opcode.MESSAGE and record.length >= MESSAGE.size:
-            _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(offset, MESSAGE.size))
-            return follows or self._fits(channel, time_ns)
+            return follows or self._fits(*MESSAGE.unpack(view.read(offset, MESSAGE.size))[2:])
         if record.opcode == Opcode.ATTACHMENT:
             stored, crc = attachment_crcs(view, record)
             return stored == crc if stored else follows
         return follows and record.opcode == Opcode.MESSAGE_INDEX and bool(index_rows(view, record))
 
-    def _fits(self, channel: int, time_ns: int) -> bool:
-        """Return whether a message has a known channel, and about the time of the known messages."""
-        span = self.span_ns
-        is_near = span is not None and span[0] - _DAY_NS < time_ns < span[1] + _DAY_NS
-        return is_near and channel in self.channels
+    def _fits(self, channel: int, _: int, time_ns: int, published_ns: int) -> bool:
+        """Return whether a message has a known channel, and about the time of the known messages.
+
+        Without known messages, its log time must be near its publish time.
+        """
+        if channel not in self.channels or (self.span_ns is None and not published_ns):
+            return False
+        first_ns, last_ns = self.span_ns or (published_ns, published_ns)
+        return first_ns - _DAY_NS < time_ns < last_ns + _DAY_NS
 
     def parse_definition(self, record: RecordAt) -> mcap.Schema | mcap.Channel | None:
         """Parse a Schema or Channel record; check a Metadata record, too.
@@ -281,10 +286,9 @@ class RecordSearch:
         for match in _MESSAGE_HEAD.finditer(data, start):
             position = match.start()
             if position + MESSAGE.size <= len(data):
-                _, length, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
-                if MESSAGE.size <= HEADER.size + length <= len(data) - position and self._fits(
-                    channel, time_ns
-                ):
+                _, length, *fields = MESSAGE.unpack_from(data, position)
+                is_inside = MESSAGE.size <= HEADER.size + length <= len(data) - position
+                if is_inside and self._fits(*fields):
                     return position
         return len(data)
 
@@ -294,26 +298,28 @@ def _decompress(view: LogBytes, offset: int, stop: int, most: int) -> tuple[byte
 
     Returns
     -------
-    The bytes, the offset of the end of the compressed data, and whether all was decompressed.
+    The bytes, the offset of the end of their compressed data, and whether all was decompressed.
     """
     is_zstd = view.read(offset, len(_ZSTD)) == _ZSTD
     decoder = zstandard.ZstdDecompressor().decompressobj() if is_zstd else lz4.frame.LZ4FrameDecompressor()
-    data, position = bytearray(), offset
+    data, position, end = bytearray(), offset, offset
     try:
         while position < stop:
             block = view.read(position, min(_BLOCK, stop - position))
             for start in range(0, len(block), _PIECE):
                 piece = block[start : start + _PIECE]
                 position += len(piece)
-                data += decoder.decompress(piece)
+                unpacked = decoder.decompress(piece)
+                data += unpacked
+                end = position if unpacked else end  # a block with a wrong length may lead further
                 limit = min(_LARGEST_FRAME, most, max(_ANY_RATIO, _LARGEST_RATIO * (position - offset)))
                 if len(data) > limit:
-                    return data, position, False
+                    return data, end, False
                 if decoder.eof:
                     return data, position - len(decoder.unused_data or b""), True
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
         pass
-    return data, position, False
+    return data, end, False
 
 
 def index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, int]]]:

@@ -35,6 +35,10 @@ HARD = [
     (103, 9171, "unchunked, data CRC: duplicated 20480 at 1536, zeroed at 512"),
     (202, 9307, "no statistics: flipped at 1715, swapped in at 1024"),  # a message of a log without chunks
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
+    (8, 1719, "unchunked: swapped in at 2048, duplicated 8192 at 9728"),  # a head that ends in a true message
+    (7, 1361, "lz4: swapped in at 21504"),  # compressed data with a wrong length lead over whole chunks
+    (401, 879, "no index: swapped in at 0, cut at 12210"),  # the definitions of another log
+    (401, 2005, "repeated definitions: swapped in at 1024"),  # messages of another log after a half index
 ]
 
 

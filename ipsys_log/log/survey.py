@@ -362,6 +362,7 @@ class Survey:
         for channel in set(channels) - self._declared[1]:
             self.faults.append((offset, f"a message is of channel {channel}, whose definition is lost"))
             self._declared[1].add(channel)
+        self.view.check_number(len(self._declared[1]), "channels")
 
     def _cover(self, start_ns: int, end_ns: int) -> None:
         first, last = self.search.span_ns or (start_ns, end_ns)

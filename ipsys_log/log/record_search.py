@@ -6,8 +6,6 @@ compressed data.
 """
 
 import re
-import struct
-import zlib
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 
@@ -28,6 +26,7 @@ from ipsys_log.log.records import (
     MAGIC,
     MESSAGE,
     RecordAt,
+    attachment_crcs,
     parse_chunk_head,
     parse_exact,
     parse_message_index,
@@ -40,7 +39,6 @@ _PIECE = 256  # compressed bytes at a time: the output of the pieces before an e
 _LARGEST_FRAME = 256 << 20  # bytes of records
 _LARGEST_RATIO = 200  # no recorded data compress better
 _ANY_RATIO = 16 << 20  # bytes of records: the ratio counts only above this
-_LONGEST_ATTACHMENT_HEAD = 1 << 16  # bytes
 _DAY_NS = 86_400 * 1_000_000_000
 _SEARCH_BYTES = 64 << 20  # limit of the search without result in a small log
 _STEP_BYTES = 256  # the cost of the check of a small record, as bytes of that limit
@@ -113,12 +111,19 @@ class RecordSearch:
 
         The length is right if a plausible record follows; soon after damage, this may be chance. Records
         within this one prove the contrary if they lead to its end, or further than a stray copy of a sector.
+        If nothing follows, one message that fits to the log is proof enough.
         """
         stop = record.offset + record.length
+        follows = self._follows(stop)
         is_near = self.damage_end is not None and record.offset - self.damage_end < _NEAR_BYTES
-        is_right = self._follows(stop) and not is_near
-        inner = None if is_right else self.find(record.offset + HEADER.size, stop)
+        is_doubtful = is_near or not follows
+        if is_doubtful and record.opcode == Opcode.ATTACHMENT:  # it may hold another log
+            stored, crc = attachment_crcs(self.view, record)
+            is_doubtful = stored != crc or stored == 0
+        inner = self.find(record.offset + HEADER.size, stop) if is_doubtful else None
         while inner is not None and inner != self.frame_at and not self.leads_to(inner, stop):
+            if not follows and self._fits_at(inner):
+                break
             inner = self.find(inner + 1, stop)
         return inner
 
@@ -179,11 +184,16 @@ class RecordSearch:
             return True
         follows = self._follows(offset + record.length)
         if record.opcode == Opcode.MESSAGE and record.length >= MESSAGE.size:
-            return follows or self._fits(*MESSAGE.unpack(view.read(offset, MESSAGE.size))[2:])
+            return follows or self._fits_at(offset)
         if record.opcode == Opcode.ATTACHMENT:
             stored, crc = attachment_crcs(view, record)
             return stored == crc if stored else follows
         return follows and record.opcode == Opcode.MESSAGE_INDEX and bool(index_rows(view, record))
+
+    def _fits_at(self, offset: int) -> bool:
+        head = self.view.read(offset, min(MESSAGE.size, self.view.size - offset))
+        is_message = len(head) == MESSAGE.size and head[0] == Opcode.MESSAGE
+        return is_message and self._fits(*MESSAGE.unpack(head)[2:])
 
     def _fits(self, channel: int, _: int, time_ns: int, published_ns: int) -> bool:
         """Return whether a message has a known channel, and about the time of the known messages.
@@ -361,31 +371,3 @@ def read_indexes(
     except LogError:
         pass  # the next record is damaged
     return end, offsets, is_right and seen >= entries.keys()
-
-
-def attachment_crcs(view: LogBytes, record: RecordAt) -> tuple[int, int]:
-    """Return the stated CRC of an attachment (0: none), and its computed CRC.
-
-    Raises
-    ------
-    LogError
-        The record has wrong lengths.
-    """
-    head = view.read(record.offset, min(record.length, _LONGEST_ATTACHMENT_HEAD))
-    try:
-        (name,) = struct.unpack_from("<I", head, HEADER.size + 16)
-        (media_type,) = struct.unpack_from("<I", head, HEADER.size + 20 + name)
-        (size,) = struct.unpack_from("<Q", head, HEADER.size + 24 + name + media_type)
-    except struct.error:
-        raise view.fault(record.offset, "the Attachment record is not valid") from None
-    if record.length < HEADER.size + 36 + name + media_type + size:
-        raise view.fault(record.offset, "the Attachment record claims lengths that it does not have")
-    stored = int.from_bytes(view.read(record.offset + record.length - 4, 4), "little")
-    return stored, crc_of(view, record.length - HEADER.size - 4, record.offset + HEADER.size) if stored else 0
-
-
-def crc_of(view: LogBytes, length: int, start: int = 0, crc: int = 0) -> int:
-    """Return the CRC-32 of a byte range of the file, continued from `crc`."""
-    for offset in range(start, start + length, _BLOCK):
-        crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)
-    return crc

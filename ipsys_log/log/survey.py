@@ -19,8 +19,6 @@ from ipsys_log.log.record_search import (
     IN_DATA,
     PRIVATE,
     RecordSearch,
-    attachment_crcs,
-    crc_of,
     index_rows,
     read_indexes,
 )
@@ -30,6 +28,8 @@ from ipsys_log.log.records import (
     MAGIC,
     MESSAGE,
     RecordAt,
+    attachment_crcs,
+    crc_of,
     parse_chunk_head,
     parse_exact,
     walk,
@@ -274,7 +274,7 @@ class Survey:
         head = parse_chunk_head(view, record.offset)[1]
         data = unpack(view, record.offset, head, is_crc_checked=False)
         inside = parse_chunk_contents(view, record.offset, data)
-        is_right = head.crc in (0, zlib.crc32(data))
+        is_right = inside.is_exact and head.crc in (0, zlib.crc32(data))
         if not (head.compression or (head.crc and is_right)) and inside.entries:
             offset = inside.in_order()[-1][0]
             length = HEADER.size + HEADER.unpack_from(data, offset)[1]
@@ -282,18 +282,16 @@ class Survey:
             if self.search.inner_record(last) is not None:
                 raise view.fault(record.offset, "the last message in a chunk holds other records")
         if not is_right:
-            self.faults.append((record.offset, "the CRC of the chunk is wrong"))
+            text = "the CRC of the chunk is wrong" if inside.is_exact else "the chunk has a wrong definition"
+            self.faults.append((record.offset, text))
         is_mine = not self._in_damage or self.search.leads_to(record.offset, view.size)
-        self._add_inside(record.offset, inside, _CHUNK if head.crc and is_right and is_mine else _UNCHECKED)
+        trust = _UNCHECKED if inside.is_exact else _UNCHECKED_SUMMARY
+        self._add_inside(record.offset, inside, _CHUNK if head.crc and is_right and is_mine else trust)
         self.parts.append(Part(Kind.CHUNK, record.offset, stop, is_right))
         self._has_chunks, self._in_damage = True, self._in_damage and not is_right
-        was_sound = not self.faults
         end, offsets, is_complete = read_indexes(view, inside.entries, stop)
         self.unindexed = None if is_complete or not is_right else inside
-        if not is_complete and end > stop:
-            self.faults.append((stop, "the message indexes of a chunk are not complete"))
-            self._in_damage = True
-        if was_sound:
+        if not self.faults:
             add_record(view, self.contents, self._unchunked, self._counts, record)
             self._counts[record.offset] = {key: len(rows) for key, rows in inside.entries.items()}
             start_ns, end_ns = inside.span_ns or (head.start_ns, head.end_ns)
@@ -302,6 +300,9 @@ class Survey:
                 index_length=end - stop if is_complete else 0, index_offsets=offsets if is_complete else {},
             )  # fmt: skip
             self._continue_hashes(inside, data)
+        if not is_complete and end > stop:
+            self.faults.append((stop, "the message indexes of a chunk are not complete"))
+            self._in_damage = True
         self._advance_crc(stop if self.unindexed else end, _LAG)
         return end
 

@@ -39,6 +39,8 @@ HARD = [
     (7, 1361, "lz4: swapped in at 21504"),  # compressed data with a wrong length lead over whole chunks
     (401, 879, "no index: swapped in at 0, cut at 12210"),  # the definitions of another log
     (401, 2005, "repeated definitions: swapped in at 1024"),  # messages of another log after a half index
+    (501, 4772, "unchunked, data CRC: duplicated 0 at 1536, flipped at 914"),  # three messages between both
+    (502, 4889, "no CRC: flipped at 4194, flipped at 375"),  # a definition with wrong lengths in a chunk
 ]
 
 

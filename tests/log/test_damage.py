@@ -9,7 +9,11 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
+from ipsys_log.log.recovery import repair
+from tests.log.conftest import Row, stock_rows
 from tests.log.damage import cases, check, run
 
 # Cases that longer runs found: seed, number of the case, log and damage.
@@ -49,6 +53,30 @@ def test_repair_after_natural_damage_converges() -> None:
     totals = run(11, 120, complaints.append)
     assert complaints == []
     assert totals["changed"] > 100
+
+
+def test_repair_keeps_an_attachment_that_holds_a_log(tmp_path: Path) -> None:
+    path, attached = tmp_path / "a.mcap", tmp_path / "attached.mcap"
+    rows: list[Row] = [("/a", 10**18 + k, 10**18, b"data %d" % k) for k in range(20)]
+    for file, attachment in ((attached, b""), (path, b"attached")):
+        with file.open("wb") as out:
+            writer = Writer(out, use_chunking=False)
+            writer.start()
+            channel = writer.register_channel("/a", "json", 0)
+            if attachment:
+                writer.add_attachment(1, 2, "log", "application/mcap", attached.read_bytes())
+                after = out.tell()
+            for _, time_ns, published_ns, data in rows:
+                writer.add_message(channel, time_ns, data, published_ns)
+            writer.finish()  # type: ignore[no-untyped-call]
+    damaged = bytearray(path.read_bytes())
+    damaged[after : after + 9] = bytes(9)  # the head of the record after the attachment
+    path.write_bytes(damaged)
+    assert repair(path).changed
+    assert stock_rows(path) == rows[1:]
+    with path.open("rb") as file_:
+        [kept] = make_reader(file_).iter_attachments()
+    assert kept.data == attached.read_bytes()
 
 
 @pytest.mark.slow

@@ -198,12 +198,13 @@ class RecordSearch:
     def _fits(self, channel: int, _: int, time_ns: int, published_ns: int) -> bool:
         """Return whether a message has a known channel, and about the time of the known messages.
 
-        Without known messages, its log time must be near its publish time.
+        The channel may be unknown, or no message known, if log time and publish time are about the same.
         """
-        if channel not in self.channels or (self.span_ns is None and not published_ns):
-            return False
-        first_ns, last_ns = self.span_ns or (published_ns, published_ns)
-        return first_ns - _DAY_NS < time_ns < last_ns + _DAY_NS
+        is_consistent = published_ns > 0 and abs(time_ns - published_ns) < _DAY_NS
+        if self.span_ns is None:
+            return is_consistent
+        is_near = self.span_ns[0] - _DAY_NS < time_ns < self.span_ns[1] + _DAY_NS
+        return is_near and (is_consistent or channel in self.channels)
 
     def parse_definition(self, record: RecordAt) -> mcap.Schema | mcap.Channel | None:
         """Parse a Schema or Channel record; check a Metadata record, too.
@@ -243,6 +244,38 @@ class RecordSearch:
         except LogError:
             pass
         return None
+
+    def read_indexes(
+        self, entries: Mapping[int, list[tuple[int, int]]], start: int
+    ) -> tuple[int, dict[int, int], bool]:
+        """Read the message indexes of a chunk with these entries, from `start` on.
+
+        Returns
+        -------
+        Their end, the offset of each by channel id, and whether they have all entries of the chunk.
+        """
+        offsets: dict[int, int] = {}
+        seen: set[int] = set()
+        end, is_right = start, True
+        try:
+            for record in walk(self.view, start, self.view.size):
+                if record.opcode != Opcode.MESSAGE_INDEX:
+                    break
+                channel, rows = index_rows(self.view, record)
+                expected = entries.get(channel, [])
+                is_mine = channel not in seen and (rows == expected or sorted(rows) == sorted(expected))
+                is_right &= is_mine
+                if not is_mine and self.inner_record(record) is not None:
+                    break
+                seen.add(channel)
+                if rows:
+                    offsets[channel] = record.offset
+                end = record.offset + record.length
+        except (BoundError, UnreadError):
+            raise
+        except LogError:
+            pass  # the next record is damaged
+        return end, offsets, is_right and seen >= entries.keys()
 
     def read_frame(self, offset: int) -> tuple[bytes, int, bool]:
         """Return the plausible records in compressed data, the end of the data, and whether these are all."""
@@ -341,33 +374,3 @@ def index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, i
             rows = parse_message_index(view, body, 0, channel, record.offset)
             return channel, list(ENTRY.iter_unpack(rows))
     raise view.fault(record.offset, "a MessageIndex record has another length than its entries")
-
-
-def read_indexes(
-    view: LogBytes, entries: Mapping[int, list[tuple[int, int]]], start: int
-) -> tuple[int, dict[int, int], bool]:
-    """Read the message indexes of a chunk with these entries, from `start` on.
-
-    Returns
-    -------
-    Their end, the offset of each by channel id, and whether they have all entries of the chunk.
-    """
-    offsets: dict[int, int] = {}
-    seen: set[int] = set()
-    end, is_right = start, True
-    try:
-        for record in walk(view, start, view.size):
-            if record.opcode != Opcode.MESSAGE_INDEX:
-                break
-            channel, rows = index_rows(view, record)
-            expected = entries.get(channel, [])
-            is_right &= channel not in seen and (rows == expected or sorted(rows) == sorted(expected))
-            seen.add(channel)
-            if rows:
-                offsets[channel] = record.offset
-            end = record.offset + record.length
-    except (BoundError, UnreadError):
-        raise
-    except LogError:
-        pass  # the next record is damaged
-    return end, offsets, is_right and seen >= entries.keys()

@@ -20,7 +20,6 @@ from ipsys_log.log.record_search import (
     PRIVATE,
     RecordSearch,
     index_rows,
-    read_indexes,
 )
 from ipsys_log.log.records import (
     DATA_END,
@@ -289,7 +288,7 @@ class Survey:
         self._add_inside(record.offset, inside, _CHUNK if head.crc and is_right and is_mine else trust)
         self.parts.append(Part(Kind.CHUNK, record.offset, stop, is_right))
         self._has_chunks, self._in_damage = True, self._in_damage and not is_right
-        end, offsets, is_complete = read_indexes(view, inside.entries, stop)
+        end, offsets, is_complete = self.search.read_indexes(inside.entries, stop)
         self.unindexed = None if is_complete or not is_right else inside
         if not self.faults:
             add_record(view, self.contents, self._unchunked, self._counts, record)

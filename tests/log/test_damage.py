@@ -45,6 +45,8 @@ HARD = [
     (401, 2005, "repeated definitions: swapped in at 1024"),  # messages of another log after a half index
     (501, 4772, "unchunked, data CRC: duplicated 0 at 1536, flipped at 914"),  # three messages between both
     (502, 4889, "no CRC: flipped at 4194, flipped at 375"),  # a definition with wrong lengths in a chunk
+    (702, 501, "unchunked, data CRC: cut at 2726, zeroed at 512"),  # one message of a lost channel
+    (703, 550, "unchunked: swapped in at 7168"),  # half an index of another log
 ]
 
 

@@ -159,7 +159,8 @@ def inner_records(view: LogBytes, offset: int, data: bytes) -> Iterator[RecordAt
 class ChunkContents:
     """The definitions and message entries of a chunk, or of a data section without chunks.
 
-    `is_exact` is False if a definition claims lengths that it does not have: other readers refuse it.
+    `is_exact` is False if a schema has the id 0, or if a definition claims lengths that it does not have:
+    other readers refuse it.
     """
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
@@ -186,8 +187,9 @@ class ChunkContents:
             self.entries.setdefault(channel, []).append((time, record.offset))
         elif record.opcode == Opcode.SCHEMA and int.from_bytes(body[:2], "little") not in self.schemas:
             schema = parse(mcap.Schema.read, view, RecordAt(record.opcode, offset, record.length), body)
-            self.schemas[schema.id] = schema
-            self.is_exact &= body.startswith(to_bytes(schema)[HEADER.size :])
+            if schema.id:
+                self.schemas[schema.id] = schema
+            self.is_exact &= schema.id > 0 and body.startswith(to_bytes(schema)[HEADER.size :])
             view.check_number(len(self.schemas), "schemas")
         elif record.opcode == Opcode.CHANNEL and int.from_bytes(body[:2], "little") not in self.channels:
             channel_ = parse(mcap.Channel.read, view, RecordAt(record.opcode, offset, record.length), body)

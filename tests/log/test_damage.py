@@ -47,6 +47,7 @@ HARD = [
     (502, 4889, "no CRC: flipped at 4194, flipped at 375"),  # a definition with wrong lengths in a chunk
     (702, 501, "unchunked, data CRC: cut at 2726, zeroed at 512"),  # one message of a lost channel
     (703, 550, "unchunked: swapped in at 7168"),  # half an index of another log
+    (803, 541, "repeated definitions: flipped at 98, flipped at 9234"),  # a schema with the id 0
 ]
 
 

@@ -162,6 +162,11 @@ class FileBytes:
         return b"".join(parts)
 
 
+def reason_of(error: LogError) -> str:
+    """Return the reason of a `fault`, without the path and the advice."""
+    return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]
+
+
 def file_identity(fd: int) -> tuple[object, object]:
     """Return device and inode of an open file, and its size in bytes and change time in ns."""
     status = os.fstat(fd)

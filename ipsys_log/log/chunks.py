@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, BoundError, chunk_excess
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse, parse_chunk_head
+from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse, parse_chunk_head, to_bytes
 
 
 class _PerThread(threading.local):
@@ -157,11 +157,16 @@ def inner_records(view: LogBytes, offset: int, data: bytes) -> Iterator[RecordAt
 
 @dataclass(slots=True)
 class ChunkContents:
-    """The definitions and message entries of a chunk, or of a data section without chunks."""
+    """The definitions and message entries of a chunk, or of a data section without chunks.
+
+    `is_exact` is False if a schema has the id 0, or if a definition claims lengths that it does not have:
+    other readers refuse it.
+    """
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    is_exact: bool = True
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
@@ -182,11 +187,14 @@ class ChunkContents:
             self.entries.setdefault(channel, []).append((time, record.offset))
         elif record.opcode == Opcode.SCHEMA and int.from_bytes(body[:2], "little") not in self.schemas:
             schema = parse(mcap.Schema.read, view, RecordAt(record.opcode, offset, record.length), body)
-            self.schemas[schema.id] = schema
+            if schema.id:
+                self.schemas[schema.id] = schema
+            self.is_exact &= schema.id > 0 and body.startswith(to_bytes(schema)[HEADER.size :])
             view.check_number(len(self.schemas), "schemas")
         elif record.opcode == Opcode.CHANNEL and int.from_bytes(body[:2], "little") not in self.channels:
             channel_ = parse(mcap.Channel.read, view, RecordAt(record.opcode, offset, record.length), body)
             self.channels[channel_.id] = channel_
+            self.is_exact &= body.startswith(to_bytes(channel_)[HEADER.size :])
             view.check_number(len(self.channels), "channels")
 
 

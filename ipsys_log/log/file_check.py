@@ -8,13 +8,13 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, UnreadError
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import LogBytes, reason_of
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.record_search import PRIVATE
 from ipsys_log.log.records import DATA_END, ChunkRef, parse_exact, walk
 from ipsys_log.log.summary import Summary, load_contents, read_intact_summary, read_summary
-from ipsys_log.log.survey import Kind, Survey, Watch, reason_of
+from ipsys_log.log.survey import Kind, Survey, Watch
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,6 @@ compressed data.
 """
 
 import re
-import struct
-import zlib
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 
@@ -28,6 +26,7 @@ from ipsys_log.log.records import (
     MAGIC,
     MESSAGE,
     RecordAt,
+    attachment_crcs,
     parse_chunk_head,
     parse_exact,
     parse_message_index,
@@ -40,7 +39,6 @@ _PIECE = 256  # compressed bytes at a time: the output of the pieces before an e
 _LARGEST_FRAME = 256 << 20  # bytes of records
 _LARGEST_RATIO = 200  # no recorded data compress better
 _ANY_RATIO = 16 << 20  # bytes of records: the ratio counts only above this
-_LONGEST_ATTACHMENT_HEAD = 1 << 16  # bytes
 _DAY_NS = 86_400 * 1_000_000_000
 _SEARCH_BYTES = 64 << 20  # limit of the search without result in a small log
 _STEP_BYTES = 256  # the cost of the check of a small record, as bytes of that limit
@@ -55,6 +53,7 @@ _CANDIDATE = re.compile(
     re.DOTALL,
 )
 _SECTOR_BYTES = 512
+_NEAR_BYTES = 4096  # after damage, where a stray copy of a sector may fit to the records by chance
 _OVERLAP = 64  # bytes: longer than each candidate
 _DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA))
 _IN_CHUNK = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE))
@@ -79,14 +78,15 @@ class RecordSearch:
     """A search in one log.
 
     `channels` are the known channel ids, `span_ns` is the time range of the known messages. `frame_at` is the
-    offset of the last compressed data that were found without the head of their chunk. `budget` limits the
-    bytes that are searched without result.
+    offset of the last compressed data that were found without the head of their chunk. `damage_end` is the
+    end of the last damage. `budget` limits the bytes that are searched without result.
     """
 
     view: LogBytes
     channels: Container[int]
     span_ns: tuple[int, int] | None = None
     frame_at: int = -1
+    damage_end: int | None = None
     budget: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -106,22 +106,29 @@ class RecordSearch:
                     return offset
         return None
 
-    def inner_record(self, record: RecordAt, is_near_damage: bool = False) -> int | None:
+    def inner_record(self, record: RecordAt) -> int | None:
         """Return the offset of the first of other records within this one, if its length is wrong.
 
-        The length is right if a plausible record follows; near damage, this may be chance. Records within
-        this one prove the contrary if they lead to its end, or further than a stray copy of a sector.
+        The length is right if a plausible record follows; soon after damage, this may be chance. Records
+        within this one prove the contrary if they lead to its end, or further than a stray copy of a sector.
+        If nothing follows, one message that fits to the log is proof enough.
         """
         stop = record.offset + record.length
-        head = MESSAGE if record.opcode == Opcode.MESSAGE else HEADER
-        is_right = self._follows(stop) and not is_near_damage
-        inner = None if is_right else self.find(record.offset + head.size, stop)
-        while inner is not None and inner != self.frame_at and not self._leads_to(inner, stop):
+        follows = self._follows(stop)
+        is_near = self.damage_end is not None and record.offset - self.damage_end < _NEAR_BYTES
+        is_doubtful = is_near or not follows
+        if is_doubtful and record.opcode == Opcode.ATTACHMENT:  # it may hold another log
+            stored, crc = attachment_crcs(self.view, record)
+            is_doubtful = stored != crc or stored == 0
+        inner = self.find(record.offset + HEADER.size, stop) if is_doubtful else None
+        while inner is not None and inner != self.frame_at and not self.leads_to(inner, stop):
+            if not follows and self._fits_at(inner):
+                break
             inner = self.find(inner + 1, stop)
         return inner
 
-    def _leads_to(self, start: int, stop: int) -> bool:
-        """Return whether records from `start` on lead to `stop`, or further than a sector."""
+    def leads_to(self, start: int, stop: int) -> bool:
+        """Return whether records from `start` on lead to `stop`, or further than a stray copy of a sector."""
         position = start
         while position < min(stop, start + _SECTOR_BYTES + 1):
             if not self._follows(position):
@@ -177,18 +184,27 @@ class RecordSearch:
             return True
         follows = self._follows(offset + record.length)
         if record.opcode == Opcode.MESSAGE and record.length >= MESSAGE.size:
-            _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(offset, MESSAGE.size))
-            return follows or self._fits(channel, time_ns)
+            return follows or self._fits_at(offset)
         if record.opcode == Opcode.ATTACHMENT:
             stored, crc = attachment_crcs(view, record)
             return stored == crc if stored else follows
         return follows and record.opcode == Opcode.MESSAGE_INDEX and bool(index_rows(view, record))
 
-    def _fits(self, channel: int, time_ns: int) -> bool:
-        """Return whether a message has a known channel, and about the time of the known messages."""
-        span = self.span_ns
-        is_near = span is not None and span[0] - _DAY_NS < time_ns < span[1] + _DAY_NS
-        return is_near and channel in self.channels
+    def _fits_at(self, offset: int) -> bool:
+        head = self.view.read(offset, min(MESSAGE.size, self.view.size - offset))
+        is_message = len(head) == MESSAGE.size and head[0] == Opcode.MESSAGE
+        return is_message and self._fits(*MESSAGE.unpack(head)[2:])
+
+    def _fits(self, channel: int, _: int, time_ns: int, published_ns: int) -> bool:
+        """Return whether a message has a known channel, and about the time of the known messages.
+
+        The channel may be unknown, or no message known, if log time and publish time are about the same.
+        """
+        is_consistent = published_ns > 0 and abs(time_ns - published_ns) < _DAY_NS
+        if self.span_ns is None:
+            return is_consistent
+        is_near = self.span_ns[0] - _DAY_NS < time_ns < self.span_ns[1] + _DAY_NS
+        return is_near and (is_consistent or channel in self.channels)
 
     def parse_definition(self, record: RecordAt) -> mcap.Schema | mcap.Channel | None:
         """Parse a Schema or Channel record; check a Metadata record, too.
@@ -228,6 +244,38 @@ class RecordSearch:
         except LogError:
             pass
         return None
+
+    def read_indexes(
+        self, entries: Mapping[int, list[tuple[int, int]]], start: int
+    ) -> tuple[int, dict[int, int], bool]:
+        """Read the message indexes of a chunk with these entries, from `start` on.
+
+        Returns
+        -------
+        Their end, the offset of each by channel id, and whether they have all entries of the chunk.
+        """
+        offsets: dict[int, int] = {}
+        seen: set[int] = set()
+        end, is_right = start, True
+        try:
+            for record in walk(self.view, start, self.view.size):
+                if record.opcode != Opcode.MESSAGE_INDEX:
+                    break
+                channel, rows = index_rows(self.view, record)
+                expected = entries.get(channel, [])
+                is_mine = channel not in seen and (rows == expected or sorted(rows) == sorted(expected))
+                is_right &= is_mine
+                if not is_mine and self.inner_record(record) is not None:
+                    break
+                seen.add(channel)
+                if rows:
+                    offsets[channel] = record.offset
+                end = record.offset + record.length
+        except (BoundError, UnreadError):
+            raise
+        except LogError:
+            pass  # the next record is damaged
+        return end, offsets, is_right and seen >= entries.keys()
 
     def read_frame(self, offset: int) -> tuple[bytes, int, bool]:
         """Return the plausible records in compressed data, the end of the data, and whether these are all."""
@@ -281,10 +329,9 @@ class RecordSearch:
         for match in _MESSAGE_HEAD.finditer(data, start):
             position = match.start()
             if position + MESSAGE.size <= len(data):
-                _, length, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
-                if MESSAGE.size <= HEADER.size + length <= len(data) - position and self._fits(
-                    channel, time_ns
-                ):
+                _, length, *fields = MESSAGE.unpack_from(data, position)
+                is_inside = MESSAGE.size <= HEADER.size + length <= len(data) - position
+                if is_inside and self._fits(*fields):
                     return position
         return len(data)
 
@@ -294,26 +341,28 @@ def _decompress(view: LogBytes, offset: int, stop: int, most: int) -> tuple[byte
 
     Returns
     -------
-    The bytes, the offset of the end of the compressed data, and whether all was decompressed.
+    The bytes, the offset of the end of their compressed data, and whether all was decompressed.
     """
     is_zstd = view.read(offset, len(_ZSTD)) == _ZSTD
     decoder = zstandard.ZstdDecompressor().decompressobj() if is_zstd else lz4.frame.LZ4FrameDecompressor()
-    data, position = bytearray(), offset
+    data, position, end = bytearray(), offset, offset
     try:
         while position < stop:
             block = view.read(position, min(_BLOCK, stop - position))
             for start in range(0, len(block), _PIECE):
                 piece = block[start : start + _PIECE]
                 position += len(piece)
-                data += decoder.decompress(piece)
+                unpacked = decoder.decompress(piece)
+                data += unpacked
+                end = position if unpacked else end  # a block with a wrong length may lead further
                 limit = min(_LARGEST_FRAME, most, max(_ANY_RATIO, _LARGEST_RATIO * (position - offset)))
                 if len(data) > limit:
-                    return data, position, False
+                    return data, end, False
                 if decoder.eof:
                     return data, position - len(decoder.unused_data or b""), True
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
         pass
-    return data, position, False
+    return data, end, False
 
 
 def index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, int]]]:
@@ -325,61 +374,3 @@ def index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, i
             rows = parse_message_index(view, body, 0, channel, record.offset)
             return channel, list(ENTRY.iter_unpack(rows))
     raise view.fault(record.offset, "a MessageIndex record has another length than its entries")
-
-
-def read_indexes(
-    view: LogBytes, entries: Mapping[int, list[tuple[int, int]]], start: int
-) -> tuple[int, dict[int, int], bool]:
-    """Read the message indexes of a chunk with these entries, from `start` on.
-
-    Returns
-    -------
-    Their end, the offset of each by channel id, and whether they have all entries of the chunk.
-    """
-    offsets: dict[int, int] = {}
-    seen: set[int] = set()
-    end, is_right = start, True
-    try:
-        for record in walk(view, start, view.size):
-            if record.opcode != Opcode.MESSAGE_INDEX:
-                break
-            channel, rows = index_rows(view, record)
-            expected = entries.get(channel, [])
-            is_right &= channel not in seen and (rows == expected or sorted(rows) == sorted(expected))
-            seen.add(channel)
-            if rows:
-                offsets[channel] = record.offset
-            end = record.offset + record.length
-    except (BoundError, UnreadError):
-        raise
-    except LogError:
-        pass  # the next record is damaged
-    return end, offsets, is_right and seen >= entries.keys()
-
-
-def attachment_crcs(view: LogBytes, record: RecordAt) -> tuple[int, int]:
-    """Return the stated CRC of an attachment (0: none), and its computed CRC.
-
-    Raises
-    ------
-    LogError
-        The record has wrong lengths.
-    """
-    head = view.read(record.offset, min(record.length, _LONGEST_ATTACHMENT_HEAD))
-    try:
-        (name,) = struct.unpack_from("<I", head, HEADER.size + 16)
-        (media_type,) = struct.unpack_from("<I", head, HEADER.size + 20 + name)
-        (size,) = struct.unpack_from("<Q", head, HEADER.size + 24 + name + media_type)
-    except struct.error:
-        raise view.fault(record.offset, "the Attachment record is not valid") from None
-    if record.length < HEADER.size + 36 + name + media_type + size:
-        raise view.fault(record.offset, "the Attachment record claims lengths that it does not have")
-    stored = int.from_bytes(view.read(record.offset + record.length - 4, 4), "little")
-    return stored, crc_of(view, record.length - HEADER.size - 4, record.offset + HEADER.size) if stored else 0
-
-
-def crc_of(view: LogBytes, length: int, start: int = 0, crc: int = 0) -> int:
-    """Return the CRC-32 of a byte range of the file, continued from `crc`."""
-    for offset in range(start, start + length, _BLOCK):
-        crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)
-    return crc

@@ -4,6 +4,7 @@ The layouts follow the MCAP specification, https://mcap.dev/spec. The record cla
 """
 
 import struct
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
 from typing import NamedTuple, Self, TypeVar
@@ -31,6 +32,8 @@ _PACKED = struct.Struct("<QQQQQQQI")  # the numbers of a ChunkRef, bytes of the 
 _CHANNEL_OFFSET = struct.Struct("<HQ")
 _WALK_BLOCK = 4096
 _LONGEST_NAME = 64
+_LONGEST_ATTACHMENT_HEAD = 1 << 16  # bytes
+_CRC_BLOCK = 1 << 20  # bytes
 
 R = TypeVar("R")
 
@@ -212,6 +215,34 @@ def parse_message_index(view: LogBytes, data: bytes, position: int, channel_id: 
         if fits and opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
             return data[end - size : end]
     raise view.fault(offset, f"a MessageIndex record of channel {channel_id} is missing")
+
+
+def attachment_crcs(view: LogBytes, record: RecordAt) -> tuple[int, int]:
+    """Return the stated CRC of an attachment (0: none), and its computed CRC.
+
+    Raises
+    ------
+    LogError
+        The record has wrong lengths.
+    """
+    head = view.read(record.offset, min(record.length, _LONGEST_ATTACHMENT_HEAD))
+    try:
+        (name,) = struct.unpack_from("<I", head, HEADER.size + 16)
+        (media_type,) = struct.unpack_from("<I", head, HEADER.size + 20 + name)
+        (size,) = struct.unpack_from("<Q", head, HEADER.size + 24 + name + media_type)
+    except struct.error:
+        raise view.fault(record.offset, "the Attachment record is not valid") from None
+    if record.length < HEADER.size + 36 + name + media_type + size:
+        raise view.fault(record.offset, "the Attachment record claims lengths that it does not have")
+    stored = int.from_bytes(view.read(record.offset + record.length - 4, 4), "little")
+    return stored, crc_of(view, record.length - HEADER.size - 4, record.offset + HEADER.size) if stored else 0
+
+
+def crc_of(view: LogBytes, length: int, start: int = 0, crc: int = 0) -> int:
+    """Return the CRC-32 of a byte range of the file, continued from `crc`."""
+    for offset in range(start, start + length, _CRC_BLOCK):
+        crc = zlib.crc32(view.read(offset, min(_CRC_BLOCK, start + length - offset)), crc)
+    return crc
 
 
 def walk(view: LogBytes, start: int, end: int) -> Iterator[RecordAt]:

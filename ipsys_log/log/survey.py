@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.bounds import BoundError
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import LogBytes, reason_of
 from ipsys_log.log.chunks import ChunkContents, parse_chunk_contents, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import ChannelHash
@@ -19,10 +19,7 @@ from ipsys_log.log.record_search import (
     IN_DATA,
     PRIVATE,
     RecordSearch,
-    attachment_crcs,
-    crc_of,
     index_rows,
-    read_indexes,
 )
 from ipsys_log.log.records import (
     DATA_END,
@@ -30,6 +27,8 @@ from ipsys_log.log.records import (
     MAGIC,
     MESSAGE,
     RecordAt,
+    attachment_crcs,
+    crc_of,
     parse_chunk_head,
     parse_exact,
     walk,
@@ -39,7 +38,6 @@ from ipsys_log.log.summary import Summary
 
 _LAG = 1 << 20  # bytes: the CRC of the data section is computed in pieces of this size
 _LONGEST_HEADER = 1 << 20  # bytes
-_NEAR_BYTES = 4096  # after damage, where a stray copy of a sector may fit to the records by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +79,7 @@ class Part:
 
 
 # The trust in a definition: in a summary without CRC, in records without CRC, in a summary with a right CRC,
-# and in a chunk with a right CRC.
+# and in a chunk with a right CRC, unless it may be a stray copy of a sector of another log.
 _UNCHECKED_SUMMARY, _UNCHECKED, _SUMMARY, _CHUNK = range(4)
 
 
@@ -116,7 +114,6 @@ class Survey:
     finished: bool = False
     data_end: int = 0
     log_end: int = 0
-    has_crc: bool = False
     crc: int = 0
     search: RecordSearch = field(init=False)
     _trust: dict[tuple[bool, int], int] = field(default_factory=dict)  # by kind (a schema?) and id
@@ -125,7 +122,6 @@ class Survey:
     _unchunked: ChunkContents = field(default_factory=ChunkContents)
     _counts: dict[int, dict[int, int]] = field(default_factory=dict)
     _crc_end: int = 0
-    _resync_at: int = -1
     _in_damage: bool = False  # damage is before the next record, and no whole chunk is between them
     _has_chunks: bool = False
 
@@ -221,7 +217,6 @@ class Survey:
             raise self.view.fault(position, "records follow after a DataEnd record")
         self.finished, self.data_end, self.unindexed = True, position, None
         self.log_end = self.log_end if log_end is None else log_end
-        self.has_crc = stored != 0
         if stored and not is_right and not self.faults:
             text = "the CRC of the data section is wrong; the position of the damage is unknown"
             self.faults.append((position, text))
@@ -233,11 +228,11 @@ class Survey:
         if record.opcode == Opcode.MESSAGE and record.length < MESSAGE.size:
             raise view.fault(record.offset, "a Message record is too short")
         definition = self.search.parse_definition(record)
-        is_near_damage = record.offset - self._resync_at < _NEAR_BYTES and self._resync_at >= 0
-        inner = self.search.inner_record(record, is_near_damage)
+        inner = self.search.inner_record(record)
         if inner is not None:
             text = f"a record claims {record.length} bytes, which hold other records"
-            if record.opcode != Opcode.MESSAGE or record.offset == self._resync_at:
+            is_message = record.opcode == Opcode.MESSAGE and inner - record.offset >= MESSAGE.size
+            if not is_message or record.offset == self.search.damage_end:
                 raise view.fault(record.offset, text)
             self.faults.append((record.offset, text))
             self.parts.append(Part(Kind.MESSAGE, record.offset, inner))
@@ -278,18 +273,24 @@ class Survey:
         head = parse_chunk_head(view, record.offset)[1]
         data = unpack(view, record.offset, head, is_crc_checked=False)
         inside = parse_chunk_contents(view, record.offset, data)
-        is_right = head.crc in (0, zlib.crc32(data))
+        is_right = inside.is_exact and head.crc in (0, zlib.crc32(data))
+        if not (head.compression or (head.crc and is_right)) and inside.entries:
+            offset = inside.in_order()[-1][0]
+            length = HEADER.size + HEADER.unpack_from(data, offset)[1]
+            last = RecordAt(Opcode.MESSAGE, head.data_offset + offset, length)
+            if self.search.inner_record(last) is not None:
+                raise view.fault(record.offset, "the last message in a chunk holds other records")
         if not is_right:
-            self.faults.append((record.offset, "the CRC of the chunk is wrong"))
-        self._add_inside(record.offset, inside, _CHUNK if head.crc and is_right else _UNCHECKED)
+            text = "the CRC of the chunk is wrong" if inside.is_exact else "the chunk has a wrong definition"
+            self.faults.append((record.offset, text))
+        is_mine = not self._in_damage or self.search.leads_to(record.offset, view.size)
+        trust = _UNCHECKED if inside.is_exact else _UNCHECKED_SUMMARY
+        self._add_inside(record.offset, inside, _CHUNK if head.crc and is_right and is_mine else trust)
         self.parts.append(Part(Kind.CHUNK, record.offset, stop, is_right))
         self._has_chunks, self._in_damage = True, self._in_damage and not is_right
-        was_sound = not self.faults
-        end, offsets, is_complete = read_indexes(view, inside.entries, stop)
+        end, offsets, is_complete = self.search.read_indexes(inside.entries, stop)
         self.unindexed = None if is_complete or not is_right else inside
-        if not is_complete and end > stop:
-            self.faults.append((stop, "the message indexes of a chunk are not complete"))
-        if was_sound:
+        if not self.faults:
             add_record(view, self.contents, self._unchunked, self._counts, record)
             self._counts[record.offset] = {key: len(rows) for key, rows in inside.entries.items()}
             start_ns, end_ns = inside.span_ns or (head.start_ns, head.end_ns)
@@ -298,6 +299,9 @@ class Survey:
                 index_length=end - stop if is_complete else 0, index_offsets=offsets if is_complete else {},
             )  # fmt: skip
             self._continue_hashes(inside, data)
+        if not is_complete and end > stop:
+            self.faults.append((stop, "the message indexes of a chunk are not complete"))
+            self._in_damage = True
         self._advance_crc(stop if self.unindexed else end, _LAG)
         return end
 
@@ -322,10 +326,9 @@ class Survey:
 
     def _add_inside(self, offset: int, inside: ChunkContents, trust: int) -> None:
         """Add the definitions of a chunk, and check that its messages have channels."""
-        for schema in inside.schemas.values():
-            self._define(offset, schema, trust)
-        for channel in inside.channels.values():
-            self._define(offset, channel, trust)
+        definitions: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
+        for definition in definitions:
+            self._define(offset, definition, trust)
         self._check_channels(offset, inside.entries.keys())
         if inside.span_ns is not None:
             self._cover(*inside.span_ns)
@@ -335,8 +338,8 @@ class Survey:
         is_schema = isinstance(record, mcap.Schema)
         known: dict[int, Any] = self.schemas if is_schema else self.channels
         if known.get(record.id, record) != record:
-            name = type(record).__name__.lower()
-            self.faults.append((offset, f"{name} {record.id} is defined in two ways"))
+            text = f"{'schema' if is_schema else 'channel'} {record.id} is defined in two ways"
+            self.faults.append((offset, text))
         elif isinstance(record, mcap.Channel) and record.schema_id not in self._declared[0]:
             self.faults.append((offset, f"channel {record.id} has a schema that is not in the log"))
         else:
@@ -359,6 +362,7 @@ class Survey:
         for channel in set(channels) - self._declared[1]:
             self.faults.append((offset, f"a message is of channel {channel}, whose definition is lost"))
             self._declared[1].add(channel)
+        self.view.check_number(len(self._declared[1]), "channels")
 
     def _cover(self, start_ns: int, end_ns: int) -> None:
         first, last = self.search.span_ns or (start_ns, end_ns)
@@ -391,10 +395,5 @@ class Survey:
         end = self.view.size if follower is None else follower
         if end > start:
             self.parts.append(Part(Kind.DAMAGE, start, end))
-        self._resync_at, self._in_damage = end, True
+        self.search.damage_end, self._in_damage = end, True
         return end
-
-
-def reason_of(error: LogError) -> str:
-    """Return the text of a fault without the path and the advice."""
-    return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]

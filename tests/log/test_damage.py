@@ -9,7 +9,11 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
+from ipsys_log.log.recovery import repair
+from tests.log.conftest import Row, stock_rows
 from tests.log.damage import cases, check, run
 
 # Cases that longer runs found: seed, number of the case, log and damage.
@@ -35,6 +39,15 @@ HARD = [
     (103, 9171, "unchunked, data CRC: duplicated 20480 at 1536, zeroed at 512"),
     (202, 9307, "no statistics: flipped at 1715, swapped in at 1024"),  # a message of a log without chunks
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
+    (8, 1719, "unchunked: swapped in at 2048, duplicated 8192 at 9728"),  # a head that ends in a true message
+    (7, 1361, "lz4: swapped in at 21504"),  # compressed data with a wrong length lead over whole chunks
+    (401, 879, "no index: swapped in at 0, cut at 12210"),  # the definitions of another log
+    (401, 2005, "repeated definitions: swapped in at 1024"),  # messages of another log after a half index
+    (501, 4772, "unchunked, data CRC: duplicated 0 at 1536, flipped at 914"),  # three messages between both
+    (502, 4889, "no CRC: flipped at 4194, flipped at 375"),  # a definition with wrong lengths in a chunk
+    (702, 501, "unchunked, data CRC: cut at 2726, zeroed at 512"),  # one message of a lost channel
+    (703, 550, "unchunked: swapped in at 7168"),  # half an index of another log
+    (803, 541, "repeated definitions: flipped at 98, flipped at 9234"),  # a schema with the id 0
 ]
 
 
@@ -43,6 +56,30 @@ def test_repair_after_natural_damage_converges() -> None:
     totals = run(11, 120, complaints.append)
     assert complaints == []
     assert totals["changed"] > 100
+
+
+def test_repair_keeps_an_attachment_that_holds_a_log(tmp_path: Path) -> None:
+    path, attached = tmp_path / "a.mcap", tmp_path / "attached.mcap"
+    rows: list[Row] = [("/a", 10**18 + k, 10**18, b"data %d" % k) for k in range(20)]
+    for file, attachment in ((attached, b""), (path, b"attached")):
+        with file.open("wb") as out:
+            writer = Writer(out, use_chunking=False)
+            writer.start()
+            channel = writer.register_channel("/a", "json", 0)
+            if attachment:
+                writer.add_attachment(1, 2, "log", "application/mcap", attached.read_bytes())
+                after = out.tell()
+            for _, time_ns, published_ns, data in rows:
+                writer.add_message(channel, time_ns, data, published_ns)
+            writer.finish()  # type: ignore[no-untyped-call]
+    damaged = bytearray(path.read_bytes())
+    damaged[after : after + 9] = bytes(9)  # the head of the record after the attachment
+    path.write_bytes(damaged)
+    assert repair(path).changed
+    assert stock_rows(path) == rows[1:]
+    with path.open("rb") as file_:
+        [kept] = make_reader(file_).iter_attachments()
+    assert kept.data == attached.read_bytes()
 
 
 @pytest.mark.slow

@@ -190,7 +190,7 @@ def test_catalogue_of_a_bucket_reads_only_changed_objects(bucket: Any, tmp_path:
         answer: dict[str, Any] = json.loads(done.out)
         return answer
 
-    assert update("s3://logs/2026") == {"logs": 3, "read": 3, "removed": 0, "errors": {}}
+    assert update("s3://logs/2026") == {"format": 2, "logs": 3, "read": 3, "removed": 0, "errors": {}}
     (row, *_) = read_rows(target)[1]
     assert (row["log"], row["bytes"], row["measurements"]) == ("a.mcap", PAPER_LAB.stat().st_size, 114)
     assert update("s3://logs/2026")["read"] == 0

@@ -123,7 +123,7 @@ def test_report_draws_the_drive(faulty_log: Path, ipsys: Ipsys, tmp_path: Path) 
     assert (done.code, done.err) == (0, "")
     page = (tmp_path / "run.html").read_text(encoding="utf-8")
     assert "robot_0: 4 of 4 waypoints" in page
-    assert "P4 (4.5, 4.5)" in page
+    assert 'P4 <span class="soft">(4.5, 4.5)<' in page
     assert page.count("data:image/") == 2
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 

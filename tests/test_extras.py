@@ -147,10 +147,8 @@ REFUSED = {
     "score https://example.org/x.zip": "the address of a dataset needs fsspec: pip install "
     "'ipsys_log[remote]'",
     "record --measure -o x.mcap": "--measure needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
-    **{
-        f"measure {more}": "the measuring page needs Starlette and Uvicorn: pip install 'ipsys_log[web]'"
-        for more in ("lab.mcap", "--rig lab.toml -o x.mcap")
-    },
+    "measure lab.mcap": "the measuring page needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
+    "measure --rig lab.toml -o x.mcap": "--measure needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
 }
 
 

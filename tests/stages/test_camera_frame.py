@@ -251,7 +251,7 @@ def test_invalid_corner_covariance_is_reported(method: str) -> None:
 
 def test_an_unknown_method_is_refused_before_anything_is_made(ipsys: Ipsys, tmp_path: Path) -> None:
     for make in (CameraFrame, lambda method: Request(method=method)):
-        with pytest.raises(IpsysError, match="ippe.{1,2}is not known; use one of perimeter, pose"):
+        with pytest.raises(IpsysError, match=r"ippe.{1,2}is not known; use one of perimeter, pose"):
             make("ippe")
     log = shutil.copy(ROOT / "sample_logs" / "paper_lab.mcap", tmp_path)
     done = ipsys("replay", log, "--method", "ippe")

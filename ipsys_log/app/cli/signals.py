@@ -145,7 +145,10 @@ def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
         try:
             if not hasattr(command, "runs_until_stopped"):
                 allow_interrupt()
-            return command(*arguments, **options)
+            result = command(*arguments, **options)
+            if _state.noted is not None and not hasattr(command, "runs_until_stopped"):
+                _interrupt(_state.noted)  # it waited for an import, or a library suppressed it
+            return result
         except Interrupted as interrupt:
             raise InterruptError(interrupt.exit_code, interrupt.text) from None
         finally:

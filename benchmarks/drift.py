@@ -28,7 +28,7 @@ from ipsys_log.statistics.drift import MeanCorners
 from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.statistics.reference_markers import Window
 from ipsys_log.units import MM_PER_M, NS_PER_S
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.weeks import FIRST_REFERENCE, Knock, WeekSettings, simulate_week
 

@@ -25,7 +25,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Markers, Message, Rig
 from ipsys_log.stages.detect import STAGE, FrameDetector
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker
+from ipsys_log.vision.markers import MovingMarker, PlacedMarker
 from tests.geometric.lab import GeometricLab
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns, still_times_ns

@@ -23,7 +23,7 @@ from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message
 from ipsys_log.messages.channels import TRUTH
-from ipsys_log.vision.marker_cells import project_corners
+from ipsys_log.vision.markers import project_corners
 
 __all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "simulator_key", "truth", "with_restarts"]
 

@@ -13,7 +13,7 @@ from ipsys_log.exchange.truth_fit import ALIGNMENTS, LEAST_INSTANTS, Fit, RigidM
 from ipsys_log.messages.arrays import Array
 from ipsys_log.statistics.path_pairs import CommonInstants, PathPair, common_instants, without_jumps
 from ipsys_log.statistics.time_offset_search import search_offsets_s
-from ipsys_log.vision.rotations import cross
+from ipsys_log.vision.poses import cross
 
 _LEAST_SPREAD_M = 0.1
 _SINGULAR = 1e-9

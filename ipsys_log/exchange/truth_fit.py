@@ -10,7 +10,7 @@ import numpy as np
 
 from ipsys_log.messages.arrays import Array, Mask
 from ipsys_log.statistics.path_pairs import CommonInstants, PathPair, common_instants
-from ipsys_log.vision.rotations import cross, rotate
+from ipsys_log.vision.poses import cross, rotate
 
 
 class Freedom(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 from ipsys_log.errors import FitError
 from ipsys_log.messages.arrays import Array
 from ipsys_log.vision.lenses import intersect_height
-from ipsys_log.vision.rotations import skew_matrices
+from ipsys_log.vision.poses import skew_matrices
 
 # Errors on the floor above this get less weight: the usual error of a tape.
 _USUAL_M = 0.005

@@ -31,7 +31,7 @@ from ipsys_log.sinks.streams.ros2_messages import (
     type_hash,
 )
 from ipsys_log.statistics.floor_cameras import read_floor_cameras
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 _STEP = "bag"
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.messages.arrays import Array, Mask
 from ipsys_log.statistics.stationary import StationaryMarker
-from ipsys_log.vision.posed_camera import PosedCamera
-from ipsys_log.vision.poses import invert_pose, make_pose, transform
+from ipsys_log.vision.poses import PosedCamera, invert_pose, make_pose, transform
 
 # In the paper, a camera is parallel to the floor if the spread of Zc is below this value.
 LEVEL_M = 0.05

@@ -13,7 +13,7 @@ from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.messages import Model
 from ipsys_log.messages.arrays import Array
 from ipsys_log.statistics.floor_cameras import outline_view
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 Size = tuple[int, int]
 

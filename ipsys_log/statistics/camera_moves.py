@@ -13,7 +13,7 @@ from ipsys_log.statistics.drift import LEAST_SHIFT_M, DriftBaseline, Motion, bui
 from ipsys_log.statistics.floor_cameras import floor_grid
 from ipsys_log.statistics.reference_markers import Window, average_windows
 from ipsys_log.vision.lenses import undistort
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 # Windows whose mean is a baseline, or the state after a move.
 _AVERAGED = 5

@@ -15,7 +15,7 @@ from ipsys_log.messages import Floor
 from ipsys_log.messages.arrays import Array, Mask
 from ipsys_log.statistics.floor_grid import FloorGrid
 from ipsys_log.vision.lenses import in_image
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 # Distance between tested points of the floor; larger on a large floor,
 _STEP_M = 0.01

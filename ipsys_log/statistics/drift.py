@@ -24,8 +24,7 @@ from ipsys_log.messages.arrays import Array
 from ipsys_log.statistics.floor_cameras import shift_floor_map
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import marker_corners, pixel_slopes
-from ipsys_log.vision.posed_camera import PosedCamera
-from ipsys_log.vision.poses import rotation
+from ipsys_log.vision.poses import PosedCamera, rotation
 from ipsys_log.vision.square_pose import fit_squares, is_convex
 
 # A shift of the floor map below this mean is not reported: slow changes of light and temperature reach half

@@ -19,7 +19,7 @@ from ipsys_log.statistics.floor_grid import FloorGrid
 from ipsys_log.statistics.plan import mean_length
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.rotations import level_turns
+from ipsys_log.vision.poses import level_turns
 
 # A marker counts as visible if a square of this multiple of its side is wholly in the image.
 WHOLE_PRINT = 1.4

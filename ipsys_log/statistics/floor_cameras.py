@@ -15,7 +15,7 @@ from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.statistics.floor_grid import FloorGrid
 from ipsys_log.statistics.model_kinds import joint_models
 from ipsys_log.vision.lenses import check_calibration, in_image, undistort
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.joint.model import JointModel

@@ -18,8 +18,7 @@ from ipsys_log.statistics.reference_markers import Window
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.posed_camera import PosedCamera
-from ipsys_log.vision.poses import pose_facing_up, transform
+from ipsys_log.vision.poses import PosedCamera, pose_facing_up, transform
 
 Array = NDArray[np.float64]
 

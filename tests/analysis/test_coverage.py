@@ -11,8 +11,7 @@ from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, Floor
 from ipsys_log.statistics.coverage import cover_floor
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.posed_camera import PosedCamera
-from ipsys_log.vision.poses import look_down, pose_facing_up, transform
+from ipsys_log.vision.poses import PosedCamera, look_down, pose_facing_up, transform
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,7 @@ from ipsys_log.statistics.drift import DriftBaseline, MeanCorners, Motion, build
 from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.vision.lenses import intersect_height, project, undistort
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.posed_camera import PosedCamera
-from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation, transform
+from ipsys_log.vision.poses import PosedCamera, make_pose, pose_facing_up, rotation, transform
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.statistics.alignment import align_camera, join_cameras
 from ipsys_log.statistics.stationary import StationaryMarker
-from ipsys_log.vision.posed_camera import PosedCamera
-from ipsys_log.vision.poses import invert_pose, look_down, make_pose, rotation, transform
+from ipsys_log.vision.poses import PosedCamera, invert_pose, look_down, make_pose, rotation, transform
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from ipsys_log.messages import CompressedImage, RigCamera
 from ipsys_log.stages.detect.stock import detect_markers
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
-from ipsys_log.vision.marker_cells import project_corners
+from ipsys_log.vision.markers import project_corners
 from tests.playing import WAIT_LIMIT_S
 
 SMALL = {"width": 960, "height": 540, "rate_hz": 20.0}

@@ -31,7 +31,7 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.vision.marker_cells import PlacedMarker
+from ipsys_log.vision.markers import PlacedMarker
 from ipsys_log.vision.poses import look_down, pose_facing_up
 from tests.changed_logs import rewrite
 from tests.conftest import Ipsys, data_section

@@ -20,7 +20,7 @@ from ipsys_log.messages import Floor, Model
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.messages.rig_file import rig_toml
 from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 from tests.conftest import Ipsys
 from tests.geometric.floor_error import compute_errors, grid_nodes
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import parse_board
 from ipsys_log.calibration.board_detection import find_board
-from ipsys_log.vision.marker_cells import cell_outlines
-from ipsys_log.vision.markers import white_cells
+from ipsys_log.vision.markers import cell_outlines, white_cells
 from tests.conftest import Ipsys
 
 DPI = 300

@@ -23,7 +23,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, Message, Rig, Tracks
 from ipsys_log.messages.rig_file import check_rig
-from ipsys_log.vision.marker_cells import PlacedMarker, project_corners
+from ipsys_log.vision.markers import PlacedMarker, project_corners
 from ipsys_log.vision.trilateration import trilaterate
 
 SMALL = LabSettings(width=640, height=360, stations=4, frames_per_station=2, drive_s=0.5, rate_hz=10.0)

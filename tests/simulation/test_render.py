@@ -12,7 +12,7 @@ from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
 from ipsys_log.capture.simulation.floor import FloorView, prepare_view
 from ipsys_log.capture.simulation.render import encode_jpeg, expose, render
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.vision.marker_cells import PlacedMarker, project_corners
+from ipsys_log.vision.markers import PlacedMarker, project_corners
 from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.capture.simulation.render import expose
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CompressedImage, Message, Rig, Tracks
-from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker, project_corners
+from ipsys_log.vision.markers import MovingMarker, PlacedMarker, project_corners
 from ipsys_log.vision.poses import look_down, pose_facing_up
 from tests.tiers import first_fast
 

@@ -23,7 +23,7 @@ from ipsys_log.stages.detect.adjustment import Guess
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.marker_cells import project_corners
+from ipsys_log.vision.markers import project_corners
 from tests.stages.drawing import (
     FISHEYE,
     PLUMB_BOB,

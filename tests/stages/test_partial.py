@@ -22,7 +22,7 @@ from ipsys_log.stages.detect.partial import fit_visible_edges
 from ipsys_log.stages.detect.stock import detect_markers
 from ipsys_log.stages.detect.uneven_light import compare_pattern
 from ipsys_log.vision.decode import decode_grey
-from ipsys_log.vision.marker_cells import project_corners
+from ipsys_log.vision.markers import project_corners
 from tests.stages.drawing import (
     FISHEYE,
     VGA,

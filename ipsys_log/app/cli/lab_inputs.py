@@ -102,7 +102,7 @@ def say_remark(camera: str, text: str) -> None:
 
 def say_unusual(lenses: Mapping[str, CameraCalibration]) -> None:
     """Print remarks on unusual values of calibrations."""
-    from ipsys_log.vision.plausible_lenses import calibration_remarks
+    from ipsys_log.vision.lenses import calibration_remarks
 
     for camera, lens in sorted(lenses.items()):
         for text in calibration_remarks(lens):

@@ -16,7 +16,7 @@ from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.models.table import min_pairs
 from ipsys_log.plain_text import join_names, shell_words
-from ipsys_log.vision.plausible_lenses import calibration_remarks
+from ipsys_log.vision.lenses import calibration_remarks
 
 # The model that a replay fits, and the number of calibration points that gives good results.
 _MODEL, _GOOD = "poly", 40

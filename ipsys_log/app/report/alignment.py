@@ -22,7 +22,7 @@ from ipsys_log.statistics.stationary import find_stationary
 from ipsys_log.statistics.tape import RiggedMeasurement
 from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.lenses import undistort
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 Lenses = Mapping[str, CameraCalibration]
 

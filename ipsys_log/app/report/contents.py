@@ -26,8 +26,7 @@ from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
 from ipsys_log.statistics.pairs import active_measurements
 from ipsys_log.tools.recording import FrameGaps, find_gaps
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
-from ipsys_log.vision.lenses import check_calibration
-from ipsys_log.vision.plausible_lenses import calibration_remarks
+from ipsys_log.vision.lenses import calibration_remarks, check_calibration
 
 
 def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:

@@ -12,8 +12,7 @@ from ipsys_log.calibration.board import Board, black_squares, board_markers
 from ipsys_log.messages import Rig
 from ipsys_log.messages.arrays import Array
 from ipsys_log.units import MM_PER_M
-from ipsys_log.vision.marker_cells import cell_outlines
-from ipsys_log.vision.markers import white_cells
+from ipsys_log.vision.markers import cell_outlines, white_cells
 
 # White margin around a chessboard or a ChArUco board, in squares; white margin around a marker, in cells.
 _BOARD_MARGIN, _MARKER_MARGIN = 0.5, 1.0

@@ -17,7 +17,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Track
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS
-from ipsys_log.vision.ellipses import covariance_ellipse, enlargement
+from ipsys_log.sinks.video.floor_map import covariance_ellipse, enlargement
 
 # Breaks of a line: a longer step or gap than this.
 _STEP_M, _GAP_NS = 0.5, 200_000_000

@@ -15,7 +15,7 @@ from ipsys_log.calibration.lens_models import project_with_slopes
 from ipsys_log.messages.arrays import Array
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.rotations import cross, level_turns
+from ipsys_log.vision.poses import cross, level_turns
 
 _FLAT = np.array([0, 1, 5])
 _CORNERS = marker_corners(1.0)

@@ -11,7 +11,7 @@ from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.messages.arrays import Array
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import pixel_slopes
-from ipsys_log.vision.rotations import rotate
+from ipsys_log.vision.poses import rotate
 from ipsys_log.vision.square_pose import fit_squares, tilt_cost
 
 _STEPS = 2

@@ -12,7 +12,7 @@ from ipsys_log.calibration.joint.observations import CameraPrior, Observations, 
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.messages.arrays import Array
-from ipsys_log.vision.rotations import rotate
+from ipsys_log.vision.poses import rotate
 
 _FIXED = 0.0
 

@@ -11,7 +11,7 @@ from ipsys_log.calibration.joint.floor_field import spline_weights
 from ipsys_log.calibration.joint.normal import NormalEquations
 from ipsys_log.calibration.joint.parameters import Layout, State
 from ipsys_log.messages.arrays import Array, Indices
-from ipsys_log.vision.rotations import left_jacobians, level_turns, rotate
+from ipsys_log.vision.poses import left_jacobians, level_turns, rotate
 
 _POSE = 6
 _KNOT = 3

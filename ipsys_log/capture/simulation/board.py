@@ -11,8 +11,7 @@ from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_s
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages.arrays import Array
 from ipsys_log.vision.lenses import undistort
-from ipsys_log.vision.marker_cells import PlacedBoard, print_outline
-from ipsys_log.vision.markers import white_cells
+from ipsys_log.vision.markers import PlacedBoard, print_outline, white_cells
 from ipsys_log.vision.poses import invert_pose, make_pose, rotation
 
 # Positions in the image, as shares of it, from left to right and from top to bottom; each twice.

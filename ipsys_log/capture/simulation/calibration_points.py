@@ -13,7 +13,7 @@ from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_s
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
 from ipsys_log.messages.arrays import Array
-from ipsys_log.vision.marker_cells import PlacedMarker, black_cells, print_outline
+from ipsys_log.vision.markers import PlacedMarker, black_cells, print_outline
 from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation
 
 REFERENCES = (ReferencePoint("A", 1.2192, 2.4384), ReferencePoint("B", 3.6576, 2.4384))

@@ -39,7 +39,7 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.marker_cells import MovingMarker, PlacedMarker
+from ipsys_log.vision.markers import MovingMarker, PlacedMarker
 
 # Start of the simulated clock: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S

@@ -33,7 +33,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig, RigCamera, RigMarker
 from ipsys_log.messages.rig_checks import dictionary_size
 from ipsys_log.units import CM_PER_M
-from ipsys_log.vision.marker_cells import project_corners
+from ipsys_log.vision.markers import project_corners
 
 # A laptop with two cores can draw this lab and track in it. Three cameras send 2.5 MB per second.
 LIVE_SETTINGS = LabSettings(

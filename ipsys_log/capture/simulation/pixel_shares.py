@@ -26,7 +26,7 @@ from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages.arrays import Array
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project
-from ipsys_log.vision.marker_cells import (
+from ipsys_log.vision.markers import (
     MovingMarker,
     PlacedBoard,
     PlacedMarker,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ipsys_log.capture.simulation.floor import FIELD_PX, FloorView, to_light
 from ipsys_log.capture.simulation.pixel_shares import Box, find_shares
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.vision.marker_cells import MovingMarker, PlacedBoard, PlacedMarker
+from ipsys_log.vision.markers import MovingMarker, PlacedBoard, PlacedMarker
 
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]

@@ -18,7 +18,7 @@ from ipsys_log.capture.simulation.render import add_static_prints, encode_jpeg, 
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.messages import Rig, RigCamera, Track, Tracks, Waypoint
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.marker_cells import MovingMarker, PlacedBoard
+from ipsys_log.vision.markers import MovingMarker, PlacedBoard
 from ipsys_log.vision.poses import pose_facing_up
 
 # Labels on the floor: a black cross of 9 cm with a white margin of 3 cm.

@@ -17,7 +17,7 @@ from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, find_drift
 from ipsys_log.statistics.drift import Motion
 from ipsys_log.statistics.floor_cameras import read_floor_cameras
 from ipsys_log.statistics.reference_markers import image_sizes, read_windows
-from ipsys_log.vision.posed_camera import PosedCamera
+from ipsys_log.vision.poses import PosedCamera
 
 
 @dataclass(slots=True, eq=False)

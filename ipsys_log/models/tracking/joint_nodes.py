@@ -13,7 +13,7 @@ from ipsys_log.messages.arrays import Array
 from ipsys_log.models.tracking.bias_modes import FLATTEST
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.rotations import level_turns
+from ipsys_log.vision.poses import level_turns
 
 # The sensitivity of a centre hardly depends on the side of its marker.
 _MARKER_M = 0.2

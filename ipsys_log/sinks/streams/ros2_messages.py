@@ -20,10 +20,10 @@ from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.rotations import quaternion
+from ipsys_log.vision.poses import quaternion
 
 if TYPE_CHECKING:
-    from ipsys_log.vision.posed_camera import PosedCamera
+    from ipsys_log.vision.poses import PosedCamera
 
 # Jazzy and Kilted have the same definitions of these messages.
 _STORE = get_typestore(Stores.ROS2_JAZZY)

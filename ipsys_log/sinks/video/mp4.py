@@ -22,9 +22,8 @@ from ipsys_log.sinks.colours import robot_colour
 from ipsys_log.sinks.selection import choose_runs, fade_ns, rig_in_force
 from ipsys_log.sinks.video.canvas import Picture
 from ipsys_log.sinks.video.composite import Composite, Scene
-from ipsys_log.sinks.video.floor_map import MapPart
+from ipsys_log.sinks.video.floor_map import MapPart, enlargement
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.ellipses import enlargement
 
 if TYPE_CHECKING:
     from av.video.stream import VideoStream

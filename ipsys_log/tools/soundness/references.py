@@ -14,8 +14,7 @@ from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MEASUREMENTS_TOPI
 from ipsys_log.messages.rig_file import check_rig
 from ipsys_log.plain_text import join_names
 from ipsys_log.tools.soundness.finding import REMARK, LogFinding
-from ipsys_log.vision.lenses import check_calibration
-from ipsys_log.vision.plausible_lenses import calibration_remarks
+from ipsys_log.vision.lenses import calibration_remarks, check_calibration
 
 
 def check_rigs(session: Session) -> Iterator[LogFinding]:

@@ -28,8 +28,8 @@ from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Markers, Message
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.sinks.rerun.live import LiveView, Write
 from ipsys_log.sinks.rerun.recording import write_recording
+from ipsys_log.sinks.rerun.viewer import LiveView, Write
 from ipsys_log.sinks.sink import LiveQueue
 from ipsys_log.vision.video import is_keyframe
 

@@ -229,7 +229,7 @@ def _open_page() -> ViewerPage:
 def _viewer(
     session: Session, chosen: PlayedTopics, rig: Rig | None, page: ViewerPage, say: Callable[[str], None]
 ) -> Sink:
-    from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.sinks.rerun.viewer import LiveView
 
     cameras = [name for name, topic in session.images.items() if topic in chosen.topics]
     return LiveView(rig, cameras, chosen.run, say, page.show, page.name)

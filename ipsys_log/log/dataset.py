@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
-from ipsys_log.log.combined_logs import check_overlaps, check_same_parameters, find_new_ids, rename_ids
 from ipsys_log.log.contents import (
     RawMessage,
     StoredChannel,
@@ -31,6 +30,7 @@ from ipsys_log.log.contents import (
     run_of_topic,
 )
 from ipsys_log.log.location import LogLocation
+from ipsys_log.log.merged_logs import check_overlaps, check_same_parameters, find_new_ids, rename_ids
 from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import ASSUMED_MODEL, Cut, Measurement, Merge, MergedLog, Message, Run
 from ipsys_log.messages.channels import (

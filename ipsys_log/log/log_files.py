@@ -11,7 +11,7 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError, UnreadError
 from ipsys_log.log.location import LogLocation, LogState, LogUrl, parse_location
-from ipsys_log.log.remote_requests import (
+from ipsys_log.log.remote_object import (
     changed_ns_of,
     check_protocol,
     open_filesystem,

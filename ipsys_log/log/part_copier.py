@@ -25,7 +25,7 @@ from ipsys_log.log.records import (
     parse_chunk_head,
     walk,
 )
-from ipsys_log.log.scan import add_record
+from ipsys_log.log.summary import add_record
 from ipsys_log.log.survey import Kind, Part, Survey
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages.channels import EVENTS_TOPIC

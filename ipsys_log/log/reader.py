@@ -19,9 +19,11 @@ from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
+    PendingChunk,
     RangeCache,
     Rows,
     chunk_entries,
+    in_log_order,
     open_chunk,
     open_unchunked,
     planned_range,
@@ -35,7 +37,6 @@ from ipsys_log.log.journal import attach_journal
 from ipsys_log.log.known_contents import contents_of, open_remote
 from ipsys_log.log.location import LogLocation, LogUrl
 from ipsys_log.log.lock import is_being_written
-from ipsys_log.log.order import PendingChunk, in_log_order
 from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.summary import NoFooterError
 from ipsys_log.log.survey import Watch

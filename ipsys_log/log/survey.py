@@ -33,8 +33,7 @@ from ipsys_log.log.records import (
     parse_exact,
     walk,
 )
-from ipsys_log.log.scan import add_record, count_all
-from ipsys_log.log.summary import Summary
+from ipsys_log.log.summary import Summary, add_record, count_all
 
 _LAG = 1 << 20  # bytes: the CRC of the data section is computed in pieces of this size
 _LONGEST_HEADER = 1 << 20  # bytes

@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
-from ipsys_log.log.combined_logs import check_same_parameters, find_new_ids
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.merged_logs import MergeSource
-from ipsys_log.log.shifted_times import check_shift
+from ipsys_log.log.merged_logs import MergeSource, check_same_parameters, check_shift, find_new_ids
 from ipsys_log.messages import Rig
 from ipsys_log.messages.channels import CUTS, MEASUREMENTS, MERGES, RECORD, RIG, RUN_EVENTS
 from ipsys_log.messages.rig_combination import combine_rigs

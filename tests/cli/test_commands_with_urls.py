@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ipsys_log.log import remote_requests
+from ipsys_log.log import remote_object
 from tests.cli.test_commands import COMMANDS
 from tests.cli.test_output_names import RIG
 from tests.conftest import ROOT, Ipsys
@@ -110,7 +110,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.copy(PAPER_LAB, tmp_path / "log.mcap")
     (tmp_path / "lab.toml").write_text(RIG)
     (tmp_path / "red.yaml").write_text(lens_yaml(640, 480))
-    monkeypatch.setattr(remote_requests, "_PAUSES_S", (0.0,))
+    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,))
     monkeypatch.chdir(tmp_path)
     before = contents(tmp_path)
     yield tmp_path

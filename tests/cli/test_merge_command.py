@@ -12,7 +12,7 @@ import pytest
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.shifted_times import shift_times
+from ipsys_log.log.merged_logs import shift_times
 from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.messages.channels import MARKERS
 from tests.conftest import Ipsys

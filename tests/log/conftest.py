@@ -10,7 +10,7 @@ from mcap import records as mcap
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from ipsys_log.log import remote_requests
+from ipsys_log.log import remote_object
 from ipsys_log.log.contents import RawMessage, Schema
 from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.writer import LogWriter
@@ -87,7 +87,7 @@ def log(tmp_path: Path, rows: list[Row]) -> Path:
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     """Serve objects with ranges on loopback; a reader does not pause before it tries again."""
-    monkeypatch.setattr(remote_requests, "_PAUSES_S", (0.0,) * 4)
+    monkeypatch.setattr(remote_object, "_PAUSES_S", (0.0,) * 4)
     with serve_ranges() as store:
         yield store
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ipsys_log.log.chunk_messages import Cursor, PendingChunk, in_log_order
 from ipsys_log.log.contents import RawMessage
-from ipsys_log.log.order import Cursor, PendingChunk, in_log_order
 
 Chunk = tuple[int, list[int]]  # time from the claimed start to the first message, and log times
 CHUNKS = st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(3, 30), max_size=8)), max_size=8)

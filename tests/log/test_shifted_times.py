@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.contents import Schema, StoredChannel
-from ipsys_log.log.shifted_times import check_shift, shift_time, shift_times
+from ipsys_log.log.merged_logs import check_shift, shift_time, shift_times
 from ipsys_log.messages import CompressedImage
 
 IMAGE = "foxglove.CompressedImage"

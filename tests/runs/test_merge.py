@@ -18,7 +18,7 @@ from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.shifted_times import shift_times
+from ipsys_log.log.merged_logs import shift_times
 from ipsys_log.messages import (
     CameraCalibration,
     CompressedImage,

@@ -17,7 +17,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.shifted_times import shift_times
+from ipsys_log.log.merged_logs import shift_times
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import MODEL, TRACKS

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
-from ipsys_log.sinks.rerun.live import LiveView
+from ipsys_log.sinks.rerun.viewer import LiveView
 from ipsys_log.sinks.streams.poses import NewSession
 
 Write = Callable[[bytes], object]

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ipsys_log.live_runs.survey.live import LiveScene
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Measurement, Model
-    from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.sinks.rerun.viewer import LiveView
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
 
@@ -316,7 +316,7 @@ def live(
 
 
 def _viewer(opened: OpenLab, run: str) -> LiveView:
-    from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.sinks.rerun.viewer import LiveView
 
     return LiveView(opened.rig, opened.cameras.states, run, say)
 
@@ -327,8 +327,7 @@ def _page_viewer(opened: OpenLab, run: str, streamed: StreamSettings) -> Iterato
     if not streamed.rerun:
         yield []
         return
-    from ipsys_log.sinks.rerun.live import LiveView
-    from ipsys_log.sinks.rerun.viewer import ViewerPage
+    from ipsys_log.sinks.rerun.viewer import LiveView, ViewerPage
 
     shown = opened.cameras.states if streamed.images else ()
     with closing(ViewerPage()) as page:

@@ -11,8 +11,8 @@ import numpy as np
 from ipsys_log.app.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.exclusion import exclude
-from ipsys_log.log.combined_logs import find_new_ids
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.merged_logs import find_new_ids
 from ipsys_log.messages import Measurement
 from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.statistics.pairs import active_measurements

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from math import ceil
 
 from ipsys_log.app.report.rows import Rows
-from ipsys_log.log.chunk_builder import IMAGE_SCHEMAS
 from ipsys_log.log.contents import run_of_topic
+from ipsys_log.log.output import IMAGE_SCHEMAS
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import RepairReport
 from ipsys_log.units import NS_PER_S, format_bytes, format_time

@@ -23,8 +23,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.sinks.colours import MARKER_COLOUR, TRUTH_COLOUR, camera_colours, robot_colour
-from ipsys_log.sinks.rerun.scene import TIMELINES
-from ipsys_log.sinks.rerun.trails import Fading, Segment, Trails
+from ipsys_log.sinks.rerun.scene import TIMELINES, Fading, Segment, Trails
 
 # Colour model and channels by pixel encoding, all with 8 bits.
 _RAW = {

@@ -23,10 +23,9 @@ sys.path.append(str(Path(__file__).resolve().parent.parent))
 
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings
 from ipsys_log.messages import Floor, Markers
-from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, find_drift
+from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, Window, find_drift
 from ipsys_log.statistics.drift import MeanCorners
 from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
-from ipsys_log.statistics.reference_markers import Window
 from ipsys_log.units import MM_PER_M, NS_PER_S
 from ipsys_log.vision.poses import PosedCamera
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

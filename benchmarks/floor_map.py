@@ -19,7 +19,7 @@ sys.path.append(str(Path(__file__).resolve().parent.parent))
 from ipsys_log.app.report.figures import figure_bytes, style_axes
 from ipsys_log.app.report.styles import shorten
 from ipsys_log.capture.simulation.settings import FLOOR_M
-from ipsys_log.statistics.floor_grid import GRID_M
+from ipsys_log.statistics.floor_cameras import GRID_M
 from tests.geometric.floor_error import SightingErrors
 
 __all__ = ["draw_floor_map"]

@@ -18,8 +18,8 @@ from ipsys_log.calibration.joint.observations import Observations
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Measurement, Message, Pair, Rig
 from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.statistics.camera_models import fit_model
-from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.poses import transform
 from tests.geometric.corner_noise import (

@@ -51,8 +51,8 @@ from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import FRAME_SKIPPED, Latency, RigNodes, Tracks
 from ipsys_log.messages.channels import EVENTS, MARKERS, TRACKS
 from ipsys_log.messages.rig_file import rig_toml
+from ipsys_log.statistics.disagreement import OverlapSummary
 from ipsys_log.statistics.latency import recorded_latencies, step_times_s
-from ipsys_log.statistics.overlap_stream import OverlapSummary
 from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricSettings, build_lab
 from tests.geometric.session import MARKERS_RUN, simulate_session

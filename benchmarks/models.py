@@ -27,10 +27,9 @@ from ipsys_log.messages import Pair
 from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.models.table import MODELS
 from ipsys_log.statistics.accuracy import error_statistics
-from ipsys_log.statistics.calibration_points import measured
+from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, measured
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.statistics.cross_validation import Study, cross_validate, gather_points, labelled_subsets
-from ipsys_log.statistics.pairs import build_pairs, gather_sightings
 from ipsys_log.statistics.point_evaluation import evaluate_model
 from ipsys_log.statistics.tape import RiggedMeasurement
 

@@ -41,7 +41,7 @@ from ipsys_log.messages import (
     RigMarker,
 )
 from ipsys_log.messages.rig_file import check_rig, load_rig
-from ipsys_log.statistics.pairs import gather_sightings
+from ipsys_log.statistics.calibration_points import gather_sightings
 from ipsys_log.vision.decode import check_encoded, decode_grey, decode_rows
 from ipsys_log.vision.lenses import check_calibration
 from tests.changed_logs import rewrite

@@ -32,7 +32,7 @@ from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Pair
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
-from ipsys_log.statistics.pairs import active_measurements
+from ipsys_log.statistics.calibration_points import active_measurements
 from tests.changed_logs import rewrite
 from tests.conftest import Ipsys, Unmeasured, data_section
 from tests.test_bad_input import refused

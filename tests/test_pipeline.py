@@ -33,7 +33,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.messages.rig_file import load_rig
-from ipsys_log.statistics.pairs import active_measurements
+from ipsys_log.statistics.calibration_points import active_measurements
 from tests.conftest import ROOT, Ipsys, data_section
 from tests.wiring import wired
 

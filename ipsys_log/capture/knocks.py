@@ -18,7 +18,7 @@ import numpy as np
 
 from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.messages.arrays import Array
-from ipsys_log.statistics.overlap_stream import OverlapStream
+from ipsys_log.statistics.disagreement import OverlapStream
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
 # The state now is the median of the last sightings, at most so many and so old.

@@ -41,7 +41,7 @@ from ipsys_log.messages.channels import (
     TRUTH,
     Channel,
 )
-from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, valid_measurements
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,8 +26,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, TRUTH_TOPIC, Message, Rig, Run, Track, Tracks
 from ipsys_log.messages.channels import RIG, TRACKS, TRUTH
 from ipsys_log.messages.rig_file import check_robots
+from ipsys_log.statistics.calibration_points import TimedPoints
 from ipsys_log.statistics.ground_truth import gather_tracks
-from ipsys_log.statistics.pairs import TimedPoints
 from ipsys_log.statistics.path_pairs import PathPair
 from ipsys_log.units import NS_PER_S, format_time
 

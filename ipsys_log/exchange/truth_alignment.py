@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.truth_fit import ALIGNMENTS, LEAST_INSTANTS, Fit, RigidMotion, fit_truth, linearize
 from ipsys_log.messages.arrays import Array
-from ipsys_log.statistics.path_pairs import CommonInstants, PathPair, common_instants, without_jumps
-from ipsys_log.statistics.time_offset_search import search_offsets_s
+from ipsys_log.statistics.path_pairs import (
+    CommonInstants,
+    PathPair,
+    common_instants,
+    search_offsets_s,
+    without_jumps,
+)
 from ipsys_log.vision.poses import cross
 
 _LEAST_SPREAD_M = 0.1
@@ -63,7 +68,7 @@ def align_truth(
 ) -> TruthAlignment:
     """Estimate the time offset and the rigid alignment of ground truth to tracks, without a scale.
 
-    The coarse offsets of :func:`~ipsys_log.statistics.time_offset_search.search_offsets_s` start a
+    The coarse offsets of :func:`~ipsys_log.statistics.path_pairs.search_offsets_s` start a
     Gauss-Newton estimate of offset and alignment together. It compares the tracks with the true positions at
     their instants, by cubic Hermite interpolation. Residuals above 5 sigma are left out. All robots share one
     offset and one alignment. The standard deviations hold for errors that are alike over 2 s.

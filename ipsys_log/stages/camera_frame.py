@@ -24,8 +24,7 @@ from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView
-from ipsys_log.statistics.marker_sizes import SizeTest
-from ipsys_log.statistics.marker_tilts import MarkerTilts, SeenMarkers
+from ipsys_log.statistics.marker_tests import MarkerTilts, SeenMarkers, SizeTest
 from ipsys_log.vision.lenses import check_calibration, check_size, undistort
 from ipsys_log.vision.markers import (
     camera_point,

@@ -1,5 +1,5 @@
 """Statistics of measurements, runs and cameras: functions from arrays and messages to results.
 
-Entry: :func:`~ipsys_log.statistics.pairs.build_pairs` and the errors of ``accuracy.py``. Read first:
-``pairs.py``, ``tape.py``, ``cross_validation.py``.
+Entry: :func:`~ipsys_log.statistics.calibration_points.build_pairs` and the errors of ``accuracy.py``.
+Read first: ``calibration_points.py``, ``tape.py``, ``cross_validation.py``.
 """

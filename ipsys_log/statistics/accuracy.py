@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Model, Pair, Residual
 from ipsys_log.messages.arrays import Array
 from ipsys_log.models.table import AppliedModel, reads_height
+from ipsys_log.statistics.calibration_points import level_cameras
 from ipsys_log.statistics.camera_models import fit_camera_models, height_sigmas, tape_covariances
 from ipsys_log.statistics.cross_validation import FOLDS, cross_validate, gather_points, make_folds
-from ipsys_log.statistics.pairs import level_cameras
 from ipsys_log.statistics.remaining_error import with_remaining_error
 from ipsys_log.vision.trilateration import USUAL_TAPE_SCALE_SIGMA
 

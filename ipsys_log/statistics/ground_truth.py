@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.messages.arrays import Array, Indices
 from ipsys_log.statistics.accuracy import error_statistics
-from ipsys_log.statistics.pairs import TimedPoints, still_interval
+from ipsys_log.statistics.calibration_points import TimedPoints, still_interval
 from ipsys_log.statistics.tape import RiggedMeasurement
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.time_brackets import bracket_times

@@ -1,22 +1,37 @@
-"""Evaluation of the joint model: errors on points that are not in its fit, learning curve, and outliers."""
+"""The joint calibration of a log: its fit, and its errors on points that are not in the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ipsys_log.calibration.joint.diagnosis import find_faults, point_covariances
 from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.hypotheses import fit_hypotheses
 from ipsys_log.calibration.joint.locate import locate_markers
 from ipsys_log.calibration.joint.model import JointModel, build_models
-from ipsys_log.calibration.joint.observations import Observations
-from ipsys_log.calibration.joint.payload import restore_joint
+from ipsys_log.calibration.joint.observations import Observations, seeing_cameras, without_points
+from ipsys_log.calibration.joint.payload import joint_payload, restore_joint
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraEvaluation, Evaluation, LearningPoint, Model, Pair, Suspect
+from ipsys_log.messages import (
+    CameraCalibration,
+    CameraEvaluation,
+    Evaluation,
+    LearningPoint,
+    Markers,
+    Model,
+    Pair,
+    Suspect,
+)
 from ipsys_log.messages.arrays import Array
+from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, RIG
+from ipsys_log.messages.stage import Progress, StageView
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows
+from ipsys_log.statistics.calibration_points import active_baselines, find_pairs, measured
 from ipsys_log.statistics.cross_validation import (
     FOLDS,
     Study,
@@ -26,9 +41,103 @@ from ipsys_log.statistics.cross_validation import (
     make_folds,
     published_curve,
 )
-from ipsys_log.statistics.joint_calibration import fit_without
 from ipsys_log.statistics.outliers import describe_outlier
 from ipsys_log.statistics.tape import RiggedMeasurement
+
+
+def observe(view: StageView) -> Observations:
+    """Return the observations of a log: all its calibration points, and the drives of its robots.
+
+    Raises
+    ------
+    FitError
+        The log has no rig, or no markers.
+    """
+    points = measured(view)
+    rig = view.rig or next(iter(view.payloads(RIG)[-1:]), None)
+    markers: dict[str, list[Markers]] = {}
+    for message in view.messages(MARKERS):
+        markers.setdefault(str(message.camera), []).append(message.payload)
+    if rig is None or not markers:
+        raise FitError("joint is fitted to the corners of markers, but the log has none; use best")
+    lenses = view.calibrations()
+    nominal = {camera for camera, lens in lenses.items() if is_nominal(lens)}
+    baselines = active_baselines(view.payloads(MEASUREMENTS))
+    measurements = [point.measurement for point in points]
+    return gather_observations(rig, lenses, markers, measurements, nominal, baselines=baselines)
+
+
+def is_nominal(lens: CameraCalibration) -> bool:
+    """Return whether intrinsics come from a data sheet: a calibration by images gives a distortion."""
+    return not lens.D.any()
+
+
+def fit_without(
+    observations: Observations, left_out: Collection[str], progress: Progress = lambda done, total: None
+) -> JointFit:
+    """Fit the cameras that saw something, without some calibration points.
+
+    The fit is a pure function, and a command needs the same fit for the model and for its description. So the
+    last fit is kept.
+    """
+    wanted = seeing_cameras(without_points(observations, left_out))
+    for known, fit in tuple(_LAST_FIT):
+        if _same(known, wanted):
+            return fit
+    # The number of steps is not known before; each brings the fit nearer to its end.
+    fit = fit_hypotheses(wanted, progress=lambda step, cost: progress(step, step + 1))
+    _LAST_FIT[:] = [(wanted, fit)]
+    return fit
+
+
+# The observations and the result of the last fit; empty before the first.
+_LAST_FIT: list[tuple[Observations, JointFit]] = []
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two values of observations are equal, with all arrays in them."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        return (one.shape, one.dtype) == (other.shape, other.dtype) and one.tobytes() == other.tobytes()
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if is_dataclass(one):
+        return all(_same(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
+    return bool(one == other)
+
+
+# More remarks on probable faults hide the first ones, which often cause the others.
+_MOST_FAULTS = 10
+
+
+def fit_joint_model(
+    view: StageView, train: Collection[str], time_ns: int, notes: list[str], progress: Progress
+) -> Model:
+    """Fit the joint model of a log to the calibration points ``train`` and to all drives.
+
+    Probable faults of the observations, and cameras without a model, go to ``notes``.
+    """
+    points = measured(view)
+    left_out = {point.measurement.id for point in points} - set(train)
+    observations = observe(view)
+    fit = fit_without(observations, left_out, progress)
+    seeing = {camera.name for camera in seeing_cameras(observations).cameras}
+    notes.extend(
+        f"camera {camera.name} saw no calibration point and no robot: it has no model"
+        for camera in observations.cameras
+        if camera.name not in seeing
+    )
+    faults = [fault.text for fault in find_faults(fit)]
+    notes.extend(faults[:_MOST_FAULTS])
+    if len(faults) > _MOST_FAULTS:
+        notes.append(f"{len(faults) - _MOST_FAULTS} more probable faults; correct the first ones")
+    pairs = {
+        camera: [pair for pair in seen if pair.measurement in train]
+        for camera, seen in find_pairs(view, points).items()
+    }
+    return joint_payload(fit, pairs, time_ns)
+
 
 Models = Mapping[str, JointModel]
 

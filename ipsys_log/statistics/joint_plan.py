@@ -21,14 +21,16 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages.arrays import Array
 from ipsys_log.statistics.expected_error import (
     ExpectedErrors,
+    choose_points,
     expect_errors,
+    mean_error,
     mean_lengths,
     see_markers,
+    some_modes,
 )
-from ipsys_log.statistics.floor_grid import FloorGrid
+from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.statistics.plan import MeasurementPlan, PlannedPlace
 from ipsys_log.statistics.tape import TapeCovariances
-from ipsys_log.statistics.taped_points import choose_points, mean_error, some_modes
 
 # A drive lasts this time.
 DRIVE_S = 30.0

@@ -16,10 +16,9 @@ from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, ME
 from ipsys_log.messages.stage import Progress, StageView, Step
 from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
-from ipsys_log.statistics.calibration_points import training_pairs
+from ipsys_log.statistics.calibration_points import level_cameras, training_pairs
 from ipsys_log.statistics.camera_models import check_different, check_line, check_pairs, fit_model
 from ipsys_log.statistics.cross_validation import REPEATS, Study, gather_points
-from ipsys_log.statistics.pairs import level_cameras
 from ipsys_log.statistics.point_evaluation import evaluate_model, fitted_pairs, gross_outliers
 from ipsys_log.units import CM_PER_M
 
@@ -170,7 +169,7 @@ class CornerModels:
         notes: list[str],
         progress: Progress,
     ) -> Model:
-        from ipsys_log.statistics.joint_calibration import fit_joint_model
+        from ipsys_log.statistics.joint_evaluation import fit_joint_model
 
         return fit_joint_model(view, train, view.last_ns(*self.fit_reads), notes, progress)
 
@@ -178,8 +177,7 @@ class CornerModels:
         self, model: Model, view: StageView, study: Study, time_ns: int, notes: list[str], progress: Progress
     ) -> Evaluation:
         """Compute the errors without the gross outliers that all models leave out."""
-        from ipsys_log.statistics.joint_calibration import observe
-        from ipsys_log.statistics.joint_evaluation import evaluate_joint
+        from ipsys_log.statistics.joint_evaluation import evaluate_joint, observe
 
         cameras = gather_points(fitted_pairs(model, study))
         excluded = () if study.seed is None else gross_outliers(cameras, study.places)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraPoint, CameraPoints, Measurement
 from ipsys_log.messages.arrays import Array
-from ipsys_log.statistics.pairs import LONGEST_GAP_NS, STILL_ACROSS_M, STILL_ALONG_M, TimedPoints
+from ipsys_log.statistics.calibration_points import LONGEST_GAP_NS, STILL_ACROSS_M, STILL_ALONG_M, TimedPoints
 from ipsys_log.units import NS_PER_S
 
 # A marker is stationary if its motion is within the limits of calibration pairs; in a high lab, the noise

@@ -14,8 +14,7 @@ import numpy as np
 
 from ipsys_log.errors import FitError
 from ipsys_log.messages.arrays import Array
-from ipsys_log.statistics.path_pairs import PathPair, common_instants, gap_limit_s
-from ipsys_log.statistics.time_offset_search import search_offsets_s
+from ipsys_log.statistics.path_pairs import PathPair, common_instants, gap_limit_s, search_offsets_s
 
 Span = tuple[float, float]
 Cameras = tuple[str, str]

@@ -24,8 +24,8 @@ from ipsys_log.messages import (
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import COMMANDS, PATHS, TRACKS, TRUTH
 from ipsys_log.statistics.accuracy import error_statistics
+from ipsys_log.statistics.calibration_points import TimedPoints
 from ipsys_log.statistics.ground_truth import gather_tracks, last_poses
-from ipsys_log.statistics.pairs import TimedPoints
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.time_brackets import bracket_times
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig, RigMarker
-from ipsys_log.statistics.intrinsics_test import find_contradicted_inputs
+from ipsys_log.statistics.marker_tests import find_contradicted_inputs
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.markers import marker_corners
 

@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, WorldPoint
-from ipsys_log.statistics.blunders import Blunder, possible_blunders
+from ipsys_log.statistics.outliers import Blunder, possible_blunders
 from ipsys_log.statistics.tape import world_point
 
 POINTS = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0), ReferencePoint("C", 1.0, 3.0))

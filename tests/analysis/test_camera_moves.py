@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Floor
-from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, find_drift
+from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, Window, find_drift
 from ipsys_log.statistics.drift import MeanCorners
 from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
-from ipsys_log.statistics.reference_markers import Window
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.markers import marker_corners

@@ -23,12 +23,13 @@ from ipsys_log.messages import (
 )
 from ipsys_log.statistics.disagreement import (
     CameraPositions,
+    OverlapStream,
+    OverlapSummary,
     compare_cameras,
     divide_floor,
     divide_time,
     read_disagreement,
 )
-from ipsys_log.statistics.overlap_stream import OverlapStream, OverlapSummary
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 

@@ -16,8 +16,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, CameraPoints, Marker, Markers, Message, Positions, Rig
 from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.camera_frame import CameraFrame
+from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.statistics.camera_models import fit_model
-from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
 from tests.geometric.floor_error import (
     KnownSightings,
     Locator,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.messages import Message, Track, Tracks
+from ipsys_log.statistics.calibration_points import TimedPoints
 from ipsys_log.statistics.ground_truth import gather_tracks, track_errors
-from ipsys_log.statistics.pairs import TimedPoints
 
 MS = 1_000_000
 # A double cannot hold nanoseconds since 1970 exactly.

@@ -17,12 +17,15 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.statistics.expected_error import (
     ExpectedErrors,
     VisibleMarkers,
+    choose_points,
     expect_errors,
+    mean_error,
+    posterior_root,
     see_markers,
+    some_modes,
 )
-from ipsys_log.statistics.floor_grid import FloorGrid
+from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.statistics.joint_plan import choose_drive, plan_joint_points
-from ipsys_log.statistics.taped_points import choose_points, mean_error, posterior_root, some_modes
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 
 GRID = FloorGrid.over(np.zeros(2), np.array([4.8, 4.8]), 0.2)

@@ -14,8 +14,8 @@ from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, Suspect, WorldPoint
 from ipsys_log.models.table import create
+from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.statistics.outliers import LeaveOneOut, find_outliers
-from ipsys_log.statistics.pairs import build_pairs, gather_sightings, valid_measurements
 from ipsys_log.statistics.tape import RiggedMeasurement, world_point
 
 Array = NDArray[np.float64]

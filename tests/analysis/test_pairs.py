@@ -22,7 +22,7 @@ from ipsys_log.messages import (
     RigMarker,
     WorldPoint,
 )
-from ipsys_log.statistics.pairs import (
+from ipsys_log.statistics.calibration_points import (
     active_measurements,
     build_pairs,
     gather_sightings,

@@ -7,7 +7,7 @@ import pytest
 
 from ipsys_log.live_runs.survey.scene import CameraView, observe_marker
 from ipsys_log.messages import CameraPoint, CameraPoints
-from ipsys_log.statistics.pairs import TimedPoints
+from ipsys_log.statistics.calibration_points import TimedPoints
 from ipsys_log.statistics.stationary import is_stationary, stationary_intervals
 from ipsys_log.units import NS_PER_S
 from tests import labs

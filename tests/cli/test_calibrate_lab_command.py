@@ -230,8 +230,8 @@ def test_the_fit_of_calibrate_lab_runs_once(
         fits.append(1)
         return fit_hypotheses(*arguments, **options)
 
-    monkeypatch.setattr("ipsys_log.statistics.joint_calibration.fit_hypotheses", count)
-    monkeypatch.setattr("ipsys_log.statistics.joint_calibration._LAST_FIT", [])
+    monkeypatch.setattr("ipsys_log.statistics.joint_evaluation.fit_hypotheses", count)
+    monkeypatch.setattr("ipsys_log.statistics.joint_evaluation._LAST_FIT", [])
     log = Path(shutil.copy(session_log, tmp_path / "lab.mcap"))
     assert ipsys("calibrate-lab", log, "--goal-mm", "20").code == 0
     assert len(fits) == 1

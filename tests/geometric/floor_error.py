@@ -18,7 +18,7 @@ from ipsys_log.messages import CameraCalibration, Model
 from ipsys_log.messages.arrays import Array, Mask
 from ipsys_log.models.table import AppliedModel
 from ipsys_log.statistics.expected_error import WHOLE_PRINT
-from ipsys_log.statistics.floor_grid import GRID_M, WALL_M
+from ipsys_log.statistics.floor_cameras import GRID_M, WALL_M
 from ipsys_log.vision.lenses import in_image, project, undistort
 from ipsys_log.vision.markers import camera_point
 from ipsys_log.vision.poses import transform

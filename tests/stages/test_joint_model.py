@@ -272,7 +272,7 @@ def test_usual_joint_model_that_cannot_be_fitted_is_left_out(
         raise FitError("camera red: no overlap")
 
     monkeypatch.setattr("ipsys_log.live_runs.pipeline.evaluated_models", lambda paths: ("rigid", "joint"))
-    monkeypatch.setattr("ipsys_log.statistics.joint_calibration.fit_joint_model", fail)
+    monkeypatch.setattr("ipsys_log.statistics.joint_evaluation.fit_joint_model", fail)
     done = ipsys("evaluate", log)
     assert done.code == 0, done.err
     assert "joint is left out: camera red: no overlap" in done.err

@@ -16,7 +16,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.checks import needs_baseline, read_baseline, withdrawal_of
 from ipsys_log.live_runs.survey.scene import CameraView, StationaryInterval
 from ipsys_log.messages import Measurement, ReferencePoint, Rig
-from ipsys_log.statistics.pairs import active_baselines, active_measurements
+from ipsys_log.statistics.calibration_points import active_baselines, active_measurements
 
 POINTS = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
 RIG = Rig("lab", "DICT_4X4_100", 0.2, reference_points=POINTS)

@@ -17,7 +17,7 @@ from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Evaluation, Measurement, Message, Model
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
-from ipsys_log.statistics.pairs import active_measurements, withdrawals
+from ipsys_log.statistics.calibration_points import active_measurements, withdrawals
 from ipsys_log.tools.soundness.check import check_logs
 from tests.conftest import Ipsys, data_section
 

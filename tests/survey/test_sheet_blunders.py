@@ -18,7 +18,7 @@ from ipsys_log.live_runs.survey.sheet import name_columns
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.statistics.pairs import active_measurements
+from ipsys_log.statistics.calibration_points import active_measurements
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.survey.test_checks import THREE, check, tape

@@ -138,7 +138,7 @@ def _complain(texts: Sequence[str], style: str = "red") -> None:
 def ask_places(scene: MeasuringScene) -> None:
     """Go through the stationary intervals that are not measured yet; with live cameras, ask until ``q``."""
     from ipsys_log.live_runs.survey.entry import check_references
-    from ipsys_log.statistics.pairs import active_measurements
+    from ipsys_log.statistics.calibration_points import active_measurements
 
     check_references(scene.rig)
     with suppress(ImportError):  # arrow keys, if the system has readline
@@ -295,7 +295,7 @@ def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.live_runs.survey.checks import withdrawal_of
-    from ipsys_log.statistics.pairs import active_measurements
+    from ipsys_log.statistics.calibration_points import active_measurements
 
     active = {measurement.id: measurement for measurement in active_measurements(scene.history())}
     if not active:

@@ -189,7 +189,7 @@ def show_measured(
 ) -> None:
     """Print the number of added measurements, and the next step for the points that a log has now."""
     from ipsys_log.models.table import min_pairs
-    from ipsys_log.statistics.pairs import active_measurements
+    from ipsys_log.statistics.calibration_points import active_measurements
 
     withdrawn = sum(measurement.withdraws is not None for measurement in added)
     count = sum(measurement.is_point for measurement in added)

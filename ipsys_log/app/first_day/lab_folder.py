@@ -20,7 +20,7 @@ from ipsys_log.exchange.lab_files import tape_sheet_path
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, TRACKS
-from ipsys_log.statistics.pairs import active_measurements
+from ipsys_log.statistics.calibration_points import active_measurements
 
 # The names of logs of an alignment begin with this.
 ALIGNMENT_LOG = "alignment"

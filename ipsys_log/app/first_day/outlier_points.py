@@ -15,7 +15,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import find_new_ids
 from ipsys_log.messages import Measurement
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.statistics.pairs import active_measurements
+from ipsys_log.statistics.calibration_points import active_measurements
 from ipsys_log.units import CM_PER_M
 
 _REASON = "it contradicts the fit (setup page)"

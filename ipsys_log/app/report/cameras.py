@@ -18,8 +18,8 @@ from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
 from ipsys_log.plain_text import plain_text
+from ipsys_log.statistics.disagreement import OverlapSummary
 from ipsys_log.statistics.latency import Percentiles
-from ipsys_log.statistics.overlap_stream import OverlapSummary
 from ipsys_log.tools.differences import Comparison
 from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
 

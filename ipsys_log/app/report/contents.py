@@ -22,8 +22,8 @@ from ipsys_log.messages import CameraCalibration, Run
 from ipsys_log.messages.channels import POSITIONS, RUN_EVENTS
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.plain_text import plain_text
+from ipsys_log.statistics.calibration_points import active_measurements
 from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
-from ipsys_log.statistics.pairs import active_measurements
 from ipsys_log.tools.recording import FrameGaps, find_gaps
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 from ipsys_log.vision.lenses import calibration_remarks, check_calibration

@@ -211,7 +211,7 @@ def _calibrated(
         return ()
     # Late: scipy takes 1 s, and most reports have no joint model.
     from ipsys_log.statistics.calibrated_cameras import describe_cameras
-    from ipsys_log.statistics.joint_calibration import fit_without, observe
+    from ipsys_log.statistics.joint_evaluation import fit_without, observe
 
     names = _model_runs(session, run)
     record = next((r for r in complete_runs(session)[::-1] if r.run in names and writes(r, MODEL)), None)

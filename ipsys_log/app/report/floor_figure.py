@@ -34,8 +34,8 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION
+from ipsys_log.statistics.calibration_points import Place, locate_measurements
 from ipsys_log.statistics.ground_truth import gather_tracks
-from ipsys_log.statistics.pairs import Place, locate_measurements
 from ipsys_log.units import CM_PER_M
 
 _GRID_M = 0.5

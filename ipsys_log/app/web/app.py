@@ -31,7 +31,12 @@ from ipsys_log.live_runs.survey.scene import (
     visible_markers,
 )
 from ipsys_log.messages import Measurement
-from ipsys_log.statistics.pairs import active_baselines, active_measurements, locate_measurements, withdrawals
+from ipsys_log.statistics.calibration_points import (
+    active_baselines,
+    active_measurements,
+    locate_measurements,
+    withdrawals,
+)
 from ipsys_log.units import CM_PER_M, NS_PER_S
 from ipsys_log.vision.trilateration import are_collinear
 

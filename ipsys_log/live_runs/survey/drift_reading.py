@@ -13,10 +13,9 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Rig
 from ipsys_log.messages.channels import MARKERS, RIG
 from ipsys_log.plain_text import shell_words
-from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, find_drift
+from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, find_drift, image_sizes, read_windows
 from ipsys_log.statistics.drift import Motion
 from ipsys_log.statistics.floor_cameras import read_floor_cameras
-from ipsys_log.statistics.reference_markers import image_sizes, read_windows
 from ipsys_log.vision.poses import PosedCamera
 
 

@@ -13,7 +13,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Message
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.statistics.pairs import withdrawals
+from ipsys_log.statistics.calibration_points import withdrawals
 
 _MOST_NAMES = 40
 

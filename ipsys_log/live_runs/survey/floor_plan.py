@@ -17,7 +17,7 @@ from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.statistics.floor_grid import FloorGrid
+from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.statistics.plan import FittedCamera, MeasurementPlan, plan_points
 from ipsys_log.statistics.tape import TapeCovariances, expected_tape_covariances
 from ipsys_log.vision.poses import invert_pose, make_pose

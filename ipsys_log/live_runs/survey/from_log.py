@@ -30,7 +30,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, Channel
-from ipsys_log.statistics.pairs import TimedPoints, gather_sightings
+from ipsys_log.statistics.calibration_points import TimedPoints, gather_sightings
 from ipsys_log.statistics.stationary import stationary_intervals
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey

@@ -23,14 +23,15 @@ from ipsys_log.statistics.calibration_points import measured, split_ids
 from ipsys_log.statistics.expected_error import (
     ExpectedErrors,
     FloorGap,
+    TapedPoint,
+    choose_points,
     expect_errors,
     find_floor_gaps,
 )
-from ipsys_log.statistics.floor_grid import FloorGrid
-from ipsys_log.statistics.intrinsics_test import find_contradicted_inputs
-from ipsys_log.statistics.joint_calibration import fit_without, is_nominal, observe
+from ipsys_log.statistics.floor_cameras import FloorGrid
+from ipsys_log.statistics.joint_evaluation import fit_without, is_nominal, observe
+from ipsys_log.statistics.marker_tests import find_contradicted_inputs
 from ipsys_log.statistics.tape import expected_tape_covariances
-from ipsys_log.statistics.taped_points import TapedPoint, choose_points
 
 # Without a floor in the rig, the map reaches this far beyond the places of the markers.
 _AROUND_M = 0.5

@@ -12,9 +12,9 @@ from ipsys_log.calibration.joint.from_messages import gather_observations
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.lab_calibration import LabCalibration, describe_fit
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
-from ipsys_log.statistics.intrinsics_test import find_contradicted_inputs
-from ipsys_log.statistics.joint_calibration import fit_without, is_nominal
-from ipsys_log.statistics.pairs import active_baselines, active_measurements
+from ipsys_log.statistics.calibration_points import active_baselines, active_measurements
+from ipsys_log.statistics.joint_evaluation import fit_without, is_nominal
+from ipsys_log.statistics.marker_tests import find_contradicted_inputs
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
 # The fit beside the recording uses a part of the sightings, so that it leaves time for the detection.

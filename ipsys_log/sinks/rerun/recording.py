@@ -27,8 +27,8 @@ from ipsys_log.sinks.rerun.scene import (
 )
 from ipsys_log.sinks.rerun.viewer import show_in_viewer
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
+from ipsys_log.statistics.calibration_points import locate_measurements
 from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
-from ipsys_log.statistics.pairs import locate_measurements
 
 # The entities above the series; each has its own plot.
 DISAGREEMENT = "series/disagreement"

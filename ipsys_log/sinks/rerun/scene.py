@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 
 from ipsys_log.messages import Floor, Message, Rig
 from ipsys_log.sinks.colours import KIND_COLOURS
-from ipsys_log.statistics.pairs import KINDS, Place
+from ipsys_log.statistics.calibration_points import KINDS, Place
 
 # The viewer shows the first timeline; the times in the payloads belong to it.
 TIMELINES = ("publish_time", "log_time")

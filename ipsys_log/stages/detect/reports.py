@@ -12,7 +12,7 @@ import numpy as np
 from ipsys_log.errors import SizeError
 from ipsys_log.messages import CameraCalibration, Event, ImageAnnotations, Marker, Markers
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, MIRRORED, OTHER_PRINTS
-from ipsys_log.statistics.intrinsics_test import IntrinsicsTest
+from ipsys_log.statistics.marker_tests import IntrinsicsTest
 from ipsys_log.vision.lenses import same_intrinsics
 
 NO_KEYFRAME, REJECTED_MARKER, UNKNOWN_MARKER = ("no_keyframe", "rejected_marker", "unknown_marker")

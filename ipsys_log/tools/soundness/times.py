@@ -114,7 +114,7 @@ def check_clocks(session: Session) -> Iterator[LogFinding]:
     if not joint:
         return
     # Late: it imports scipy, and most logs have no nodes.
-    from ipsys_log.statistics.clock_agreement import find_contradicted_clocks
+    from ipsys_log.statistics.calibrated_cameras import find_contradicted_clocks
 
     for one in find_contradicted_clocks(joint[-1], session.payloads(topics)):
         yield LogFinding("time", REMARK, one.text, _ADVICE, clock_topic(one.camera))

@@ -41,7 +41,7 @@ from ipsys_log.messages import (
 from ipsys_log.sinks.selection import PlayedScene
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.sinks.streams.settings import Stream
-from ipsys_log.statistics.overlap_stream import OverlapSummary
+from ipsys_log.statistics.disagreement import OverlapSummary
 from ipsys_log.units import NS_PER_S
 
 _NS_PER_MS = 1_000_000

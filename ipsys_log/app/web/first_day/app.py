@@ -24,7 +24,7 @@ from ipsys_log.app.web.requests import ERROR_HANDLERS, answer_file, read_json
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.live_runs.survey.live import LiveScene
-from ipsys_log.statistics.pairs import active_measurements
+from ipsys_log.statistics.calibration_points import active_measurements
 
 Body = Mapping[str, Any]
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from track_drives import SeenDrive
 
 from ipsys_log.messages import Message, Position, Track, Tracks
-from ipsys_log.models.tracking.interpolation import TrackRows, interpolate
-from ipsys_log.models.tracking.motion import MotionNoise
+from ipsys_log.models.tracking.filter import MotionNoise
 from ipsys_log.models.tracking.smoothed_poses import Frame, smooth_positions
-from ipsys_log.models.tracking.track_messages import gather_rows, make_track
+from ipsys_log.models.tracking.track_messages import TrackRows, gather_rows, interpolate, make_track
 from ipsys_log.stages.fuse import Fuse
 from ipsys_log.units import NS_PER_S
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
         verify,
     )
     from ipsys_log.errors import IpsysError
-    from ipsys_log.models.fitted_corners import FittedCornerModel
+    from ipsys_log.models.locate_corners import FittedCornerModel
 
 __all__ = [
     "CalibrationResult",
@@ -88,7 +88,7 @@ def __getattr__(name: str) -> Any:
 
         return IpsysError
     if name == "FittedCornerModel":
-        from ipsys_log.models.fitted_corners import FittedCornerModel
+        from ipsys_log.models.locate_corners import FittedCornerModel
 
         return FittedCornerModel
     if name in __all__:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from ipsys_log.capture.frames import Clock
     from ipsys_log.engine.pieces import PieceWorkers
-    from ipsys_log.models.fitted_corners import FittedCornerModel
+    from ipsys_log.models.locate_corners import FittedCornerModel
     from ipsys_log.sinks.sink import Sink
 
 __all__ = [
@@ -357,7 +357,7 @@ def load_model(path: StrPath | LogUrl, name: str | None = None) -> FittedModel |
         model = fitted_in(session, name)[0]
     if not reads_corners(model.name):
         return FittedModel(model)
-    from ipsys_log.models.fitted_corners import FittedCornerModel  # late: scipy takes 1 s
+    from ipsys_log.models.locate_corners import FittedCornerModel  # late: scipy takes 1 s
 
     return FittedCornerModel(model)
 

@@ -14,8 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS, Channel
-from ipsys_log.models.tracking.interpolation import interpolate
-from ipsys_log.models.tracking.track_messages import gather_rows
+from ipsys_log.models.tracking.track_messages import gather_rows, interpolate
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,13 +20,13 @@ from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 
 def _rigid() -> Any:
-    from ipsys_log.models.rigid import RigidTransform
+    from ipsys_log.models.closed_form import RigidTransform
 
     return RigidTransform()
 
 
 def _poly() -> Any:
-    from ipsys_log.models.poly import PolynomialRegression
+    from ipsys_log.models.closed_form import PolynomialRegression
 
     return PolynomialRegression()
 
@@ -280,7 +280,7 @@ class AppliedModel:
         world_m = np.array([pair.world_m for pair in camera.pairs])
         self._volume = Volume(fitted_m, world_m)
         if reads_height(name):
-            from ipsys_log.models.depths import HeightCheck
+            from ipsys_log.models.ray_models import HeightCheck
 
             self._height_check = HeightCheck(self._estimator.camera_rays, fitted_m, world_m)
         if camera.noise is not None:
@@ -336,7 +336,7 @@ class AppliedModel:
     ) -> NDArray[np.bool_]:
         """Return a mask (n,) of the markers whose depths agree with the heights that the model read.
 
-        All agree if the model reads no heights. See :class:`ipsys_log.models.depths.HeightCheck`.
+        All agree if the model reads no heights. See :class:`ipsys_log.models.ray_models.HeightCheck`.
         """
         if self._height_check is None:
             return np.ones(len(points_m), dtype=bool)
@@ -345,7 +345,7 @@ class AppliedModel:
     def rises(self, points_m: Array, world_m: Array, depth_sigmas_m: Array) -> tuple[Array, Array]:
         """Return the heights by the depths minus the heights that the model read, and their sigmas, (n,).
 
-        The model must read heights. See :meth:`ipsys_log.models.depths.HeightCheck.rises`.
+        The model must read heights. See :meth:`ipsys_log.models.ray_models.HeightCheck.rises`.
         """
         assert self._height_check is not None
         return self._height_check.rises(points_m, world_m, depth_sigmas_m)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi, norm
 
-from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.models.closed_form import PolynomialRegression
 from ipsys_log.statistics import consistency
 from ipsys_log.statistics.consistency import score, usual_covariances
 

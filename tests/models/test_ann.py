@@ -15,7 +15,7 @@ from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError
 from ipsys_log.models.ann import NeuralNetwork, _slopes, evaluate_networks
-from ipsys_log.models.rigid import RigidTransform
+from ipsys_log.models.closed_form import RigidTransform
 from ipsys_log.models.table import create
 from tests.models.test_rays import authors_pairs, error_cm
 

@@ -19,8 +19,7 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.models.poly import PolynomialRegression
-from ipsys_log.models.rigid import rigid_transform
+from ipsys_log.models.closed_form import PolynomialRegression, rigid_transform
 from ipsys_log.models.table import MODELS, create, inputs, min_pairs, parameters, predict_array, restore
 
 
@@ -72,7 +71,7 @@ def test_poly_is_more_exact_than_normal_equations() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform((-200, -100, 2000), (200, 100, 2000.5), (40, 3))
     coefficients = rng.normal(size=(10, 3))
-    from ipsys_log.models.poly import regressors
+    from ipsys_log.models.closed_form import regressors
 
     shifted = (points - points.mean(axis=0)) / 100
     world = regressors(shifted) @ coefficients

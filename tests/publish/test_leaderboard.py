@@ -14,7 +14,7 @@ from tests.publish.packs import change_scores
 from tests.test_benchmarks import BENCHMARKS
 
 OWN = """
-from ipsys_log.models.poly import PolynomialRegression as Estimator
+from ipsys_log.models.closed_form import PolynomialRegression as Estimator
 """
 
 

@@ -26,7 +26,7 @@ from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, TRACKS
 from ipsys_log.messages.rig_file import load_rig
-from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.models.closed_form import PolynomialRegression
 from ipsys_log.tools.publish.packing import pack
 from ipsys_log.tools.publish.scores import Score
 from ipsys_log.tools.publish.scoring import ScoreComparison, ScoreResult, score
@@ -278,7 +278,7 @@ def test_newer_model_is_named(dataset: Path, ipsys: Ipsys) -> None:
 
 
 OWN = """
-from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.models.closed_form import PolynomialRegression
 
 class Estimator(PolynomialRegression):
     pass

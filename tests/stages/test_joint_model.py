@@ -25,7 +25,7 @@ from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, Markers, Measurement, Message, Model, Run, Tracks
 from ipsys_log.messages.channels import EVALUATION, MARKERS, MEASUREMENTS_TOPIC, POSITIONS, RIG
-from ipsys_log.models.fitted_corners import FittedCornerModel
+from ipsys_log.models.locate_corners import FittedCornerModel
 from ipsys_log.models.table import MODELS
 from ipsys_log.statistics.joint_evaluation import JOINT_SUBSETS
 from tests.conftest import Ipsys

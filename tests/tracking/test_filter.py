@@ -8,8 +8,19 @@ from numpy.typing import NDArray
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from ipsys_log.models.tracking.filter import UNKNOWN_RAD2, Sightings, States, compare, predict, start, update
-from ipsys_log.models.tracking.motion import MOTION, POSE, MotionNoise, transition
+from ipsys_log.models.tracking.filter import (
+    MOTION,
+    POSE,
+    UNKNOWN_RAD2,
+    MotionNoise,
+    Sightings,
+    States,
+    compare,
+    predict,
+    start,
+    transition,
+    update,
+)
 
 Array = NDArray[np.float64]
 

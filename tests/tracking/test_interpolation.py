@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.models.tracking.interpolation import TrackRows, interpolate
-from ipsys_log.models.tracking.motion import MotionNoise
-from ipsys_log.models.tracking.track_messages import gather_rows
+from ipsys_log.models.tracking.filter import MotionNoise
+from ipsys_log.models.tracking.track_messages import TrackRows, gather_rows, interpolate
 
 Array = NDArray[np.float64]
 

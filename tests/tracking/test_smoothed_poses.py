@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import Position, Rig, RigMarker, Track, Tracks
 from ipsys_log.models.tracking import smoothed_poses
-from ipsys_log.models.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions
-from ipsys_log.models.tracking.smoother import smooth_track
+from ipsys_log.models.tracking.smoothed_poses import Frame, SmoothedPose, smooth_positions, smooth_track
 from ipsys_log.models.tracking.track_messages import make_track
 from ipsys_log.units import NS_PER_S
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.models.tracking.filter import Sightings, States, start
-from ipsys_log.models.tracking.motion import MOTION, POSE, MotionNoise, transition
-from ipsys_log.models.tracking.smoother import smooth_track
+from ipsys_log.models.tracking.filter import MOTION, POSE, MotionNoise, Sightings, States, start, transition
+from ipsys_log.models.tracking.smoothed_poses import smooth_track
 
 Array = NDArray[np.float64]
 

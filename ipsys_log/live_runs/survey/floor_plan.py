@@ -14,7 +14,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
-from ipsys_log.models.rigid import rigid_transform
+from ipsys_log.models.closed_form import rigid_transform
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.statistics.floor_cameras import FloorGrid

@@ -10,10 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages.arrays import Array
-from ipsys_log.models.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
-from ipsys_log.models.tracking.history import HISTORY_NS, History, Record, Sighted
-from ipsys_log.models.tracking.motion import MotionNoise
-from ipsys_log.models.tracking.unseen_growth import UnseenGrowth
+from ipsys_log.models.tracking.filter import (
+    Innovations,
+    MotionNoise,
+    Sightings,
+    States,
+    compare,
+    predict,
+    start,
+    update,
+)
+from ipsys_log.models.tracking.history import HISTORY_NS, History, Record, Sighted, UnseenGrowth
 from ipsys_log.units import NS_PER_S
 
 # The name of a robot, and the id of its reference marker.

@@ -38,7 +38,7 @@ from stream_server import free_ports, write_lens
 
 from ipsys_log.capture.camera_thread import NODES_RUN
 from ipsys_log.capture.frames import CameraState
-from ipsys_log.capture.knocks import KnockMonitor
+from ipsys_log.capture.live_check import KnockMonitor
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.simulation.settings import hall_settings, parse_grid

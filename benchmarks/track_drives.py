@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rendered_sessions import rendered_session
 
 from ipsys_log.calibration.joint.payload import JOINT, joint_payload
-from ipsys_log.capture.simulation.pace import Pace, Stops, draw_pace
+from ipsys_log.capture.simulation.drive import Pace, Stops, draw_pace
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Rig
 from ipsys_log.models.locate_corners import LocateCorners

@@ -44,7 +44,7 @@ from track_errors import (
 )
 
 from ipsys_log.calibration.joint.payload import JOINT
-from ipsys_log.capture.simulation.pace import Stops
+from ipsys_log.capture.simulation.drive import Stops
 from ipsys_log.errors import FitError
 
 __all__ = ["measure"]

@@ -21,8 +21,7 @@ from ipsys_log.capture.frames import (
 from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
-from ipsys_log.capture.video_files import frame_payload
-from ipsys_log.capture.video_packets import find_size, is_decodable_start
+from ipsys_log.capture.video_files import find_size, frame_payload, is_decodable_start
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, schema_name
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, Markers, RigCamera, image_topic

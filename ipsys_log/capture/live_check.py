@@ -1,23 +1,241 @@
-"""The live check of the cameras: a frame of each about once a second, and events for knocked cameras."""
+"""The live check of the cameras: a frame of each about once a second, and a warning of knocked cameras.
+
+A reference marker that moves in the image shows it. The side of the marker gives the scale, so no model is
+necessary. If another camera sees the same marker move, the marker has moved. Cameras that see no reference
+marker are compared with other cameras in the overlap of their fields of view. There the errors of the models
+differ from place to place, so that only a sudden change of some centimetres is certain.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from math import hypot
 from types import TracebackType
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from ipsys_log.capture.knocks import KnockMonitor
 from ipsys_log.capture.recorder import Source
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CAMERA_MOVED, CompressedImage, CompressedVideo, Message, Rig
+from ipsys_log.messages import CAMERA_MOVED, CompressedImage, CompressedVideo, Markers, Message, Rig
+from ipsys_log.messages.arrays import Array
 from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
+from ipsys_log.statistics.disagreement import OverlapStream
+from ipsys_log.units import MM_PER_M, NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import decode_keyframe, is_keyframe
+
+# The state now is the median of the last sightings, at most so many and so old.
+_RECENT = 5
+_RECENT_NS = NS_PER_S // 2
+# With fewer, one wrong sighting is the median.
+_FEWEST_RECENT = 3
+# The state before is the median of earlier sightings, at most so old and at least so many.
+_BEFORE_NS = 3 * NS_PER_S
+_FEWEST_BEFORE = 5
+# Smallest motion of a marker that counts.
+_LEAST_MARKER_M = 0.002
+# Smallest change of the difference of two cameras that counts. It also changes with the place of the robot,
+# at most so many m per m.
+_LEAST_OVERLAP_M = 0.015
+_OVERLAP_SLOPE = 0.02
+# A smaller change in units of the usual spread is noise.
+_SPREADS = 6.0
+# Values within such an extent cannot have changed by _LEAST_OVERLAP_M, also with rounding.
+_CALM_M = 0.99 * _LEAST_OVERLAP_M
+# A motion must last so long. Meanwhile the other cameras send their frames.
+_CONFIRMED_NS = NS_PER_S // 5
+# A camera without a reference marker for so long counts as one without reference markers.
+_UNWATCHED_NS = 2 * NS_PER_S
+# In the overlap, the state before is that at nearly the same place: the robot moves on.
+_OVERLAP_BEFORE_NS = 3 * NS_PER_S // 2
+_FEWEST_OVERLAP = 4
+
+
+class Knock(NamedTuple):
+    """A warning that a camera has moved, as a text for the user; ``camera`` is None if two are possible."""
+
+    time_ns: int
+    camera: str | None
+    text: str
+
+
+@dataclass(slots=True, eq=False)
+class _History:
+    """Values over the last seconds, and the time since when they have changed."""
+
+    kept_ns: int
+    fewest: int
+    rows: deque[tuple[int, Array]] = field(default_factory=deque)
+    changed_ns: int | None = None
+    # Bounds of x and y of all rows: low x, high x, low y, high y. They can be too wide.
+    bounds: tuple[float, float, float, float] | None = None
+
+    def add(self, time_ns: int, value: Array) -> None:
+        if self.rows and time_ns <= self.rows[-1][0]:
+            return
+        self.rows.append((time_ns, value))
+        while self.rows[0][0] < time_ns - self.kept_ns:
+            self.rows.popleft()
+
+    def change(self) -> tuple[Array, Array] | None:
+        """Return the change from before to now, and the usual spread of a value; None if unknown."""
+        newest_ns = self.rows[-1][0]
+        split = max(len(self.rows) - _RECENT, 0)
+        recent = [value for time_ns, value in list(self.rows)[split:] if newest_ns - time_ns <= _RECENT_NS]
+        before = np.array([value for _, value in list(self.rows)[:split]])
+        if len(recent) < _FEWEST_RECENT or len(before) < self.fewest:
+            return None
+        middle = np.median(before, axis=0)
+        spread = 1.5 * np.median(np.abs(before - middle), axis=0)
+        return np.median(recent, axis=0) - middle, spread
+
+    def is_within(self, extent: float) -> bool:
+        """Return whether the first two values of all rows lie within an extent.
+
+        Medians take ten times as long, and a hall has thousands of differences per second.
+        """
+        x, y = self.rows[-1][1][:2].tolist()
+        low_x, high_x, low_y, high_y = self.bounds or (x, x, y, y)
+        self.bounds = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
+        if not _is_short(self.bounds, extent):
+            xs, ys = zip(*(value[:2].tolist() for _, value in self.rows), strict=True)
+            self.bounds = min(xs), max(xs), min(ys), max(ys)
+        return _is_short(self.bounds, extent)
+
+    def note(self, is_changed: bool) -> bool:
+        """Note whether the value is changed now; return whether it has been for long enough."""
+        newest_ns = self.rows[-1][0]
+        if not is_changed:
+            self.changed_ns = None
+        elif self.changed_ns is None:
+            self.changed_ns = newest_ns
+        return self.changed_ns is not None and newest_ns - self.changed_ns >= _CONFIRMED_NS
+
+    def restart(self) -> None:
+        self.rows.clear()
+        self.changed_ns = None
+
+
+def _is_short(bounds: tuple[float, float, float, float], extent: float) -> bool:
+    low_x, high_x, low_y, high_y = bounds
+    return hypot(high_x - low_x, high_y - low_y) <= extent
+
+
+class KnockMonitor:
+    """The monitor of all cameras; it gets the results of the stages in the order of the log.
+
+    Parameters
+    ----------
+    rig : names the reference markers and their sides.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig, self._overlap = rig, OverlapStream(rig)
+        self._markers: dict[tuple[str, int], _History] = {}
+        self._shifts_m: dict[tuple[str, int], float] = {}
+        self._watched_ns: dict[str, int] = {}
+        self._pairs: dict[tuple[tuple[str, str], int], _History] = {}
+
+    def __call__(self, message: Message) -> Iterator[Knock]:
+        """Yield the warnings that a message causes."""
+        if isinstance(message.payload, Markers):
+            yield from self._see_markers(str(message.camera), message.payload)
+        for difference in self._overlap(message):
+            key = difference.cameras, difference.marker_id
+            history = self._pairs.setdefault(key, _History(_OVERLAP_BEFORE_NS, _FEWEST_OVERLAP))
+            history.add(difference.time_ns, np.array(difference[3:]))
+            yield from self._see_difference(difference.cameras, history)
+
+    def _see_markers(self, camera: str, frame: Markers) -> Iterator[Knock]:
+        confirmed, present = [], []
+        for marker in frame.markers:
+            if not self._rig.is_reference(marker.id):
+                continue
+            key = camera, marker.id
+            history = self._markers.setdefault(key, _History(_BEFORE_NS, _FEWEST_BEFORE))
+            history.add(frame.timestamp, marker.corners_px.reshape(8))
+            self._watched_ns[camera] = frame.timestamp
+            present.append(marker.id)
+            self._shifts_m[key] = shift_m = self._shift_m(marker.id, history)
+            if history.note(shift_m > _LEAST_MARKER_M):
+                confirmed.append(marker.id)
+        if confirmed and 2 * len(confirmed) >= len(present):
+            own = [marker_id for marker_id in confirmed if not self._is_seen_moving(camera, marker_id)]
+            if own:
+                yield self._warn(camera, frame.timestamp, own, len(present))
+            for marker_id in confirmed if own else ():
+                self._markers[camera, marker_id].restart()
+
+    def _shift_m(self, marker_id: int, history: _History) -> float:
+        """Return the motion of a marker in the image in m at its distance; 0 if it is not certain."""
+        newest, oldest = (history.rows[n][1].reshape(4, 2) for n in (-1, 0))
+        sides_px = np.hypot(*(newest[[1, 2, 3, 0]] - newest).T)
+        scale = self._rig.length_of(marker_id) / float(sides_px.max())
+        # Medians take ten times as long, and nearly all frames show a still marker.
+        if scale * float(np.hypot(*(newest - oldest).mean(axis=0))) < _LEAST_MARKER_M / 2:
+            return 0.0
+        change = history.change()
+        if change is None:
+            return 0.0
+        shift_px, spread_px = change[0].reshape(4, 2).mean(axis=0), float(change[1].max())
+        length_px = float(np.linalg.norm(shift_px))
+        return scale * length_px if length_px > _SPREADS * spread_px / np.sqrt(_RECENT) else 0.0
+
+    def _is_seen_moving(self, camera: str, marker_id: int) -> bool:
+        """Return whether another camera sees the marker move."""
+        return any(
+            shift_m > _LEAST_MARKER_M / 2
+            for (other, own_id), shift_m in self._shifts_m.items()
+            if own_id == marker_id and other != camera
+        )
+
+    def _warn(self, camera: str, time_ns: int, markers: list[int], present: int) -> Knock:
+        shift_mm = float(np.median([self._shifts_m[camera, marker_id] for marker_id in markers])) * MM_PER_M
+        names = ", ".join(map(str, markers))
+        several = len(markers) > 1
+        doubt = "" if several else f", or reference marker {names} has moved"
+        return Knock(
+            time_ns,
+            camera,
+            f"camera {camera} has moved{doubt}: {len(markers)} of {present} reference markers in its image "
+            f"shifted by {shift_mm:.1f} mm; to measure it: ipsys drift",
+        )
+
+    def _see_difference(self, pair: tuple[str, str], history: _History) -> Iterator[Knock]:
+        now_ns = history.rows[-1][0]
+        suspects = [
+            camera
+            for camera in pair
+            if now_ns - self._watched_ns.get(camera, -_UNWATCHED_NS) >= _UNWATCHED_NS
+        ]
+        change = history.change() if suspects and not history.is_within(_CALM_M) else None
+        size_m = 0.0 if change is None else float(np.linalg.norm(change[0][:2]))
+        if not history.note(change is not None and size_m > _overlap_limit_m(*change)):
+            return
+        others = {own for (own, _), one in self._pairs.items() if own != pair and one.changed_ns is not None}
+        common = [camera for camera in suspects if any(camera in own for own in others)] or suspects
+        for (own, _), one in self._pairs.items():
+            if set(own) & set(common):
+                one.restart()
+        yield Knock(
+            now_ns,
+            common[0] if len(common) == 1 else None,
+            f"camera {' or '.join(common)} has moved: the positions of cameras {pair[0]} and {pair[1]} "
+            f"suddenly differ by {size_m * MM_PER_M:.0f} mm more; check the mounts",
+        )
+
+
+def _overlap_limit_m(change: Array, spread: Array) -> float:
+    """Return the change of a difference that is possible without a motion of a camera, in m."""
+    travel_m = float(np.linalg.norm(change[2:]))
+    return max(_LEAST_OVERLAP_M + _OVERLAP_SLOPE * travel_m, _SPREADS * float(spread[:2].max()))
+
 
 _EVERY_S = 1.0
 # Mean grey level of a dark image, and standard deviation of the grey levels behind a lens cap.

@@ -24,7 +24,7 @@ from ipsys_log.capture.frames import (
     SourceError,
     report_refused_settings,
 )
-from ipsys_log.capture.video_packets import find_video, name_format, pass_through
+from ipsys_log.capture.video_files import find_video, name_format, pass_through
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigCamera
 from ipsys_log.plain_text import hide_password

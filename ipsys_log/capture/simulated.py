@@ -14,11 +14,17 @@ from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings
-from ipsys_log.capture.simulation.board import board_cells
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.floor import Check
-from ipsys_log.capture.simulation.live_lab import LIVE_SETTINGS, Film, board_film, lab_film, next_missing
-from ipsys_log.capture.simulation.pixel_shares import exposure_interval
+from ipsys_log.capture.simulation.live_lab import (
+    LIVE_SETTINGS,
+    Film,
+    board_cells,
+    board_film,
+    lab_film,
+    next_missing,
+)
+from ipsys_log.capture.simulation.render import exposure_interval
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera

@@ -36,12 +36,11 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from ipsys_log.capture.backlog import Backlog
+from ipsys_log.capture.backlog import Backlog, RecentFrames
 from ipsys_log.capture.frames import SourceError
 from ipsys_log.capture.live_check import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.recent_frames import RecentFrames
 from ipsys_log.capture.recorder import CameraSource, Recording, open_recording, write_each
 from ipsys_log.engine.blas import one_blas_thread
 from ipsys_log.engine.checks import check_inputs

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.capture import knocks
-from ipsys_log.capture.knocks import Knock, KnockMonitor
+from ipsys_log.capture import live_check
+from ipsys_log.capture.live_check import Knock, KnockMonitor
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Marker, Markers, Message, Position, Positions, ReferenceMarker, Rig
@@ -146,7 +146,7 @@ def test_extents_leave_out_no_warning(
 
     rig = Rig("lab", "DICT_4X4_100", LENGTH_M)
     quick = warnings(positions(turned, 10.0, bias_m), rig)
-    monkeypatch.setattr(knocks._History, "is_within", lambda history, extent: False)
+    monkeypatch.setattr(live_check._History, "is_within", lambda history, extent: False)
     assert quick == warnings(positions(turned, 10.0, bias_m), rig)
 
 

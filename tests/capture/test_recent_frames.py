@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.capture.backlog import RecentFrames
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import check_independent_frames
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.recent_frames import RecentFrames
 from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
 from ipsys_log.engine.view import LogView

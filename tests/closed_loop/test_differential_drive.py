@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.capture.simulation.differential_drive import STEP_NS, Chassis, DifferentialDrive, Pose2d
+from ipsys_log.capture.simulation.robot_lab import STEP_NS, Chassis, DifferentialDrive, Pose2d
 from ipsys_log.units import NS_PER_S
 
 IDEAL = Chassis(slip=0.0, slip_sigma=0.0, noise=0.0)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.capture.simulation.differential_drive import DifferentialDrive, Pose2d
+from ipsys_log.capture.simulation.robot_lab import DifferentialDrive, Pose2d
 from ipsys_log.live_runs.robot_runs.settings import PATHS
 from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import FOLDER, example

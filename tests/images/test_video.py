@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.capture.video_packets import pass_through
+from ipsys_log.capture.video_files import pass_through
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedVideo, Event, Markers, Message, RawImage, Rig
 from ipsys_log.stages.detect import Detect

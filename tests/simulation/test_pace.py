@@ -8,8 +8,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.drive import plan_drive
-from ipsys_log.capture.simulation.pace import Stops, draw_pace
+from ipsys_log.capture.simulation.drive import Stops, draw_pace, plan_drive
 from ipsys_log.capture.simulation.settings import LabSettings
 
 STOPS = Stops(legs_s=2.0, stands_s=1.0, acceleration_m_s2=2.5)

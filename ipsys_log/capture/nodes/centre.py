@@ -18,8 +18,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
-from ipsys_log.capture.nodes.certificates import AUTHORITY
-from ipsys_log.capture.nodes.network import NodeNetwork, open_centre_session
+from ipsys_log.capture.nodes.network import AUTHORITY, NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
 from ipsys_log.capture.nodes.wire import (
     FrameHeader,

@@ -11,8 +11,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Say
-from ipsys_log.capture.nodes.certificates import Certificates, check_centre
-from ipsys_log.capture.nodes.network import NodeNetwork, open_node_session
+from ipsys_log.capture.nodes.network import Certificates, NodeNetwork, check_centre, open_node_session
 from ipsys_log.capture.nodes.wire import (
     MARKERS_FORMAT,
     FrameHeader,

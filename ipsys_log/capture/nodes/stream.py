@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from ipsys_log.capture.frames import Frame, NodeRefusedError, SourceError, SourceMessage, mid_exposure_ns
 from ipsys_log.capture.node_clock import ClockHistory, Exchange
 from ipsys_log.capture.nodes.wire import FrameHeader, FrameRequest, NodeState, StateRequest
-from ipsys_log.capture.video_packets import is_decodable_start
+from ipsys_log.capture.video_files import is_decodable_start
 from ipsys_log.messages import EVENTS_TOPIC, ClockEstimate, Event, RigCamera, clock_topic
 from ipsys_log.messages.events import NODE_ANSWERS, NODE_REFUSED
 from ipsys_log.units import NS_PER_S

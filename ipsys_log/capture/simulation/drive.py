@@ -1,4 +1,4 @@
-"""Convoy of robots that drive along a smooth closed path over the whole floor.
+"""Convoy of robots on a smooth closed path over the whole floor, at full speed or with stops.
 
 The path does not cross itself, so the robots of a convoy never meet, for any duration.
 """
@@ -13,9 +13,78 @@ import numpy as np
 
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose, overlap
 from ipsys_log.capture.simulation.cameras import Camera
-from ipsys_log.capture.simulation.pace import Pace
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 from ipsys_log.messages.arrays import Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stops:
+    """The stops of a robot.
+
+    Attributes
+    ----------
+    legs_s, stands_s : mean durations of a leg and of a stand, above 0; they have exponential distributions.
+    acceleration_m_s2 : of each start, and of each braking, above 0.
+    """
+
+    legs_s: float
+    stands_s: float
+    acceleration_m_s2: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pace:
+    """The speed of a robot, as a share of full speed: linear between knots, constant after the last one.
+
+    Attributes
+    ----------
+    times_s : (n,), of the knots, from 0 on.
+    shares : (n,), of full speed, at the knots.
+    """
+
+    times_s: Array
+    shares: Array
+
+    def share_at(self, times_s: Array) -> Array:
+        """Return the shares of full speed (n,) at times (n,)."""
+        return np.interp(times_s, self.times_s, self.shares)
+
+    def driven_s(self, times_s: Array) -> Array:
+        """Return the ways since the start (n,) at times (n,), as the time for them at full speed."""
+        steps_s = np.diff(self.times_s)
+        ends_s = np.concatenate([[0.0], np.cumsum(steps_s * (self.shares[1:] + self.shares[:-1]) / 2)])
+        knot = np.maximum(np.searchsorted(self.times_s, times_s, side="right") - 1, 0)
+        since_s = times_s - self.times_s[knot]
+        return np.asarray(ends_s[knot] + since_s * (self.shares[knot] + self.share_at(times_s)) / 2)
+
+
+def draw_pace(stops: Stops, speed_m_s: float, duration_s: float, rng: np.random.Generator) -> Pace:
+    """Draw the pace of a robot: it drives at full speed at the start, and stops again and again.
+
+    Parameters
+    ----------
+    stops : its stops.
+    speed_m_s : its full speed.
+    duration_s : the drive has stops until this time.
+    rng : random numbers.
+
+    Examples
+    --------
+    >>> stops = Stops(legs_s=6.0, stands_s=2.0, acceleration_m_s2=2.5)
+    >>> pace = draw_pace(stops, 0.26, 600.0, np.random.default_rng(0))
+    >>> round(float(pace.driven_s(np.array([600.0]))[0] / 600), 2)
+    0.76
+    """
+    ramp_s, knots = speed_m_s / stops.acceleration_m_s2, [(0.0, 1.0)]
+    time_s = rng.exponential(stops.legs_s)
+    while time_s < duration_s:
+        stands_s = rng.exponential(stops.stands_s)
+        knots += [(time_s, 1.0), (time_s + ramp_s, 0.0)]
+        knots += [(time_s + ramp_s + stands_s, 0.0), (time_s + 2 * ramp_s + stands_s, 1.0)]
+        time_s += 2 * ramp_s + stands_s + rng.exponential(stops.legs_s)
+    times_s, shares = np.array(knots).T
+    return Pace(times_s, shares)
+
 
 # Time constant of the acceleration of a robot.
 _START_S = 0.4

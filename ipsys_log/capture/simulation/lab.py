@@ -19,8 +19,7 @@ from ipsys_log.capture.simulation.calibration_points import (
 from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
 from ipsys_log.capture.simulation.floor import FloorView, prepare_view
-from ipsys_log.capture.simulation.pixel_shares import exposure_interval
-from ipsys_log.capture.simulation.render import encode_jpeg, render
+from ipsys_log.capture.simulation.render import encode_jpeg, exposure_interval, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,

@@ -13,8 +13,7 @@ import numpy as np
 
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose, cameras_seeing
 from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.differential_drive import Pose2d
-from ipsys_log.capture.simulation.robot_lab import RobotStart
+from ipsys_log.capture.simulation.robot_lab import Pose2d, RobotStart
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed

@@ -47,7 +47,7 @@ Lap = Callable[[Path], Spent]
 
 def replay_with_jobs(path: Path) -> Spent:
     """Detect with two local processes, without Dask."""
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.pipeline import replay
 
     begin_s = time.perf_counter()

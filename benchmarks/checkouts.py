@@ -29,7 +29,7 @@ def _replay(package: Path, log: Path, until: str | None) -> Turn:
         del sys.modules[name]
     sys.path.insert(0, str(package))
     from ipsys_log import __file__ as found
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.pipeline import replay
 
     assert Path(found).is_relative_to(package), found

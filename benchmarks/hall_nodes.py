@@ -42,8 +42,8 @@ from ipsys_log.capture.live_check import KnockMonitor
 from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.capture.simulation.settings import hall_settings, parse_grid
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log, write_message
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.stream import run
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session

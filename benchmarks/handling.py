@@ -29,7 +29,7 @@ from rounds import Contender, Row, Timing, Turn, race
 from scenes import CACHE, drawn, lengthened
 
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.workers import available_cores
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode, schema_data

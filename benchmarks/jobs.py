@@ -55,7 +55,7 @@ class _Turn(NamedTuple):
 
 
 def _detection(path: Path, jobs: int, one_core: bool = False) -> Turn:
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.pipeline import replay
 
     target = path.with_name(f"jobs_{jobs}.mcap")
@@ -116,8 +116,8 @@ def _compute_share(line: Connection, path: Path, number: int, processes: int) ->
 
 def _detection_plan(session: Session) -> PiecePlan:
     from ipsys_log.engine.graph import Task, plan_stage, writer_of
-    from ipsys_log.engine.options import Request
     from ipsys_log.engine.pieces import plan_pieces
+    from ipsys_log.engine.request import Request
 
     task = plan_stage(writer_of(MARKERS), session, Request().options(None), {})
     assert isinstance(task, Task)

@@ -27,7 +27,7 @@ from scenes import drawn
 from stream_server import Served, loops_of, serve
 
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage

@@ -10,7 +10,7 @@ from scenes import drawn
 
 from ipsys_log.capture.simulation.calibration_points import plan_points
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Message

@@ -38,7 +38,7 @@ _CAMERAS = 3
 
 
 def _whole(path: Path, jobs: int = 1, until: str | None = None) -> Turn:
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.pipeline import replay
 
     target = path.with_name("replayed.mcap")

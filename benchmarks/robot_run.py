@@ -28,7 +28,7 @@ from scenes import drawn
 
 from ipsys_log.app.report.robot_run import robot_run_json
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.live_runs.robot_runs.run import drive_robots
 from ipsys_log.live_runs.robot_runs.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab

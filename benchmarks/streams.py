@@ -28,7 +28,7 @@ from stream_costs import ROBOT, cost_rows, hand_over_rows
 from stream_server import free_ports, loops_of, serve
 
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Latency, Tracks

@@ -29,8 +29,8 @@ from ipsys_log.app.cli import main
 from ipsys_log.capture.simulation.lab import simulate
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.capture.video_files import open_video
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Measurement, Message

@@ -12,7 +12,7 @@ from typing import Any
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (

@@ -16,8 +16,8 @@ import pytest
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import Recording
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import append_messages, write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs import pipeline

@@ -12,7 +12,7 @@ import pytest
 
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CAMERA_MOVED, Event, Markers, ReferenceMarker

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message

@@ -23,7 +23,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
 from ipsys_log.app.cli.dialog import ask_places
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.live_runs.survey.checks import check_entry, withdrawal_of
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry

@@ -18,10 +18,10 @@ from ipsys_log.capture.live_plan import plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.engine.graph import STAGES, Task, plan_stage
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
 from ipsys_log.engine.pieces import plan_pieces
 from ipsys_log.engine.provenance import imported_inputs
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.engine.execute import run_stage
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.stream import in_threads, run
 from ipsys_log.errors import LogError
 from ipsys_log.live_runs.pipeline import replay

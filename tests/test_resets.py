@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session

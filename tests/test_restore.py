@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_message
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.live_runs.restore import finish_runs
 from ipsys_log.log.dataset import Session

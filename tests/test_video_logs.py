@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 from ipsys_log.capture import live_check
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from ipsys_log.live_runs.survey.live import LiveScene

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ipsys_log.api.log_export import Export, ExportOptions, channel_of_table, find_format
 from ipsys_log.api.sampled_track import SampledTrack, sample_track, time_in_ns
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.request import Progress
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session

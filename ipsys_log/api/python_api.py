@@ -15,9 +15,9 @@ from ipsys_log.api.log_export import Export
 from ipsys_log.api.opened_log import Listing, Log, StrPath
 from ipsys_log.api.sampled_track import SampledTrack
 from ipsys_log.calibration.calibrate import CalibrationResult, Failure
-from ipsys_log.engine.options import Progress, Request
 from ipsys_log.engine.output import choose_target
 from ipsys_log.engine.provenance import Outcome
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.player import Player
 from ipsys_log.live_runs.tracker import LiveTracks, Tracker
@@ -351,7 +351,7 @@ def load_model(path: StrPath | LogUrl, name: str | None = None) -> FittedModel |
     IpsysError
         The log has no such model.
     """
-    from ipsys_log.engine.select import fitted_in
+    from ipsys_log.engine.request import fitted_in
 
     with Session([parse_location(path)]) as session:
         model = fitted_in(session, name)[0]

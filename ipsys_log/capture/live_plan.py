@@ -11,8 +11,7 @@ from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.engine.execute import LiveRun, copy_messages
 from ipsys_log.engine.graph import Task, copy_model, is_of_model, stages_until
-from ipsys_log.engine.options import Request
-from ipsys_log.engine.select import wanted_models
+from ipsys_log.engine.request import Request, wanted_models
 from ipsys_log.engine.stream import WiredStage, wire
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig

@@ -17,8 +17,8 @@ from ipsys_log.engine.model_checks import (
     check_measurements,
     check_models,
 )
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.provenance import Outcome, check_run_name, find_run, imported_inputs, newest_run
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.states import made_by_newer, recorded_stages
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.log.contents import camera_of_topic

@@ -1,4 +1,4 @@
-"""Execution of one stage on a log: find its run, complete it, or compute and append it."""
+"""Execution of one stage on a log: find its run, complete it, or compute and append it. One BLAS thread."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from threadpoolctl import threadpool_limits
+
 from ipsys_log.engine.graph import Task, is_of_model, method_of, plan_stage
-from ipsys_log.engine.inputs import inputs
-from ipsys_log.engine.options import Progress, Request
+from ipsys_log.engine.model_checks import Remarks
 from ipsys_log.engine.output import append_messages, append_run, record_message
 from ipsys_log.engine.pieces import DividedRun, merge_pieces
 from ipsys_log.engine.provenance import (
@@ -21,9 +22,10 @@ from ipsys_log.engine.provenance import (
     free_name,
     read_channels,
 )
-from ipsys_log.engine.remarks import Remarks
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.engine.states import Recorded, recorded_stages
 from ipsys_log.engine.stream import WiredStage, in_threads, run, wire
+from ipsys_log.engine.view import inputs
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
@@ -310,3 +312,15 @@ def _stream(task: Task, session: Session, wired: WiredStage, progress: Progress)
             is_written[key] = (channel_of(*key), run_of_topic(message.topic)) in written
         if is_written[key]:
             yield message
+
+
+def one_blas_thread() -> threadpool_limits:
+    """Limit BLAS to one thread for a ``with`` block.
+
+    The matrices are small: more threads would only wait for one another. Their number also changes the last
+    bits of results, such as those of LAPACK's dpotri.
+    """
+    # A library that is loaded within the block would not be limited. scipy has a BLAS of its own.
+    import scipy.linalg  # noqa: F401
+
+    return threadpool_limits(1, user_api="blas")

@@ -10,9 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.provenance import Outcome, read_channels
-from ipsys_log.engine.select import fitted_in
+from ipsys_log.engine.request import Request, fitted_in
 from ipsys_log.engine.view import LogView
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
@@ -123,7 +122,7 @@ def plan_stage(
 
     Parameters
     ----------
-    options : of the user, by name, see :meth:`ipsys_log.engine.options.Request.options`.
+    options : of the user, by name, see :meth:`ipsys_log.engine.request.Request.options`.
     inputs : by derived channel, the run to read.
     rig, lenses : given by the user. They replace those of the log if they change the input of the stage.
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.engine.inputs import given_settings, left_out_frames
 from ipsys_log.engine.stream import WiredStage, derive
+from ipsys_log.engine.view import given_settings, left_out_frames
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session

@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ipsys_log.engine.blas import one_blas_thread
 from ipsys_log.engine.checks import check_earlier_runs, describe_changed_images
-from ipsys_log.engine.execute import compute_messages, run_stage
+from ipsys_log.engine.execute import compute_messages, one_blas_thread, run_stage
 from ipsys_log.engine.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.engine.model_checks import check_fits
-from ipsys_log.engine.options import Progress, Request
 from ipsys_log.engine.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.engine.provenance import Outcome, imported_inputs
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation

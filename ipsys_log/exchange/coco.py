@@ -20,7 +20,7 @@ from typing import IO, Any, NamedTuple
 import cv2
 import numpy as np
 
-from ipsys_log.engine.options import Progress
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Marker, Markers, Message, RawImage

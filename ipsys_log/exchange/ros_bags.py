@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ipsys_log.engine.options import Progress
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.exchange.bag_bounds import bound_reader, check_files, unpack_message
 from ipsys_log.log.contents import parse_foreign_camera

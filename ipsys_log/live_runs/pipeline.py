@@ -42,17 +42,15 @@ from ipsys_log.capture.live_check import KnockEvents
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import CameraSource, Recording, open_recording, write_each
-from ipsys_log.engine.blas import one_blas_thread
 from ipsys_log.engine.checks import check_inputs
-from ipsys_log.engine.continuation import continue_newest
-from ipsys_log.engine.execute import sign
+from ipsys_log.engine.execute import one_blas_thread, sign
 from ipsys_log.engine.graph import stages_until
-from ipsys_log.engine.options import Progress, Request
 from ipsys_log.engine.output import open_target
 from ipsys_log.engine.pieces import PieceWorkers
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.engine.replay import Replay
-from ipsys_log.engine.select import evaluated_models, wanted_models
+from ipsys_log.engine.request import Progress, Request, evaluated_models, wanted_models
+from ipsys_log.engine.states import continue_newest
 from ipsys_log.engine.stream import Route, WiredStage, in_threads, run
 from ipsys_log.engine.workers import LocalWorkers, check_jobs
 from ipsys_log.errors import IpsysError, LogError

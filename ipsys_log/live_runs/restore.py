@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ipsys_log.engine.graph import is_of_model, stages_until, writer_of
-from ipsys_log.engine.options import Progress, Request
 from ipsys_log.engine.provenance import Outcome, newest_run
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import CAMERA_POINTS, EVENTS, MARKERS, MODEL

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.output import check_copy, create_copy
+from ipsys_log.engine.request import Progress
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.output import check_copy, create_copy, write_message
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.hashing import ChannelHash

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.output import check_copy, create_copy, write_message
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.hashing import ChannelHash

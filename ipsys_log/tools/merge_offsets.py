@@ -9,8 +9,8 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading

@@ -8,11 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ipsys_log.engine.blas import one_blas_thread
-from ipsys_log.engine.execute import compute_messages
+from ipsys_log.engine.execute import compute_messages, one_blas_thread
 from ipsys_log.engine.graph import Task, input_runs, plan_stage, stage_named, writes
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.provenance import copied_from, is_whole, original_of, replaced_lenses
+from ipsys_log.engine.request import Progress
 from ipsys_log.engine.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode

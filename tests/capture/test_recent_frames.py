@@ -16,8 +16,8 @@ from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import check_independent_frames
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs import pipeline

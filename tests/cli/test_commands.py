@@ -14,7 +14,7 @@ import pytest
 import typer.main
 
 from ipsys_log.app.cli.app import app, present_words
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages.rig_file import check_rig, load_rig
@@ -260,7 +260,7 @@ def test_replay_that_is_done_imports_no_library_of_models(lab: Path) -> None:
     pipeline.replay([lab], Request(models=("poly",)), "fit")
     program = (
         "import sys; from pathlib import Path; from ipsys_log.live_runs import pipeline\n"
-        "from ipsys_log.engine.options import Request\n"
+        "from ipsys_log.engine.request import Request\n"
         f"(*_, fit) = pipeline.replay([Path({str(lab)!r})], Request(models=('poly',)), 'fit')\n"
         "print(fit.fresh, sorted({'sklearn', 'pandas', 'matplotlib'} & sys.modules.keys()))"
     )

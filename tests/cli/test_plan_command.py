@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Measurement, Message, Rig

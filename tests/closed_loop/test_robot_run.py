@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.exchange.data_frames import read_table
 from ipsys_log.live_runs.robot_runs.run import ROBOT_RUN, drive_robots
 from ipsys_log.live_runs.robot_runs.settings import PROGRAM, CameraFailure, RobotRun, choose_paths, read_lab

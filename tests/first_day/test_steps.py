@@ -14,8 +14,8 @@ from ipsys_log.app.first_day.lab_folder import LabFolder
 from ipsys_log.app.first_day.rig_entry import save_rig_entry
 from ipsys_log.app.first_day.steps import Status, read_progress
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.live_runs.survey.checks import withdrawal_of
 from ipsys_log.live_runs.survey.from_log import open_finished_log

@@ -19,8 +19,8 @@ from rich.console import Console
 
 import ipsys_log
 from ipsys_log.app.report.pack_scores import score_answer, score_tables
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session

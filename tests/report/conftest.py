@@ -13,8 +13,8 @@ import pytest
 from ipsys_log.app.report.accuracy import Accuracy, read_accuracy
 from ipsys_log.app.report.advice import advise
 from ipsys_log.app.report.findings import Findings, gather_findings
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session

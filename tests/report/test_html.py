@@ -11,8 +11,8 @@ import pytest
 
 from ipsys_log.app.report.accuracy import Accuracy, read_accuracy
 from ipsys_log.app.report.html import render_report
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Message, ReferencePoint, Suspect

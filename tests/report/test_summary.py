@@ -19,8 +19,8 @@ from ipsys_log.app.report.files import cross_validation_csv
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.summary import answer_json, answer_text
 from ipsys_log.app.report.tables import models_table
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, Suspect

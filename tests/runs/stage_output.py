@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.engine.graph import VERSIONS
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.provenance import fingerprint
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.models.table import CORNER_MODELS, MODELS

@@ -16,7 +16,7 @@ LATE = """
 import json
 from threadpoolctl import threadpool_info
 from ipsys_log.live_runs import pipeline
-from ipsys_log.engine.blas import one_blas_thread
+from ipsys_log.engine.execute import one_blas_thread
 with one_blas_thread():
     from ipsys_log.models.table import create
     create("kriging")

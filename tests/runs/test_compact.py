@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from ipsys_log.engine.graph import version_parameters
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import append_messages, write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.live_runs.survey.exclusion import exclude

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import append_messages
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay

@@ -11,7 +11,7 @@ import pytest
 
 from ipsys_log.engine import graph
 from ipsys_log.engine.graph import STAGES, stages_until
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RawImage, Tracks, channels

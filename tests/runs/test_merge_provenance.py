@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay

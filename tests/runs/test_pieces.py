@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.engine.blas import one_blas_thread
-from ipsys_log.engine.execute import compute_messages
+from ipsys_log.engine.execute import compute_messages, one_blas_thread
 from ipsys_log.engine.graph import Task, plan_stage, writer_of
 from ipsys_log.engine.output import write_log
 from ipsys_log.engine.pieces import (

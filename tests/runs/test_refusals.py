@@ -217,7 +217,7 @@ CASES: dict[str, Case] = {
 @pytest.fixture(scope="module")
 def model_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with the fitted model poly."""
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.pipeline import replay
 
     path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("model") / "model.mcap"))

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import ipsys_log
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import append_messages, write_log, write_messages
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session

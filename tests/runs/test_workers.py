@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.engine import pieces, workers
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.pieces import Piece, PieceFrames, PiecePlan, PieceRun
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.workers import LocalWorkers
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay

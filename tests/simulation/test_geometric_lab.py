@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.capture.simulation.cameras import Camera
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Marker, Markers, Message, Rig, Tracks

@@ -14,9 +14,8 @@ import pytest
 from ipsys_log.api import python_api as api
 from ipsys_log.api.python_api import load_model
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
-from ipsys_log.engine.select import evaluated_models
+from ipsys_log.engine.request import Request, evaluated_models
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.live_runs.survey.checks import check_entry
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry

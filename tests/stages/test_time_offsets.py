@@ -12,8 +12,8 @@ import pytest
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.lab import drive_start_ns, simulate
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.stream import run, wire
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode

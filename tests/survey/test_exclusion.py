@@ -25,7 +25,7 @@ from tests.conftest import Ipsys, data_section
 @pytest.fixture(scope="module")
 def fitted_log(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the small simulated session with a rigid model and its evaluation."""
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.pipeline import replay
 
     log = tmp_path_factory.mktemp("fitted") / "lab.mcap"
@@ -146,7 +146,7 @@ def test_excluded_points_are_not_faulty(tmp_path: Path) -> None:
 
 def test_measuring_page_shows_the_reason_of_an_exclusion(detected_lab: Path) -> None:
     from ipsys_log.app.web.app import history_json
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.from_log import open_finished_log
 
     name = measured(detected_lab)[0].id

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.survey.entry import TypedEntry
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from ipsys_log.live_runs.survey.sheet import name_columns

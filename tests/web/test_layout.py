@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from ipsys_log.app.web.server import serve
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from tests.conftest import Unmeasured
 from tests.web.contrast import low_contrasts

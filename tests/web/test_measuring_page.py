@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.app.web.server import serve
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.errors import LogError
 from ipsys_log.live_runs.survey.from_log import FinishedLog, open_finished_log
 from ipsys_log.live_runs.survey.scene import CameraView, StationaryInterval

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log import __version__
-from ipsys_log.engine.blas import one_blas_thread
+from ipsys_log.engine.execute import one_blas_thread
 from ipsys_log.engine.graph import VERSIONS
 from ipsys_log.engine.pieces import Piece, PiecePlan, PieceResult, PieceRun, check_versions, compute_piece
 from ipsys_log.engine.provenance import fingerprint

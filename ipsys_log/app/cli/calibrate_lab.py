@@ -40,7 +40,7 @@ from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_me
 from ipsys_log.app.cli.stages import derive
 
 if TYPE_CHECKING:
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.lab_calibration import LabCalibration
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Rig
@@ -250,7 +250,7 @@ def _record_drive(
     page : address and port of the measuring page; None: the terminal asks after the recording.
     force : overwrite an existing log.
     """
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
     from ipsys_log.live_runs.survey.live_calibration import LiveCalibration

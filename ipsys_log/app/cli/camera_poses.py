@@ -115,7 +115,7 @@ def _prepare_now(
 ) -> Lab:
     """Return the cameras to open, after all checks that are possible before they are opened."""
     from ipsys_log.capture.live_plan import check_start
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.errors import IpsysError
 
     if rig is None:

@@ -18,8 +18,8 @@ from rich.text import Text
 from ipsys_log.plain_text import plain_text
 
 if TYPE_CHECKING:
-    from ipsys_log.engine.options import Progress
     from ipsys_log.engine.provenance import Outcome
+    from ipsys_log.engine.request import Progress
 
 _DRAW_EVERY_S = 0.1
 # A stage with more runs than this gets a count instead of a list.

@@ -89,7 +89,7 @@ def measure(
     """
     ends = csv is not None or places or ab is not None
     allow_interrupt(None if ends else SAVED)
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.live_runs.survey.add_sheet import add_sheet, check_sheet

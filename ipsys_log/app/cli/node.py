@@ -16,7 +16,7 @@ from ipsys_log.plain_text import shell_words
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab
     from ipsys_log.capture.nodes.network import NodeNetwork
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
 
 NodeLog = Annotated[
     Path | None,
@@ -71,7 +71,7 @@ def node(
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.capture.nodes.centre import is_of_node
     from ipsys_log.capture.nodes.network import read_network
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ipsys_log.app.web.dashboard.state import Dashboard
     from ipsys_log.app.web.server import PageServer
     from ipsys_log.capture.lab import OpenLab
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.player import Player
     from ipsys_log.live_runs.survey.scene import MeasuringScene
     from ipsys_log.messages import Model
@@ -93,7 +93,7 @@ def plan_dashboard(
     import ipsys_log.app.web.dashboard.app  # noqa: F401
     from ipsys_log.app.web.server import check_port_free
     from ipsys_log.engine.graph import copy_model
-    from ipsys_log.engine.select import wanted_models
+    from ipsys_log.engine.request import wanted_models
 
     check_port_free(host, port, "--web-port")
     first, *_ = wanted_models(request)

@@ -66,7 +66,7 @@ def plan(
     """
     from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.engine.graph import writes
-    from ipsys_log.engine.select import copied_run
+    from ipsys_log.engine.request import copied_run
     from ipsys_log.live_runs.survey.floor_plan import plan_floor
     from ipsys_log.messages.channels import MODEL
     from ipsys_log.messages.rig_file import load_rig
@@ -105,7 +105,7 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
 
 def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
     """Check that a plan is possible, before a model is fitted."""
-    from ipsys_log.engine.select import copied_run
+    from ipsys_log.engine.request import copied_run
     from ipsys_log.engine.view import LogView
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session

@@ -39,7 +39,7 @@ from ipsys_log.app.cli.stream import StreamOptions, choose_streams, takes_stream
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.capture.multiplexer import LiveCameras
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.live import LiveScene
     from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Measurement, Model
@@ -105,7 +105,7 @@ def record(
     """
     allow_interrupt(SAVED if points_only else _NOT_BEGUN)
     from ipsys_log.capture.live_plan import check_start
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
@@ -195,7 +195,7 @@ def ready_to_measure(
     """
     import ipsys_log.models.closed_form  # noqa: F401 - the outliers need it, and no frame must wait for it
     from ipsys_log.capture.live_plan import check_model, check_start
-    from ipsys_log.engine.select import fitted_in
+    from ipsys_log.engine.request import fitted_in
     from ipsys_log.live_runs.survey.entry import check_references
     from ipsys_log.log.dataset import Session
 
@@ -280,7 +280,7 @@ def live(
     """
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log.capture.live_plan import check_start, shown_run
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
     from ipsys_log.sinks.streams.settings import check_streams, open_live_streams

@@ -83,7 +83,7 @@ def _init_simulated(path: Path) -> None:
 
 
 def _rig_of(log: LogLocation) -> str:
-    from ipsys_log.engine.select import rig_with_offsets
+    from ipsys_log.engine.request import rig_with_offsets
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.rig_file import rig_toml
 

@@ -14,7 +14,7 @@ from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_k
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.robot_runs.settings import RobotRun
 
 Paths = Annotated[
@@ -142,7 +142,7 @@ def drive(
     """
     allow_interrupt("stopped before the drive began; no log was written")
     from ipsys_log.capture.simulation.settings import LabSettings
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.robot_runs.settings import (
         PROGRAM,
         RobotRun,

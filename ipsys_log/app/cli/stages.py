@@ -31,8 +31,8 @@ from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.accuracy import Accuracy
-    from ipsys_log.engine.options import Request
     from ipsys_log.engine.provenance import Outcome
+    from ipsys_log.engine.request import Request
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.location import LogLocation
 
@@ -134,7 +134,7 @@ def build_command(
 
 def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
     """Return the options of a command as a request."""
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
 
     rig, calibration, lenses = given.pop("rig"), given.pop("calibration", None), given.pop("lenses", None)
     options = replay_options(**given)
@@ -148,7 +148,7 @@ def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
 
 def replay_options(**given: Any) -> dict[str, Any]:
     """Return the options of a command without rig and intrinsics as those of `python_api.replay`."""
-    from ipsys_log.engine.options import Request
+    from ipsys_log.engine.request import Request
     from ipsys_log.log.location import parse_location
     from ipsys_log.messages.rig_file import check_name
 

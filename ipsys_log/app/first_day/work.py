@@ -24,8 +24,7 @@ from ipsys_log.capture.live_plan import check_start, shown_run
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.simulated import show_board
 from ipsys_log.engine.graph import copy_model
-from ipsys_log.engine.options import Request
-from ipsys_log.engine.select import wanted_models
+from ipsys_log.engine.request import Request, wanted_models
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, read_lab

@@ -22,7 +22,7 @@ from ipsys_log.app.report.styles import camera_styles, shorten
 from ipsys_log.app.report.tables import advice_table, height_note, suspects_table, trajectory_table
 from ipsys_log.engine.graph import stages_until, writer_of, writes
 from ipsys_log.engine.provenance import newest_run
-from ipsys_log.engine.select import has_corners
+from ipsys_log.engine.request import has_corners
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session

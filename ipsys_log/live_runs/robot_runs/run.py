@@ -12,8 +12,8 @@ from ipsys_log.capture.lab import Lab, first_messages, open_lab
 from ipsys_log.capture.live_plan import check_start, shown_run
 from ipsys_log.capture.recorder import CameraSource
 from ipsys_log.capture.simulation.robot_lab import RobotLab, robot_rig
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.provenance import Outcome
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.live_runs.robot_runs.lockstep import LockstepCameras, SimulatedClock, SyncPoint
 from ipsys_log.live_runs.robot_runs.programs import Programs, start_programs

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.survey.blunders import MODEL_NAME
 from ipsys_log.live_runs.survey.checks import EntryCheck, check_entry
 from ipsys_log.live_runs.survey.entry import Entry, Fault, parse_entry

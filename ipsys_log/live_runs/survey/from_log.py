@@ -10,9 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ipsys_log.engine.options import Progress, Request
 from ipsys_log.engine.output import write_messages
 from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.engine.states import out_of_date_lines
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.live_runs.survey.entry import check_references

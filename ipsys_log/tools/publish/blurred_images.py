@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.output import write_log
 from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, RawImage

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.engine.options import Request
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from ipsys_log.engine.options import Progress
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session

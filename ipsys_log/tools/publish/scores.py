@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.engine.graph import writer_of, writes
-from ipsys_log.engine.options import Progress, Request
 from ipsys_log.engine.provenance import fingerprint
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ipsys_log.engine.options import Progress
 from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 
 from ipsys_log.engine.graph import writes
-from ipsys_log.engine.options import Progress
+from ipsys_log.engine.request import Progress
 from ipsys_log.engine.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.errors import IpsysError, UnreadError, os_error_text, reason_without
 from ipsys_log.log.bounds import BoundError

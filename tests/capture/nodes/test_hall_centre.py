@@ -19,8 +19,8 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.capture.nodes.node import Node
 from ipsys_log.capture.simulation.settings import hall_settings
-from ipsys_log.engine.options import Request
 from ipsys_log.engine.output import write_log
+from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session

@@ -15,7 +15,7 @@ from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig, rig_toml
-from ipsys_log.stages.detect.stock import marker_detector
+from ipsys_log.stages.detect.search import marker_detector
 
 # The beginning of the rig file of the simulated lab.
 _SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.

@@ -23,7 +23,7 @@ from ipsys_log.capture.simulation.floor import prepare_view
 from ipsys_log.capture.simulation.live_lab import POSES, board_film, image_index, lab_film, plan_live_lab
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CompressedImage, RigCamera
-from ipsys_log.stages.detect.stock import detect_markers
+from ipsys_log.stages.detect.search import detect_markers
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.markers import project_corners

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.stages.detect.changes import ChangeDetector
+from ipsys_log.stages.detect.motion import ChangeDetector
 from tests.stages.drawing import Array, Picture
 
 WIDTH, HEIGHT, BREADTH_PX = 640, 480, 80.0

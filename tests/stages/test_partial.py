@@ -19,7 +19,7 @@ from ipsys_log.messages import CompressedImage, Event, Marker
 from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.partial import fit_visible_edges
-from ipsys_log.stages.detect.stock import detect_markers
+from ipsys_log.stages.detect.search import detect_markers
 from ipsys_log.stages.detect.uneven_light import compare_pattern
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.markers import project_corners

@@ -134,7 +134,7 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
     from ipsys_log.messages import Rig
     from ipsys_log.messages.rig_checks import check_units
     from ipsys_log.messages.rig_file import check_rig, load_rig
-    from ipsys_log.stages.detect.stock import marker_detector
+    from ipsys_log.stages.detect.search import marker_detector
 
     if rig is not None:
         lab = load_rig(rig)

@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Rig
 from ipsys_log.messages.channels import RIG
-from ipsys_log.stages.detect.stock import detect_markers
+from ipsys_log.stages.detect.search import detect_markers
 from ipsys_log.statistics.alignment import Alignment
 from ipsys_log.vision.lenses import project
 

@@ -16,7 +16,7 @@ from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigMarker
 from ipsys_log.messages.rig_checks import check_units
 from ipsys_log.messages.rig_file import check_rig, example_toml, load_rig
-from ipsys_log.stages.detect.stock import marker_detector
+from ipsys_log.stages.detect.search import marker_detector
 
 _FILE = "lab.toml"
 _USUAL = ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 1.0, 0.0)

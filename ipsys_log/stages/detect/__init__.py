@@ -51,7 +51,7 @@ from ipsys_log.stages.detect.reports import (
     Reports,
     SeenSquares,
 )
-from ipsys_log.stages.detect.stock import detect_markers, marker_detector
+from ipsys_log.stages.detect.search import detect_markers, marker_detector
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.lenses import check_calibration, check_size, same_intrinsics

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages.arrays import Array, Grey
-from ipsys_log.stages.detect.prints import Prints
-from ipsys_log.stages.detect.profiles import MarkerView, Poses
+from ipsys_log.stages.detect.prints import MarkerView, Poses, Prints
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES
 from ipsys_log.vision.decode import levels_at
 from ipsys_log.vision.lenses import project
@@ -95,7 +94,7 @@ def edge_derivatives(prints: Prints, camera: Array, slopes: Array, late: Array, 
     Parameters
     ----------
     camera : (m, 3), camera positions in print coordinates.
-    slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.profiles.EdgePositions`.
+    slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.prints.EdgePositions`.
 
     Returns
     -------

@@ -31,8 +31,7 @@ from ipsys_log.stages.detect.adjustment import (
     sample_cells,
     solve,
 )
-from ipsys_log.stages.detect.prints import Prints, build_prints
-from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, MarkerView, Poses, measure
+from ipsys_log.stages.detect.prints import LEAST_CONTRAST, MarkerView, Poses, Prints, build_prints, measure
 from ipsys_log.stages.detect.uneven_light import count_contradictions
 
 _MOVED_FAR_PX = 1.0

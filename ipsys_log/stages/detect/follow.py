@@ -9,10 +9,9 @@ import numpy as np
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.messages.arrays import Array, Grey
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
-from ipsys_log.stages.detect.changes import ChangeDetector
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.misprints import Inspection, Misprints
-from ipsys_log.stages.detect.motion import LONG_S, Track, extend, predict, same_speed
+from ipsys_log.stages.detect.motion import LONG_S, ChangeDetector, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.partial import Rejection, fit_visible_edges, resembles
 from ipsys_log.stages.detect.search import (
     WHOLE,

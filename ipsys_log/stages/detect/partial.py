@@ -29,8 +29,15 @@ from ipsys_log.stages.detect.adjustment import (
     sample_cells,
     solve,
 )
-from ipsys_log.stages.detect.prints import Prints, build_prints
-from ipsys_log.stages.detect.profiles import EdgePositions, MarkerView, Poses, locate, read_profiles
+from ipsys_log.stages.detect.prints import (
+    EdgePositions,
+    MarkerView,
+    Poses,
+    Prints,
+    build_prints,
+    locate,
+    read_profiles,
+)
 from ipsys_log.stages.detect.search import count_wrong_cells
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages.arrays import Array
-from ipsys_log.stages.detect.prints import Prints
-from ipsys_log.stages.detect.profiles import BLURS_PX, LEAST_CONTRAST
+from ipsys_log.stages.detect.prints import BLURS_PX, LEAST_CONTRAST, Prints
 from ipsys_log.vision.markers import white_cells
 
 # Cells differ if their levels differ by this share of the print's contrast.

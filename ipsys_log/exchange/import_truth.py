@@ -20,8 +20,14 @@ from ipsys_log.exchange.ground_truth_files import (
     TruthUnits,
     read_truth_files,
 )
-from ipsys_log.exchange.truth_alignment import Residuals, TruthAlignment, align_truth, residuals_of
-from ipsys_log.exchange.truth_fit import ALIGNMENTS, RigidMotion
+from ipsys_log.exchange.truth_alignment import (
+    ALIGNMENTS,
+    Residuals,
+    RigidMotion,
+    TruthAlignment,
+    align_truth,
+    residuals_of,
+)
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, TRUTH_TOPIC, Message, Rig, Run, Track, Tracks
 from ipsys_log.messages.channels import RIG, TRACKS, TRUTH

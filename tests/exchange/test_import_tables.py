@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 import ipsys_log as ipsys_api
 from ipsys_log import IpsysError
 from ipsys_log.engine.output import write_log
-from ipsys_log.exchange.detection_tables import DetectionOptions, import_detections
-from ipsys_log.exchange.pair_tables import pair_messages, read_pairs
+from ipsys_log.exchange.import_tables import DetectionOptions, import_detections, pair_messages, read_pairs
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import RIG_TOPIC, CameraCalibration, Rig, RigCamera, RigMarker
 from ipsys_log.messages.channels import MODEL

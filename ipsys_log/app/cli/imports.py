@@ -288,7 +288,7 @@ def _import_detections(
     rig: Path | None,
     calibration: list[str] | None,
 ) -> None:
-    from ipsys_log.exchange.detection_tables import DetectionOptions, import_detections
+    from ipsys_log.exchange.import_tables import DetectionOptions, import_detections
     from ipsys_log.messages.rig_file import load_rig
 
     lab = load_rig(rig) if rig else None
@@ -309,7 +309,7 @@ def _import_detections(
 def _import_pairs(source: Path, output: Path, rig: Path | None) -> None:
     from ipsys_log.engine.output import write_log
     from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.pair_tables import pair_messages, read_pairs
+    from ipsys_log.exchange.import_tables import pair_messages, read_pairs
     from ipsys_log.messages.rig_file import load_rig
 
     if rig is None:

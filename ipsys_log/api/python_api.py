@@ -25,8 +25,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogUrl, parse_location
 from ipsys_log.log.log_files import find_logs
-from ipsys_log.messages import CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.tools.differences import Comparison

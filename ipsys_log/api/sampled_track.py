@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS, Channel
 from ipsys_log.models.tracking.track_messages import gather_rows, interpolate
 

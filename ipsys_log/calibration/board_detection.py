@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.chessboard import find_chessboard
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey
 
 # Sample positions along an edge, in squares from the corner, the same on both sides of the corner.
 _ALONG_EDGE = np.linspace(0.12, 0.5, 9)

@@ -13,7 +13,7 @@ from ipsys_log.calibration.board_size import check_charuco_size, check_chessboar
 from ipsys_log.calibration.chessboard import fits_in
 from ipsys_log.calibration.image_selection import ExcludedSighting
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Grey
+from ipsys_log.messages import Grey
 
 # Up to this number of images, the search is thorough. More images come from a video, which has enough images.
 _THOROUGH = 100

@@ -16,7 +16,7 @@ from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import find_board
 from ipsys_log.calibration.chessboard import find_largest_grid, fits_in
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey
 
 # Squares in a row of the tried boards, and the largest number of rows.
 _COLUMNS, _MOST_ROWS = range(3, 25), 25

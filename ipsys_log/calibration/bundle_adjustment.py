@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.lens_models import LensModel, project_points, project_with_slopes
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Usual bending of a board (sagitta over half of its size), and the residual that such a bending costs in the
 # prior. The corners of a few images outweigh it.

@@ -31,8 +31,7 @@ from ipsys_log.calibration.two_cameras import (
     two_cameras_fault,
 )
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 
 MIN_IMAGES = 5
 # Fewer images are refused even with --force.

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey
 
 # Least and largest number of rows of a grid.
 _LEAST, _MOST = 3, 100

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 _CELLS = (8, 6)
 # Width of a strip along each side of the image, as a share of the image. Distortion is largest there.

@@ -14,8 +14,7 @@ import numpy as np
 
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
-from ipsys_log.messages.arrays import Grey
+from ipsys_log.messages import CompressedImage, CompressedVideo, Grey, RawImage
 from ipsys_log.messages.rig_file import check_name
 from ipsys_log.vision.decode import check_encoded, read_image_size
 from ipsys_log.vision.video import Video

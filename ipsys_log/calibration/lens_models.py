@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Least depth of a point for a pinhole model, as a share of its distance. Other points have no image.
 _LEAST_DEPTH = 1e-3

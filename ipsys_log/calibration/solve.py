@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.bundle_adjustment import Corners, LensFit, adjust, residuals
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.uncertainty import group_similar_images, held_out_squares, lens_covariance
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Shares of the longer image side: from a field of view of 200 degrees to a telephoto lens.
 _FOCAL_SHARES = {

@@ -24,7 +24,7 @@ from ipsys_log.calibration.bundle_adjustment import (
 )
 from ipsys_log.calibration.lens_models import LENS_MODELS, LensModel
 from ipsys_log.calibration.solve import fitted_basis, loss_scale_px, rms_px, solve
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 Group = NDArray[np.bool_]
 

@@ -25,7 +25,7 @@ from ipsys_log.calibration.bundle_adjustment import (
 )
 from ipsys_log.calibration.image_selection import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms
 # are per square of the distance from the principal point.

@@ -21,8 +21,7 @@ import numpy as np
 
 from ipsys_log.capture.recorder import Source
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CAMERA_MOVED, CompressedImage, CompressedVideo, Markers, Message, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import CAMERA_MOVED, Array, CompressedImage, CompressedVideo, Markers, Message, Rig
 from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
 from ipsys_log.statistics.disagreement import OverlapStream

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, Mask
 from ipsys_log.statistics.path_pairs import (
     CommonInstants,
     PathPair,

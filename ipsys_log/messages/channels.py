@@ -6,19 +6,18 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from ipsys_log.messages.events import ClockEstimate, Event, Latency
+from ipsys_log.messages.events import ClockEstimate, Cut, Event, Latency, Merge, Run
 from ipsys_log.messages.images import (
+    CameraPoints,
     CompressedImage,
     CompressedVideo,
     ImageAnnotations,
+    Markers,
     RawImage,
     SkippedVideo,
 )
-from ipsys_log.messages.markers import CameraPoints, Markers
-from ipsys_log.messages.measurements import Measurement
-from ipsys_log.messages.models import Evaluation, Model
+from ipsys_log.messages.models import Evaluation, Measurement, Model
 from ipsys_log.messages.rig import CameraCalibration, Rig
-from ipsys_log.messages.runs import Cut, Merge, Run
 from ipsys_log.messages.tracks import FrameTransforms, Positions, RobotPath, Tracks, WheelCommand
 
 

@@ -1,4 +1,4 @@
-"""Messages: a payload on a topic, and the types of the fields of payloads."""
+"""Messages: a payload on a topic; the types of the fields of payloads, and of other arrays."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Types of arrays; docstrings give the shapes.
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+Times = NDArray[np.int64]
+Grey = NDArray[np.uint8]
+
+# Types of the fields of payloads.
 TimeNs = Annotated[int, "google.protobuf.Timestamp"]
 Floats = Annotated[NDArray[np.float64], (-1,)]
 Vec3 = Annotated[NDArray[np.float64], (3,)]

@@ -10,7 +10,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 
 def column_sigmas(values: NDArray[np.float64]) -> NDArray[np.float64]:

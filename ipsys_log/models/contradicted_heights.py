@@ -8,8 +8,7 @@ from statistics import median
 
 import numpy as np
 
-from ipsys_log.messages import Event, Model
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Event, Model
 from ipsys_log.messages.events import CONTRADICTED_HEIGHT
 from ipsys_log.units import NS_PER_S
 

@@ -13,7 +13,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.models.ann import column_sigmas
 
 _EPS = float(np.finfo(np.float64).eps)

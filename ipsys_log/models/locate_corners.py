@@ -14,8 +14,7 @@ from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Marker, Markers, Message, Model, Position, Positions, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Marker, Markers, Message, Model, Position, Positions, Rig
 from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
 from ipsys_log.units import NS_PER_S
 

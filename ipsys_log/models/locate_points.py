@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
 from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
 from ipsys_log.models.table import AppliedModel, reads_height
 from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M

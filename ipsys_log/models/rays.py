@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import intersect_height
 from ipsys_log.vision.poses import skew_matrices
 

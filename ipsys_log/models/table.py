@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.messages import CameraModel
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraModel
 from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # World points (n, 3) from camera points (n, 3) and the known heights (n,), for models that use them.
 Predict = Callable[[Array, Array], Array]

@@ -10,6 +10,7 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
+    Array,
     CameraCalibration,
     CameraPoint,
     CameraPoints,
@@ -20,7 +21,6 @@ from ipsys_log.messages import (
     Message,
     Rig,
 )
-from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
 from ipsys_log.messages.events import CALIBRATION_CONTRADICTED, TILTED_MARKER
 from ipsys_log.messages.stage import Plan, Stage, StageView

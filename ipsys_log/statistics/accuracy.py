@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Model, Pair, Residual
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraEvaluation, ErrorStatistics, Model, Pair, Residual
 from ipsys_log.models.table import AppliedModel, reads_height
 from ipsys_log.statistics.calibration_points import level_cameras
 from ipsys_log.statistics.camera_models import fit_camera_models, height_sigmas, tape_covariances

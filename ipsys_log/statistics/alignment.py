@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, CameraCalibration, Mask
 from ipsys_log.statistics.stationary import StationaryMarker
 from ipsys_log.vision.poses import PosedCamera, invert_pose, make_pose, transform
 

@@ -16,8 +16,7 @@ import numpy as np
 from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.payload import restore_joint
-from ipsys_log.messages import ClockEstimate, Model
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, ClockEstimate, Model
 from ipsys_log.statistics.floor_cameras import outline_view
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import PosedCamera

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraModel, Model, Noise, Pair, Parameter
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import (
     fit_cameras,

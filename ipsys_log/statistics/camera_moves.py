@@ -12,8 +12,7 @@ from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import read_columns
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Floor, Markers
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Floor, Markers
 from ipsys_log.messages.channels import MARKERS
 from ipsys_log.statistics.drift import (
     LEAST_SHIFT_M,

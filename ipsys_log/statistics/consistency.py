@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # With fewer calibration points of a camera, the usual error is unknown: the fit has ten terms, so each point
 # alone bends the model.

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from ipsys_log.messages import Floor
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, Floor, Mask
 from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.vision.lenses import in_image
 from ipsys_log.vision.poses import PosedCamera

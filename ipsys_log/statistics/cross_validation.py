@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages import LearningPoint, Measurement, Pair
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, LearningPoint, Measurement, Pair
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import (
     fit_cameras,

@@ -23,8 +23,7 @@ from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import read_columns
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Position, Positions, Rig
-from ipsys_log.messages.arrays import Array, Times
+from ipsys_log.messages import Array, Message, Position, Positions, Rig, Times
 from ipsys_log.messages.channels import POSITIONS, RIG
 from ipsys_log.units import MM_PER_M, NS_PER_S
 from ipsys_log.vision.time_brackets import bracket_times

@@ -20,7 +20,7 @@ import numpy as np
 
 from ipsys_log.calibration.joint.observations import lens_model_of
 from ipsys_log.calibration.lens_models import project_points, project_with_slopes
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.statistics.floor_cameras import shift_floor_map
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import marker_corners, pixel_slopes

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from ipsys_log.calibration.joint.locate import locate_markers
 from ipsys_log.calibration.joint.model import JointModel
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, Mask
 from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.statistics.plan import mean_length
 from ipsys_log.statistics.tape import TapeCovariances

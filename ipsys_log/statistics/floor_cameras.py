@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraCalibration, CameraModel, Floor, Model
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, CameraCalibration, CameraModel, Floor, Mask, Model
 from ipsys_log.models.closed_form import rigid_transform
 from ipsys_log.statistics.model_kinds import joint_models
 from ipsys_log.vision.lenses import check_calibration, in_image, undistort

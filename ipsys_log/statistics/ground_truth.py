@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import ErrorStatistics, Message, Tracks
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, ErrorStatistics, Indices, Message, Tracks
 from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.calibration_points import TimedPoints, still_interval
 from ipsys_log.statistics.tape import RiggedMeasurement

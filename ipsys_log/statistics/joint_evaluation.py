@@ -18,6 +18,7 @@ from ipsys_log.calibration.joint.observations import Observations, seeing_camera
 from ipsys_log.calibration.joint.payload import joint_payload, restore_joint
 from ipsys_log.errors import FitError
 from ipsys_log.messages import (
+    Array,
     CameraCalibration,
     CameraEvaluation,
     Evaluation,
@@ -27,7 +28,6 @@ from ipsys_log.messages import (
     Pair,
     Suspect,
 )
-from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import Progress, StageView
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows

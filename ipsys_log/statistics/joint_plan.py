@@ -18,7 +18,7 @@ from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.statistics.expected_error import (
     ExpectedErrors,
     choose_points,

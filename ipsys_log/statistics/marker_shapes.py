@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration, Marker
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, Marker
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.square_pose import is_convex

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration, Marker, Markers, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, Marker, Markers, Rig
 from ipsys_log.statistics.marker_shapes import (
     LEVEL_SCATTER,
     SHAPE_SIGMA,

@@ -10,8 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages import Evaluation, Model, Pair, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Evaluation, Model, Pair, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, MEASUREMENTS, RIG, Channel
 from ipsys_log.messages.stage import Progress, StageView, Step
 from ipsys_log.models.locate_points import LocatePoints

@@ -10,8 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.messages import Distance, Measurement, Rig, Suspect, WorldPoint
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Distance, Measurement, Rig, Suspect, WorldPoint
 from ipsys_log.statistics.consistency import FEWEST_POINTS, score, usual_covariances
 from ipsys_log.statistics.tape import (
     RiggedMeasurement,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, Mask
 from ipsys_log.vision.time_brackets import bracket_times
 
 # Longest gap for an interpolation, in usual intervals: one missing frame is no gap.

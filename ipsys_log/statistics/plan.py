@@ -15,8 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, CameraCalibration, Mask
 from ipsys_log.models.rays import directions
 from ipsys_log.models.uncertainty import Predict, Uncertainty, leverage_terms
 from ipsys_log.vision.lenses import in_image

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ipsys_log.messages import ErrorStatistics
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, ErrorStatistics
 
 # Both ends of the 95 % confidence interval.
 _LOW, _HIGH = 0.025, 0.975

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraPoint, CameraPoints, Measurement
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraPoint, CameraPoints, Measurement
 from ipsys_log.statistics.calibration_points import LONGEST_GAP_NS, STILL_ACROSS_M, STILL_ALONG_M, TimedPoints
 from ipsys_log.units import NS_PER_S
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Distance, Measurement, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Distance, Measurement, Rig
 from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import (
     ON_REFERENCE_SIGMA_M,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.statistics.path_pairs import PathPair, common_instants, gap_limit_s, search_offsets_s
 
 Span = tuple[float, float]

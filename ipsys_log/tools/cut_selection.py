@@ -16,8 +16,7 @@ from ipsys_log.engine.provenance import newest_run, with_inputs
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedVideo
-from ipsys_log.messages.arrays import Times
+from ipsys_log.messages import CompressedVideo, Times
 from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, MERGES, POSITIONS, RECORD, RIG
 from ipsys_log.tools.differences import marker_ids
 from ipsys_log.units import NS_PER_S, format_time

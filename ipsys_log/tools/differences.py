@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraPoints, Markers, Message, Positions, Tracks
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraPoints, Markers, Message, Positions, Tracks
 from ipsys_log.units import NS_PER_S, format_time
 
 

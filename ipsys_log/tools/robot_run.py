@@ -15,13 +15,13 @@ from ipsys_log.messages import (
     FINISHED,
     HOLDING,
     STOPPED,
+    Array,
     ErrorStatistics,
     RobotPath,
     Tracks,
     Waypoint,
     WheelCommand,
 )
-from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import COMMANDS, PATHS, TRACKS, TRUTH
 from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.calibration_points import TimedPoints

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import ErrorStatistics
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, ErrorStatistics
 from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, last_poses
 from ipsys_log.units import NS_PER_S

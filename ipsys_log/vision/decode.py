@@ -13,8 +13,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CompressedImage, RawImage
-from ipsys_log.messages.arrays import Grey
+from ipsys_log.messages import CompressedImage, Grey, RawImage
 from ipsys_log.vision.jpeg import cut_rows, decode_flawed, read_layout, remove_stray_bytes, whole_rows
 
 # An embedded thumbnail may come before the size of a JPEG.

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 
 
 def make_pose(rotation_matrix: Array, origin_m: Array) -> Array:

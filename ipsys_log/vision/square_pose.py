@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners
 

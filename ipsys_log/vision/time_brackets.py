@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipsys_log.messages.arrays import Array, Indices, Mask, Times
+from ipsys_log.messages import Array, Indices, Mask, Times
 
 
 class TimeBrackets(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 SIDES = ("left", "right")
 # A hand lays a marker onto a reference point with this standard deviation, along each axis.

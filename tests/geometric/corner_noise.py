@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.markers import marker_corners, pixel_slopes
 
 # Squared errors of rendered corners in units of the stated covariance: the part that is new in each frame,

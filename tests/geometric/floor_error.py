@@ -14,8 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration, Model
-from ipsys_log.messages.arrays import Array, Mask
+from ipsys_log.messages import Array, CameraCalibration, Mask, Model
 from ipsys_log.models.table import AppliedModel
 from ipsys_log.statistics.expected_error import WHOLE_PRINT
 from ipsys_log.statistics.floor_cameras import GRID_M, WALL_M

@@ -13,8 +13,7 @@ from ipsys_log.capture.simulation.cameras import Camera, aim_cameras, mount_came
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import transform

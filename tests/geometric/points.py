@@ -11,7 +11,7 @@ from ipsys_log.capture.simulation.calibration_points import SimulatedPose, overl
 from ipsys_log.capture.simulation.cameras import Camera, sees
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.markers import black_cells, marker_corners
 
 # Candidates of a point: the one farthest from the earlier points of its camera is selected. Poses are drawn

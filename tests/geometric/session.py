@@ -24,11 +24,11 @@ from ipsys_log.messages import (
     Message,
     Rig,
     Run,
+    Times,
     Track,
     Tracks,
     calibration_topic,
 )
-from ipsys_log.messages.arrays import Times
 from ipsys_log.messages.channels import MARKERS, RECORD
 from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, PlacedMarkers

@@ -13,7 +13,7 @@ from ipsys_log.capture.simulation.calibration_points import SimulatedPose
 from ipsys_log.capture.simulation.cameras import Camera, sees
 from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.capture.simulation.settings import Purpose, random_stream
-from ipsys_log.messages.arrays import Array, Times
+from ipsys_log.messages import Array, Times
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.poses import transform

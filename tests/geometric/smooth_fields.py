@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Grid nodes per correlation length. With 2, the variance of the field changes between the nodes by 1e-8 of
 # itself.

@@ -15,6 +15,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
     IMPORTED,
     RIG_TOPIC,
+    Array,
     Marker,
     Markers,
     Message,
@@ -23,7 +24,6 @@ from ipsys_log.messages import (
     Run,
     calibration_topic,
 )
-from ipsys_log.messages.arrays import Array
 from ipsys_log.messages.channels import MARKERS, RECORD
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project

@@ -17,8 +17,7 @@ from ipsys_log.calibration.image_selection import NEAR, advise, measure_coverage
 from ipsys_log.calibration.lens_models import LENS_MODELS, find_lens_model
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
-from ipsys_log.messages import CompressedImage, CompressedVideo
-from ipsys_log.messages.arrays import Grey
+from ipsys_log.messages import CompressedImage, CompressedVideo, Grey
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import decode_keyframe, is_keyframe
 

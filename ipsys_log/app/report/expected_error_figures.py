@@ -20,7 +20,7 @@ from ipsys_log.app.report.rows import means_cm
 from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.live_runs.survey.floor_plan import PlannedFloor, mesh
 from ipsys_log.live_runs.survey.lab_calibration import CameraResult, LabCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.statistics.joint_plan import PlannedDrive
 from ipsys_log.units import CM_PER_M, MM_PER_M
 

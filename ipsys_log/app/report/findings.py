@@ -16,8 +16,7 @@ from ipsys_log.engine.provenance import complete_runs, newest_run, replaced_lens
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION, MEASUREMENTS, MODEL
 from ipsys_log.models.table import is_known, reads_corners
 from ipsys_log.sinks.selection import rig_in_force

@@ -33,8 +33,7 @@ from ipsys_log.app.report.points_figure import draw_hulls, places_figure
 from ipsys_log.app.report.styles import NOTE, model_styles
 from ipsys_log.app.report.tables import height_note
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import ErrorStatistics
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, ErrorStatistics
 from ipsys_log.units import CM_PER_M
 
 # Largest factor by which the map is wider than the floor, to make room for arrows.

@@ -15,7 +15,7 @@ from ipsys_log.app.report.figures import has_legend, legend_label, name_cameras
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.floor_figure import draw_ground
 from ipsys_log.app.report.styles import NOTE, REST, TEST, camera_styles, shorten
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 
 def places_figure(findings: Findings) -> Figure:

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.calibration.board import Board, black_squares, board_markers
-from ipsys_log.messages import Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Rig
 from ipsys_log.units import MM_PER_M
 from ipsys_log.vision.markers import cell_outlines, white_cells
 

@@ -14,8 +14,7 @@ from matplotlib.patches import Ellipse
 from ipsys_log.app.report.figures import save_figure, style_axes
 from ipsys_log.app.report.styles import robot_colour, robot_line, shorten
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Track
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Track
 from ipsys_log.messages.channels import SMOOTHED_TRACKS, TRACKS
 from ipsys_log.sinks.video.floor_map import covariance_ellipse, enlargement
 

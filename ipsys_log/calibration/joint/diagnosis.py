@@ -10,7 +10,7 @@ from ipsys_log.calibration.joint.fit import Finding, JointFit
 from ipsys_log.calibration.joint.prior_sigmas import tape_contradiction
 from ipsys_log.calibration.joint.robust import limit_of, robust_loss
 from ipsys_log.calibration.joint.trajectories import Kind
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.units import CM_PER_M
 
 # A reading is wrong if its error exceeds this many standard deviations.

@@ -20,7 +20,7 @@ from ipsys_log.calibration.joint.solver import SHORT, ConvergenceError, Solution
 from ipsys_log.calibration.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
 from ipsys_log.calibration.joint.trajectories import Kind, Trajectories
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.poses import level_turns
 
 # The field of the floor reaches this far beyond the outermost place of a marker.

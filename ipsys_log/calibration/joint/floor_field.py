@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Distance of the knots as a share of the correlation length. A cubic spline follows the field to 1 % of
 # its standard deviation.

@@ -20,8 +20,7 @@ from ipsys_log.calibration.joint.observations import (
 )
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.messages import CameraCalibration, Markers, Measurement, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, Markers, Measurement, Rig
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.trilateration import (
     ON_REFERENCE_SIGMA_M,

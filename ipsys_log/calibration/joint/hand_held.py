@@ -24,7 +24,7 @@ from ipsys_log.calibration.joint.sighting_factors import make_sighting_factors
 from ipsys_log.calibration.joint.solver import solve
 from ipsys_log.calibration.joint.trajectories import Kind, Paths, Trajectories
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import undistort
 
 # Views of two cameras within this time show nearly the same pose of the body.

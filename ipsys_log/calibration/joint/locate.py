@@ -12,7 +12,7 @@ import numpy as np
 
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.lens_models import project_with_slopes
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import cross, level_turns

@@ -8,7 +8,7 @@ import numpy as np
 
 from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners
 from ipsys_log.calibration.joint.model import JointModel
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import pixel_slopes
 from ipsys_log.vision.poses import rotate

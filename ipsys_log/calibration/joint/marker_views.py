@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipsys_log.calibration.joint.observations import Body, Sightings
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.square_pose import solve_squares
 

@@ -11,8 +11,7 @@ from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.floor_field import FloorField
 from ipsys_log.calibration.joint.observations import lens_model_of
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 
 # Modes of the joint covariance below this share of a prior variance are left out.
 _LEAST_SHARE = 1e-10

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.normal import Factorisation, NormalEquations
 from ipsys_log.calibration.joint.trajectories import Kind
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 _CANDIDATES = 12
 # With so many candidates between the neighbours of the last time, three searches find one of 400 sightings.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky_banded, lapack
 from scipy.sparse import csr_array
 
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, Indices
 
 
 @dataclass(frozen=True, slots=True, eq=False)

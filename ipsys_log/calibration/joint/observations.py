@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.lens_models import LENS_MODELS, LensModel
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, CameraCalibration, Indices
 from ipsys_log.vision.markers import marker_corners
 
 # In a lab with so few cameras, a robot passes all of them within seconds.

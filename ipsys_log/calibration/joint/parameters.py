@@ -11,7 +11,7 @@ from ipsys_log.calibration.joint.floor_field import FloorField
 from ipsys_log.calibration.joint.observations import CameraPrior, Observations, lens_model_of
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.poses import rotate
 
 _FIXED = 0.0

@@ -14,7 +14,7 @@ from ipsys_log.calibration.joint.parameters import State
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.calibration.joint.start import PlacedCamera
 from ipsys_log.calibration.joint.trajectories import Paths, Trajectories
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, Indices
 
 # A longer time without sightings divides a path.
 _GAP_S = 1.0

@@ -14,8 +14,7 @@ import numpy as np
 from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.model import JointModel, build_models
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration, CameraModel, Model, Pair, Parameter
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, CameraModel, Model, Pair, Parameter
 from ipsys_log.vision.lenses import DISTORTION_MODELS
 from ipsys_log.vision.poses import rotation
 

@@ -11,7 +11,7 @@ from ipsys_log.calibration.joint.normal import NormalEquations
 from ipsys_log.calibration.joint.observations import CalibrationPoint, Tape
 from ipsys_log.calibration.joint.parameters import Layout, State
 from ipsys_log.calibration.joint.robust import limit_of, robust_loss
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, Indices
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from ipsys_log.calibration.joint.observations import Observations
 from ipsys_log.calibration.joint.parameters import Layout, State, tape_sigmas
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Uncertainty of the standard deviations of both scales, as that of their logarithm: the readings decide.
 _SPREAD = 3.0

@@ -13,7 +13,7 @@ from ipsys_log.calibration.joint.point_factors import PointFactors
 from ipsys_log.calibration.joint.robust import limit_of, robust_loss
 from ipsys_log.calibration.joint.sighting_factors import SightingFactors
 from ipsys_log.calibration.joint.trajectories import Kind, Trajectories
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

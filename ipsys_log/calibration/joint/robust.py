@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Up to this many standard deviations of chi2 above its mean, an error counts as normal.
 _NORMAL_SPREAD = 4.5

@@ -13,7 +13,7 @@ from ipsys_log.calibration.joint.parameters import Layout, State
 from ipsys_log.calibration.joint.robust import limit_of, robust_loss
 from ipsys_log.calibration.joint.trajectories import Kind, Placement, Trajectories
 from ipsys_log.calibration.lens_models import project_points, project_with_slopes
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, Indices
 from ipsys_log.vision.poses import cross
 
 # A covariance of lower rank has no noise in some directions, because a fitted pose removed it there.

@@ -14,7 +14,7 @@ from ipsys_log.calibration.joint.normal import Factorisation, NormalEquations
 from ipsys_log.calibration.joint.parameters import State
 from ipsys_log.calibration.joint.problem import Problem
 from ipsys_log.errors import FitError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 _FIRST_DAMPING = 1e-4
 # Limits of the damping.

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.joint.marker_views import MarkerViews, guess_distortion, view_markers
 from ipsys_log.calibration.joint.observations import Observations
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 
 # Errors of a place above this get less weight: that of a depth from the size of a marker.
 _USUAL_M = 0.05

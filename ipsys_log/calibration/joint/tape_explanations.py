@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.joint.observations import CalibrationPoint
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.vision.trilateration import SIDES, are_collinear, multilaterate, side_of
 
 # Twice the negative logarithm of the probability of a mistake: one point in a hundred has a wrong side, or

@@ -10,7 +10,7 @@ import numpy as np
 from ipsys_log.calibration.joint.floor_field import spline_weights
 from ipsys_log.calibration.joint.normal import NormalEquations
 from ipsys_log.calibration.joint.parameters import Layout, State
-from ipsys_log.messages.arrays import Array, Indices
+from ipsys_log.messages import Array, Indices
 from ipsys_log.vision.poses import left_jacobians, level_turns, rotate
 
 _POSE = 6

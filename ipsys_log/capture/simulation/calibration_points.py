@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.capture.simulation.cameras import Camera, sees
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Distance, Interval, Measurement, ReferencePoint
 from ipsys_log.vision.markers import PlacedMarker, black_cells, print_outline
 from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation
 

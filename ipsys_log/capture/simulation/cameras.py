@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.poses import look_down, transform
 

@@ -14,7 +14,7 @@ import numpy as np
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose, overlap
 from ipsys_log.capture.simulation.cameras import Camera
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,8 +30,7 @@ from ipsys_log.capture.simulation.lab import build_rig, moving_marker
 from ipsys_log.capture.simulation.render import Print, add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Rig, RigCamera, RigMarker
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Rig, RigCamera, RigMarker
 from ipsys_log.messages.rig_checks import dictionary_size
 from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.lenses import undistort

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.capture.simulation.floor import FIELD_PX, FloorView, Plane, to_light
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import (

@@ -9,8 +9,7 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.scene import Prediction
-from ipsys_log.messages import Measurement, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Measurement, Rig
 from ipsys_log.statistics.outliers import Blunder, possible_blunders
 from ipsys_log.statistics.tape import (
     RiggedMeasurement,

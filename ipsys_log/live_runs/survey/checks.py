@@ -20,8 +20,7 @@ from ipsys_log.live_runs.survey.blunders import (
 )
 from ipsys_log.live_runs.survey.entry import Entry, Fault, check_references, parse_baseline
 from ipsys_log.live_runs.survey.scene import MarkerObservations, Prediction, predict
-from ipsys_log.messages import Distance, Measurement, Model, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Distance, Measurement, Model, Rig
 from ipsys_log.statistics.calibration_points import active_baselines, active_measurements, withdrawals
 from ipsys_log.statistics.tape import (
     TapePoint,

@@ -11,8 +11,7 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.models.closed_form import rigid_transform
 from ipsys_log.models.table import AppliedModel, reads_corners

@@ -15,8 +15,7 @@ from ipsys_log.engine.graph import writes
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraCalibration, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, Channel
 from ipsys_log.messages.stage import Progress
 from ipsys_log.statistics.calibration_points import measured, split_ids

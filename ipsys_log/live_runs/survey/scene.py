@@ -10,8 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.statistics.consistency import FEWEST_POINTS

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # A clock error counts like an error of 1 mm for each of these times.
 _CLOCK_S = 0.001

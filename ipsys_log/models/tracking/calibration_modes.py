@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraModel, Model, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraModel, Model, Rig
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.tracking.bias_modes import (
     FLATTEST,

@@ -13,7 +13,7 @@ from math import exp
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 
 # Columns of the state: x, y, z in m and heading in rad; their rates; the acceleration in x and y.
 POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)

@@ -9,8 +9,7 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import Model, Position, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Model, Position, Rig
 from ipsys_log.models.tracking.bias_modes import BiasModes
 from ipsys_log.models.tracking.filter import UNKNOWN_RAD2, Sightings
 from ipsys_log.models.tracking.tracks import Robot

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.joint.locate import LevelPositions, locate_markers
 from ipsys_log.calibration.joint.model import JointModel
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.models.tracking.bias_modes import FLATTEST
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import Model, Position, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Model, Position, Rig
 from ipsys_log.models.tracking.filter import (
     MOTION,
     POSE,

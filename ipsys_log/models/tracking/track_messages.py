@@ -10,8 +10,7 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import STAMP_UNRELIABLE, Event, Message, Model, Rig, Track
-from ipsys_log.messages.arrays import Array, Indices, Times
+from ipsys_log.messages import STAMP_UNRELIABLE, Array, Event, Indices, Message, Model, Rig, Times, Track
 from ipsys_log.messages.channels import EVENTS, MODEL, POSITIONS, RIG, Channel
 from ipsys_log.messages.stage import StageView
 from ipsys_log.models.tracking.filter import MotionNoise, transition

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.models.tracking.filter import (
     Innovations,
     MotionNoise,

@@ -10,8 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.messages.message import Mat33
+from ipsys_log.messages import Mat33, Message, Track, Tracks
 from ipsys_log.units import NS_PER_S
 
 # A robot of 0.26 m/s moves 13 cm in this time.

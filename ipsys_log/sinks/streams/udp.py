@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Message, Tracks
-from ipsys_log.messages.message import Mat33
+from ipsys_log.messages import Mat33, Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipsys_log.messages import Rig, Track, Tracks
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Rig, Track, Tracks
 from ipsys_log.plain_text import plain_text
 from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
 from ipsys_log.units import NS_PER_S

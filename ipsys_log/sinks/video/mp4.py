@@ -15,8 +15,7 @@ from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Rig
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, Message, Rig
 from ipsys_log.messages.channels import MARKERS, TRACKS
 from ipsys_log.sinks.colours import robot_colour
 from ipsys_log.sinks.selection import choose_runs, fade_ns, rig_in_force

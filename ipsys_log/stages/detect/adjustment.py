@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey
 from ipsys_log.stages.detect.prints import MarkerView, Poses, Prints
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES
 from ipsys_log.vision.decode import levels_at

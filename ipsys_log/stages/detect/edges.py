@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, CameraCalibration, Grey
 from ipsys_log.stages.detect.adjustment import (
     Guess,
     MarkerFit,

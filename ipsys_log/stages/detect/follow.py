@@ -6,8 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, CameraCalibration, CompressedImage, Grey, RawImage
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.misprints import Inspection, Misprints

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey
 from ipsys_log.messages.events import MIRRORED, OTHER_PRINTS
 from ipsys_log.stages.detect.search import find_squares, read_cells
 

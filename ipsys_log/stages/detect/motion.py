@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import rotation, rotation_vector

@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array, Grey, Mask
+from ipsys_log.messages import Array, CameraCalibration, Grey, Mask
 from ipsys_log.stages.detect.adjustment import (
     Guess,
     MarkerFit,

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, CameraCalibration, Grey
 from ipsys_log.vision.decode import levels_at
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners, white_cells

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Marker
-from ipsys_log.messages.arrays import Array, Grey
+from ipsys_log.messages import Array, Grey, Marker
 from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES, count_contradictions
 from ipsys_log.vision.decode import levels_at
 from ipsys_log.vision.markers import white_cells

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array
 from ipsys_log.stages.detect.prints import BLURS_PX, LEAST_CONTRAST, Prints
 from ipsys_log.vision.markers import white_cells
 

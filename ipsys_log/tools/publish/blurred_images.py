@@ -15,8 +15,7 @@ from ipsys_log.engine.provenance import newest_run
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Message, RawImage
-from ipsys_log.messages.arrays import Grey
+from ipsys_log.messages import CompressedImage, Grey, Message, RawImage
 from ipsys_log.messages.channels import CHANNELS, CUTS, MARKERS
 from ipsys_log.plain_text import shell_words
 from ipsys_log.vision.decode import decode_grey

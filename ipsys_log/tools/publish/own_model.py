@@ -14,8 +14,7 @@ from ipsys_log.engine.request import Request
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraEvaluation, Evaluation, Model, Pair
-from ipsys_log.messages.arrays import Array
+from ipsys_log.messages import Array, CameraEvaluation, Evaluation, Model, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, TRUTH
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, HELD_OUT, error_rows

@@ -11,9 +11,7 @@ import cv2
 import numpy as np
 
 from ipsys_log.app.report.styles import camera_styles, robot_colour, shorten
-from ipsys_log.messages import CameraCalibration, Model, Rig, Track, Tracks
-from ipsys_log.messages.arrays import Array
-from ipsys_log.messages.message import Mat33
+from ipsys_log.messages import Array, CameraCalibration, Mat33, Model, Rig, Track, Tracks
 from ipsys_log.statistics.floor_cameras import outline_view, read_floor_cameras
 from ipsys_log.units import NS_PER_S
 

@@ -12,15 +12,18 @@ import numpy as np
 
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import BoardSighting
-from ipsys_log.calibration.board_search import NotSeenError, SearchResult, check_sizes, search_images
-from ipsys_log.calibration.bundle_adjustment import Corners, LensFit, camera_points
-from ipsys_log.calibration.image_selection import (
+from ipsys_log.calibration.board_search import (
     ExcludedSighting,
     ImageCoverage,
+    NotSeenError,
+    SearchResult,
     advise,
+    check_sizes,
     measure_coverage,
+    search_images,
     select_images,
 )
+from ipsys_log.calibration.bundle_adjustment import Corners, LensFit, camera_points
 from ipsys_log.calibration.images import ImageSource
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.solve import SolveResult, determines_focal_length, find_start, rms_px, solve

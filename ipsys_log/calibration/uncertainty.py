@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.calibration.board_search import NEAR, group_outlines
 from ipsys_log.calibration.bundle_adjustment import (
     USUAL_BENDING_M,
     Corners,
@@ -23,7 +24,6 @@ from ipsys_log.calibration.bundle_adjustment import (
     reduce_to_lens,
     residuals,
 )
-from ipsys_log.calibration.image_selection import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
 from ipsys_log.messages import Array
 

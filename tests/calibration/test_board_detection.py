@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.calibration.board_detection import BoardSighting, find_board
-from ipsys_log.calibration.board_search import search_images
-from ipsys_log.calibration.image_selection import MAX_IMAGES, select_images
+from ipsys_log.calibration.board_search import MAX_IMAGES, search_images, select_images
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import Array, chessboard_pattern, pixels_of, random_pose, render
 

@@ -13,7 +13,7 @@ import simplejpeg
 
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting, view_board
-from ipsys_log.calibration.image_selection import NEAR, advise, measure_coverage
+from ipsys_log.calibration.board_search import NEAR, advise, measure_coverage
 from ipsys_log.calibration.lens_models import LENS_MODELS, find_lens_model
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.live_runs.survey.entry import Fault

@@ -9,8 +9,8 @@ from typing import Any
 
 from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, counted, mm
+from ipsys_log.calibration.board_search import ExcludedSighting
 from ipsys_log.calibration.calibrate import CalibrationResult
-from ipsys_log.calibration.image_selection import ExcludedSighting
 
 _SHOWN_DROPPED = 6
 

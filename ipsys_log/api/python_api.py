@@ -285,7 +285,7 @@ def score(
     >>> score("dataset").as_stated  # doctest: +SKIP
     True
     """
-    from ipsys_log.tools.publish.own_model import OwnModel
+    from ipsys_log.tools.publish.scoring import OwnModel
     from ipsys_log.tools.publish.scoring import score as score_pack
 
     of_user = [OwnModel(name, create) for name, create in (own or {}).items()]

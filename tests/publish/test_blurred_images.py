@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import IMAGES, MARKERS
-from ipsys_log.tools.publish.blurred_images import blur_image
+from ipsys_log.tools.publish.kept_contents import blur_image
 from ipsys_log.tools.publish.packing import pack
 from ipsys_log.tools.publish.scoring import score
 from ipsys_log.vision.decode import decode_grey

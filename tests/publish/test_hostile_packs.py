@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.tools.publish.members import MAX_MEMBERS, check_member_name
+from ipsys_log.tools.publish.manifest import MAX_MEMBERS, check_member_name
 from ipsys_log.tools.publish.opened_pack import copy_pack
 from tests.conftest import Ipsys
 from tests.publish.packs import change_manifest, change_scores, contents, sign

@@ -59,7 +59,7 @@ def test_download_larger_than_the_disk_ends(
     address: str, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pieces = iter([bytes(1000)] * 1000)
-    monkeypatch.setattr("ipsys_log.tools.publish.remote_pack._download", lambda source: pieces)
+    monkeypatch.setattr("ipsys_log.tools.publish.opened_pack._download", lambda source: pieces)
     monkeypatch.setattr("shutil.disk_usage", lambda folder: type("Usage", (), {"free": 10_000}))
     with pytest.raises(IpsysError, match=r"has more than 5.0 kB, half of the free space"):
         ipsys_log.score(f"{address}/dataset.zip")

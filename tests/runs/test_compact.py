@@ -29,10 +29,9 @@ from ipsys_log.messages import (
     Run,
 )
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.tools.compact import compact
+from ipsys_log.tools.compact import compact, superseded_runs
 from ipsys_log.tools.cut import cut
 from ipsys_log.tools.cut_selection import CutOptions
-from ipsys_log.tools.superseded import superseded_runs
 from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys
 from tests.shared_files import make_once

@@ -31,7 +31,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.tools.soundness.check import check_logs
 from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
-from ipsys_log.tools.soundness.times import MessageTimes
+from ipsys_log.tools.soundness.references import MessageTimes
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import scale_intrinsics
 from tests.changed_logs import rewrite

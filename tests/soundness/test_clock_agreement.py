@@ -12,7 +12,7 @@ from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ClockEstimate, Message, clock_topic
-from ipsys_log.tools.soundness.times import check_clocks
+from ipsys_log.tools.soundness.references import check_clocks
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab

@@ -17,8 +17,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation, LogState
 from ipsys_log.log.log_files import read_log_state
 from ipsys_log.messages.channels import EVALUATION, EVENTS, MEASUREMENTS
+from ipsys_log.tools.compact import outdated_runs
 from ipsys_log.tools.recording import find_gaps
-from ipsys_log.tools.superseded import outdated_runs
 from ipsys_log.units import NS_PER_S
 
 COLUMNS: Columns = {

@@ -259,7 +259,7 @@ def nominal_lenses(
     IpsysError
         A text is not a number, or names no camera; or the size of an image is unknown.
     """
-    from ipsys_log.calibration.nominal import nominal_intrinsics
+    from ipsys_log.calibration.lens_models import nominal_intrinsics
     from ipsys_log.errors import IpsysError
 
     lenses: dict[str, CameraCalibration] = {}

@@ -191,8 +191,8 @@ def merge(
         ipsys merge a.mcap b.mcap c.mcap -o day.mcap --offset b=0.012 --offset c=-1
     """
     from ipsys_log.engine.output import check_copy
+    from ipsys_log.tools.merge import choose_offsets
     from ipsys_log.tools.merge import merge as merge_logs
-    from ipsys_log.tools.merge_offsets import choose_offsets
 
     check_copy(logs, output, overwrite)
     with progress_bar() as progress:

@@ -22,7 +22,7 @@ from ipsys_log.models.table import is_known, reads_corners
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.statistics.accuracy import POOLED
 from ipsys_log.statistics.calibration_points import measured, split_ids
-from ipsys_log.tools.soundness.times import check_clocks
+from ipsys_log.tools.soundness.references import check_clocks
 
 if TYPE_CHECKING:
     from ipsys_log.statistics.calibrated_cameras import CalibratedCamera

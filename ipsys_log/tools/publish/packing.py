@@ -1,4 +1,4 @@
-"""Packing of logs: a folder or a zip archive with logs, rig, card, checksums and expected scores."""
+"""Packing of logs: a folder or a zip archive with logs, rig, card (README), checksums and expected scores."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ipsys_log.engine.request import Progress
+from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
 from ipsys_log.messages.channels import RIG
 from ipsys_log.messages.rig_file import hide_passwords, rig_toml
+from ipsys_log.statistics.calibration_points import measured
 from ipsys_log.tools.cut import cut
-from ipsys_log.tools.publish.blurred_images import blur_log, marker_corners
-from ipsys_log.tools.publish.card import Card, read_card
-from ipsys_log.tools.publish.kept_channels import cut_options, kept_channels
-from ipsys_log.tools.publish.manifest import build_manifest, json_text
-from ipsys_log.tools.publish.members import (
+from ipsys_log.tools.publish.card import Card, escape_markdown, read_card
+from ipsys_log.tools.publish.kept_contents import blur_log, cut_options, kept_channels, marker_corners
+from ipsys_log.tools.publish.manifest import (
     CHECKSUMS,
     LOGS,
     MANIFEST,
@@ -32,14 +32,120 @@ from ipsys_log.tools.publish.members import (
     RIG_FILE,
     SCORES,
     Member,
+    build_manifest,
     check_unique,
     checksum_lines,
     describe_member,
     free_member_name,
+    json_text,
 )
-from ipsys_log.tools.publish.readme import readme_text
 from ipsys_log.tools.publish.scores import SCORE_FIELDS, Score, compute_scores, scores_json
-from ipsys_log.units import NS_PER_S
+from ipsys_log.units import NS_PER_S, format_bytes, format_time
+
+_CARD_ROWS: dict[str, Callable[[Card], str]] = {
+    "Authors": lambda card: ", ".join(card.authors),
+    "Licence": lambda card: card.licence,
+    "Version": lambda card: card.version,
+    "Published": lambda card: card.published,
+    "Place": lambda card: card.place,
+    "Hardware": lambda card: card.hardware,
+    "Marker sizes": lambda card: card.marker_sizes,
+    "Measurement": lambda card: card.measured,
+    "To cite": lambda card: card.citation,
+    "Web address": lambda card: card.url,
+}
+_SCHEMES = {"cross_validation": "cross-validated", "held_out": "held-out points"}
+_REFERENCES = {"tape": "tape", "truth": "ground truth"}
+
+
+def readme_text(
+    card: Card, session: Session, rig: Rig, scores: Sequence[Score], blurred: bool = False
+) -> str:
+    """Return the dataset card in Markdown.
+
+    All texts of the author and all names from the logs are escaped.
+
+    Parameters
+    ----------
+    session : the packed logs.
+    rig : the newest rig of the logs.
+    blurred : True if the images are blurred outside of the markers.
+    """
+    lines = [f"# {escape_markdown(card.title)}", ""]
+    if card.description:
+        lines += [escape_markdown(card.description), ""]
+    texts = ((name, escape_markdown(text_of(card))) for name, text_of in _CARD_ROWS.items())
+    lines += _table(("", ""), ((name, text) for name, text in texts if text))
+    lines += ["", "## Content", "", *_table(("file", "size", "messages", "start (UTC)"), _log_rows(session))]
+    lines += ["", *_facts(session, rig, blurred)]
+    lines += ["", "## Expected scores", "", *_score_lines(scores)]
+    lines += ["", "## Check of the scores", "", *_CHECK]
+    return "\n".join(lines) + "\n"
+
+
+_CHECK = (
+    "    ipsys score .",
+    "",
+    "The command checks all files, runs the pipeline again in a temporary copy, and compares the scores. For",
+    "your own model, a class with `fit(points_m, world_m)` and `predict(points_m)`:",
+    "",
+    "    ipsys score . --model mine.py:Estimator",
+)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table; the cells are Markdown."""
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+
+
+def _log_rows(session: Session) -> Iterator[tuple[str, str, str, str]]:
+    for reader in session.readers:
+        start = "" if reader.start_ns is None else format_time(reader.start_ns)
+        size = format_bytes(reader.size)
+        yield f"{LOGS}/{reader.path.name}", size, str(reader.message_count), start
+
+
+def _facts(session: Session, rig: Rig, blurred: bool) -> list[str]:
+    """Return what the logs and their rig contain."""
+    seconds = (session.end_ns - session.start_ns) / NS_PER_S
+    cameras = sorted({*session.images, *session.calibrations, *(camera.name for camera in rig.cameras)})
+    lengths = sorted({rig.marker_length_m, *(rig.length_of(marker.id) for marker in rig.markers)})
+    rows = (
+        ("Duration", f"{seconds:.0f} s"),
+        ("Cameras", ", ".join(cameras)),
+        ("Images", _describe_images(bool(session.images), blurred)),
+        ("Calibration points", str(len(measured(LogView(session))))),
+        ("Marker dictionary", rig.dictionary),
+        ("Marker side", ", ".join(f"{length_m * 100:g} cm" for length_m in lengths)),
+    )
+    lines = _table(("", ""), ((name, escape_markdown(text)) for name, text in rows))
+    return [*lines, "", f"`{RIG_FILE}` is the rig. The logs contain it too."]
+
+
+def _describe_images(present: bool, blurred: bool) -> str:
+    if not present:
+        return "no, only detected markers or camera points"
+    return "blurred outside of the markers, in grey" if blurred else "yes"
+
+
+def _score_lines(scores: Sequence[Score]) -> list[str]:
+    rows = (
+        (
+            escape_markdown(score.model),
+            f"{_SCHEMES.get(score.scheme, score.scheme)}, {score.dimensions.upper()}",
+            _REFERENCES.get(score.against, score.against),
+            str(score.points),
+            *(f"{value_mm:.3f}" for value_mm in score.figures),
+        )
+        for score in scores
+    )
+    head = ("model", "errors", "against", "points", "mean", "median", "p95", "RMSE")
+    return [
+        f"In mm, over all cameras. `{SCORES}` has all digits, and the tolerances.",
+        "",
+        *_table(head, rows),
+    ]
+
 
 # Times of members in an archive; with the clock of the machine, equal packs would differ.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)

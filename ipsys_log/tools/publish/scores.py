@@ -17,8 +17,7 @@ from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.models.table import MODEL_PARTS, is_known
 from ipsys_log.plain_text import plain_text
 from ipsys_log.statistics.accuracy import POOLED, count_repeats, root_mean_square_m
-from ipsys_log.tools.publish.manifest import parse_json
-from ipsys_log.tools.publish.members import SCORES
+from ipsys_log.tools.publish.manifest import SCORES, parse_json
 
 _MM_PER_M = 1000.0
 # Six decimals of a mm are more than any two environments agree on.

@@ -29,12 +29,13 @@ from ipsys_log.tools.soundness.channels import (
 )
 from ipsys_log.tools.soundness.finding import BROKEN, NOTE, REMARK, UNREAD, LogCheck, LogFinding
 from ipsys_log.tools.soundness.references import (
+    MessageTimes,
     check_cameras,
+    check_clocks,
     check_intrinsics,
     check_measurements,
     check_rigs,
 )
-from ipsys_log.tools.soundness.times import MessageTimes, check_clocks
 
 _BYTES_PER_MB = 1_000_000
 # Logs without images are smaller: their markers are the start of all later stages.

@@ -50,7 +50,7 @@ def test_package_has_the_names_of_the_api() -> None:
 
 
 def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
-    from ipsys_log.live_runs.tracker import Tracker
+    from ipsys_log.live_runs.player import Tracker
 
     tracker = Tracker(lambda _: [])
     tracks = [Message("/runs/poly/tracks", n, n, Tracks(n, ())) for n in range(1000)]

@@ -19,8 +19,7 @@ from ipsys_log.engine.output import choose_target
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.engine.request import Progress, Request
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.player import Player
-from ipsys_log.live_runs.tracker import LiveTracks, Tracker
+from ipsys_log.live_runs.player import LiveTracks, Player, Tracker
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogUrl, parse_location

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.robot_runs.ports import Ports, find_ports
+from ipsys_log.live_runs.robot_runs.settings import Ports, find_ports
 from ipsys_log.live_runs.robot_runs.wheels import Wheels
 
 

@@ -17,7 +17,7 @@ from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.engine.output import write_messages
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
-from ipsys_log.live_runs.survey.exclusion import place_in_log
+from ipsys_log.live_runs.survey.from_log import place_in_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Distance, Evaluation, Measurement, Suspect

@@ -18,7 +18,7 @@ from ipsys_log.engine.output import append_messages, write_log
 from ipsys_log.engine.request import Request
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.live_runs.pipeline import replay
-from ipsys_log.live_runs.survey.exclusion import exclude
+from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraPoints,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.survey.exclusion import exclude
+from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Evaluation, Measurement, Message, Model

@@ -92,8 +92,8 @@ def measure(
     from ipsys_log.engine.request import Request
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed
-    from ipsys_log.live_runs.survey.add_sheet import add_sheet, check_sheet
     from ipsys_log.live_runs.survey.from_log import open_finished_log
+    from ipsys_log.live_runs.survey.sheet import add_sheet, check_sheet
 
     if sum((terminal, csv is not None, places, ab is not None)) > 1:
         raise IpsysError("--terminal, --csv, --places and --ab cannot be used together; give one of them")
@@ -166,9 +166,9 @@ def exclude(
         ipsys exclude calibration.mcap p007 p012 --reason "the tape sagged"
         ipsys exclude calibration.mcap p012 --readmit --reason "tape was straight"
     """
-    from ipsys_log.live_runs.survey import exclusion
+    from ipsys_log.live_runs.survey import from_log
 
-    result = (exclusion.readmit if readmit else exclusion.exclude)(log, points, reason)
+    result = (from_log.readmit if readmit else from_log.exclude)(log, points, reason)
     done, before = ("re-admitted", "not excluded") if readmit else ("excluded", "excluded already")
     for name, text in result.unchanged.items():
         warn(f"{name} is {before}{f': {text}' if text else ''}")

@@ -10,7 +10,7 @@ import numpy as np
 
 from ipsys_log.app.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.survey.exclusion import exclude
+from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import find_new_ids
 from ipsys_log.messages import Measurement

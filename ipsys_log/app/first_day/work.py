@@ -29,10 +29,10 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, read_lab
 from ipsys_log.live_runs import pipeline
-from ipsys_log.live_runs.survey.add_sheet import add_sheet, check_sheet
 from ipsys_log.live_runs.survey.entry import check_references
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from ipsys_log.live_runs.survey.live import LiveScene
+from ipsys_log.live_runs.survey.sheet import add_sheet, check_sheet
 from ipsys_log.messages import (
     CompressedImage,
     CompressedVideo,

@@ -15,11 +15,16 @@ from ipsys_log.capture.simulation.robot_lab import RobotLab, robot_rig
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
-from ipsys_log.live_runs.robot_runs.lockstep import LockstepCameras, SimulatedClock, SyncPoint
-from ipsys_log.live_runs.robot_runs.programs import Programs, start_programs
-from ipsys_log.live_runs.robot_runs.real_time import Driver, RobotCameras, add_truth
+from ipsys_log.live_runs.robot_runs.robot_cameras import (
+    Driver,
+    LockstepCameras,
+    RobotCameras,
+    SimulatedClock,
+    SyncPoint,
+    add_truth,
+)
 from ipsys_log.live_runs.robot_runs.settings import RobotRun, start_poses
-from ipsys_log.live_runs.robot_runs.steering import Steering
+from ipsys_log.live_runs.robot_runs.steering import Programs, Steering, start_programs
 from ipsys_log.live_runs.robot_runs.wheels import Wheels
 from ipsys_log.messages import EVENTS_TOPIC, PATHS_TOPIC, CameraCalibration, Event, Message, Rig, RobotPath
 from ipsys_log.messages.channels import TRACKS

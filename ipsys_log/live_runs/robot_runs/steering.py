@@ -1,17 +1,168 @@
-"""The exchange with the robots at each tick: positions, the relay, commands, and the motion of the robots."""
+"""Control of robots: their programs and relays, one process each, and the exchange with them at each tick."""
 
 from __future__ import annotations
 
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 from ipsys_log.capture.simulation.robot_lab import RobotLab
-from ipsys_log.live_runs.robot_runs.programs import Programs
-from ipsys_log.live_runs.robot_runs.settings import RobotRun
+from ipsys_log.errors import IpsysError
+from ipsys_log.live_runs.robot_runs.settings import Ports, RobotRun
 from ipsys_log.live_runs.robot_runs.wheels import Wheels
-from ipsys_log.messages import FINISHED, HOLDING, STOPPED, WheelCommand
+from ipsys_log.messages import FINISHED, HOLDING, STOPPED, Waypoint, WheelCommand
 from ipsys_log.units import NS_PER_S
+
+_END_S = 5.0
+# A relay does little work: ten minutes are enough on any machine.
+_TURN_S, _RELAY_TURNS = 0.1, 6000
+_LOOPBACK = "127.0.0.1"
+
+
+class Programs:
+    """The running programs of the robots.
+
+    Parameters
+    ----------
+    relays : the relays by robot; empty without relays.
+    """
+
+    def __init__(
+        self, path: Path, processes: Mapping[str, subprocess.Popen[bytes]], relays: Mapping[str, RelayLink]
+    ) -> None:
+        self.relays = relays
+        self._path, self._processes = path, processes
+
+    def check(self) -> None:
+        """Check that all programs still run.
+
+        Raises
+        ------
+        IpsysError
+            A program has ended.
+        """
+        for robot, process in self._processes.items():
+            if process.poll() is not None:
+                raise IpsysError(
+                    f"{robot}: its program {self._path} has ended with exit code {process.returncode}; its "
+                    "messages are above"
+                )
+
+
+class RelayLink:
+    """The connection to a relay with the clock of the simulator."""
+
+    def __init__(self, port: int, process: subprocess.Popen[bytes]) -> None:
+        self._address, self._process = (_LOOPBACK, port), process
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((_LOOPBACK, 0))
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def tick(self, number: int, time_ns: int, positions: int) -> int:
+        """Send the time, and the number of positions so far; return the number that the relay has sent on.
+
+        Raises
+        ------
+        IpsysError
+            The relay has ended or does not answer.
+        """
+        fields = {"relay_tick": number, "time_ns": time_ns, "positions": positions}
+        self._socket.sendto(json.dumps(fields).encode(), self._address)
+        # In turns: time in which this program is suspended does not count.
+        for _ in range(_RELAY_TURNS):
+            if self._process.poll() is not None:
+                break
+            if select.select([self._socket], [], [], _TURN_S)[0]:
+                answer = json.loads(self._socket.recv(2048))
+                if answer["relay_tick"] == number:
+                    return int(answer["forwarded"])
+        raise IpsysError("the relay of the datagrams does not answer; start the run again")
+
+
+@contextmanager
+def start_programs(run: RobotRun, wheels: str, ports: Ports) -> Iterator[Programs]:
+    """Start a program for each robot, and a relay if the run has one; they end after the block.
+
+    Parameters
+    ----------
+    wheels : the address of the wheels.
+    """
+    with ExitStack() as stack:
+        relays: dict[str, RelayLink] = {}
+        processes: dict[str, subprocess.Popen[bytes]] = {}
+        for number, (robot, path) in enumerate(run.paths.items()):
+            if run.has_relay:
+                relays[robot] = _start_relay(run, robot, number, ports, stack)
+            address = f"{run.over}://{_LOOPBACK}:{ports.positions[number]}"
+            processes[robot] = _start(_command(run.program, robot, address, wheels, path), stack)
+        yield Programs(run.program, processes, relays)
+
+
+def _command(
+    program: Path, robot: str, positions: str, wheels: str, path: Sequence[Waypoint]
+) -> Sequence[str]:
+    runs = [sys.executable, str(program)] if program.suffix == ".py" else [str(program.absolute())]
+    places = " ".join(f"{place.x_m:g},{place.y_m:g}" for place in path)
+    return [*runs, "--robot", robot, "--positions", positions, "--wheels", wheels, "--path", places]
+
+
+def _start_relay(run: RobotRun, robot: str, number: int, ports: Ports, stack: ExitStack) -> RelayLink:
+    port, target = ports.relays[number], ports.positions[number]
+    command = [
+        sys.executable,
+        "-m",
+        "ipsys_log.live_runs.robot_runs.relay",
+        "--port",
+        str(port),
+        "--to",
+        str(target),
+    ]
+    command += ["--loss", str(run.loss), "--delay-s", str(run.delay_s)]
+    command += ["--seed", str(run.seed + 1000 * number)]
+    if run.over == "ros2":
+        command += ["--ros2", str(ports.server), "--robot", robot]
+    process = _start([*command, *["--lockstep"] * run.lockstep], stack, subprocess.PIPE)
+    assert process.stdout is not None
+    stack.callback(process.stdout.close)
+    if process.stdout.readline().strip() != b"ready":
+        raise IpsysError(f"--port {run.port}: the relay cannot use port {port}; give another port")
+    link = RelayLink(port, process)
+    stack.callback(link.close)
+    return link
+
+
+def _start(command: Sequence[str], stack: ExitStack, output: int | None = None) -> subprocess.Popen[bytes]:
+    try:
+        # A group of its own: Ctrl-C in the terminal ends the simulator, and this ends its programs.
+        process = subprocess.Popen(command, stdout=output, process_group=0, env=_environment())
+    except OSError as error:
+        raise IpsysError(f"{command[0]}: cannot be started: {error.strerror}; make it executable") from error
+    stack.callback(_end, process)
+    return process
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment of a program; Python shows its prints at once."""
+    return {**os.environ, "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 class Steering:

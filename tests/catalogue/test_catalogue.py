@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from ipsys_log.api import python_api as api
-from ipsys_log.api.catalogue.table import update_catalogue
+from ipsys_log.api.catalogue import update_catalogue
 from ipsys_log.engine import output
 from ipsys_log.engine.graph import VERSIONS
 from ipsys_log.engine.output import append_messages

@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 from ipsys_log.api import python_api as api
-from ipsys_log.api.catalogue.row import Baseline
-from ipsys_log.api.catalogue.table import update_catalogue
+from ipsys_log.api.catalogue import Baseline, update_catalogue
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.output import write_log
 from tests.geometric.lab import GeometricSettings, build_lab

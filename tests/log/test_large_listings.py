@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from ipsys_log.api.catalogue import table
-from ipsys_log.api.catalogue.row import Baseline
-from ipsys_log.api.catalogue.table import CatalogueUpdate, update_catalogue
+from ipsys_log.api import catalogue
+from ipsys_log.api.catalogue import Baseline, CatalogueUpdate, update_catalogue
 from ipsys_log.log.location import LogLocation, parse_location
 from ipsys_log.log.log_files import find_logs
 
@@ -74,7 +73,7 @@ def test_requests_of_many_objects_are_those_of_pages(
         return done, len(requests)
 
     with monkeypatch.context() as patch:  # reading 10,000 objects would take minutes
-        patch.setattr(table, "read_row", row_without_reading)
+        patch.setattr(catalogue, "read_row", row_without_reading)
         first, count = update()
     assert (first.logs, first.read) == (OBJECTS, OBJECTS)
     assert count <= OBJECTS // PAGE + FEW

@@ -67,8 +67,7 @@ def catalogue(
         ipsys catalogue logs -o catalogue.parquet
         ipsys catalogue logs -o catalogue.parquet --baseline logs/first.mcap
     """
-    from ipsys_log.api.catalogue.row import Baseline
-    from ipsys_log.api.catalogue.table import update_catalogue
+    from ipsys_log.api.catalogue import Baseline, update_catalogue
     from ipsys_log.app.report.files import check_file, check_parquet_name
     from ipsys_log.errors import IpsysError
     from ipsys_log.extras import check_installed

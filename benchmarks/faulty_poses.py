@@ -19,14 +19,7 @@ from ipsys_log.calibration.images import find_sources
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    CameraCalibration,
-    CompressedImage,
-    Message,
-    Rig,
-    RigMarker,
-    Tracks,
-)
+from ipsys_log.messages import CameraCalibration, CompressedImage, Message, Rig, RigMarker, Tracks
 from ipsys_log.messages.channels import CAMERA_POINTS, POSITIONS
 from ipsys_log.units import MM_PER_M
 from ipsys_log.vision.lenses import undistort

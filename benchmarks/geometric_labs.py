@@ -22,12 +22,7 @@ from ipsys_log.statistics.calibration_points import build_pairs, gather_sighting
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.vision.lenses import in_image, project
 from ipsys_log.vision.poses import transform
-from tests.geometric.corner_noise import (
-    WHITE_SHARE,
-    corner_covariances,
-    draw_corner_noise,
-    edge_sigma_px,
-)
+from tests.geometric.corner_noise import WHITE_SHARE, corner_covariances, draw_corner_noise, edge_sigma_px
 from tests.geometric.floor_error import (
     KnownSightings,
     Locator,
@@ -36,13 +31,7 @@ from tests.geometric.floor_error import (
     locate_with_model,
     summarize,
 )
-from tests.geometric.lab import (
-    GeometricLab,
-    GeometricSettings,
-    PlacedMarkers,
-    build_lab,
-    camera_poses,
-)
+from tests.geometric.lab import GeometricLab, GeometricSettings, PlacedMarkers, build_lab, camera_poses
 from tests.geometric.session import simulate_session
 
 __all__ = [

@@ -15,11 +15,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    CameraCalibration,
-    CompressedImage,
-    Message,
-)
+from ipsys_log.messages import CameraCalibration, CompressedImage, Message
 from ipsys_log.stages.detect import Detect
 from ipsys_log.tools.differences import Comparison
 from ipsys_log.tools.verify import verify

@@ -14,11 +14,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    FRAME_SKIPPED,
-    STAMP_UNRELIABLE,
-    Event,
-)
+from ipsys_log.messages import FRAME_SKIPPED, STAMP_UNRELIABLE, Event
 from ipsys_log.messages.channels import POSITIONS
 from ipsys_log.stages.detect import Detect
 from ipsys_log.units import NS_PER_S

@@ -23,14 +23,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    CompressedImage,
-    Markers,
-    Measurement,
-    Message,
-    Positions,
-    Rig,
-)
+from ipsys_log.messages import CompressedImage, Markers, Measurement, Message, Positions, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.statistics.calibration_points import active_measurements

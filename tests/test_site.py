@@ -16,15 +16,7 @@ from markdown_it import MarkdownIt
 
 import ipsys_log
 from tests.conftest import ROOT
-from tests.site_pages import (
-    SiteParser,
-    build_site,
-    link_fault,
-    loaded_addresses,
-    parse,
-    read_site,
-    staging,
-)
+from tests.site_pages import SiteParser, build_site, link_fault, loaded_addresses, parse, read_site, staging
 from tests.test_words import texts
 
 PAGES: list[Path] = staging["pages"]()

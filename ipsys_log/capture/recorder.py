@@ -24,14 +24,7 @@ from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.messages import (
-    STAMP_UNRELIABLE,
-    CompressedImage,
-    CompressedVideo,
-    Event,
-    Measurement,
-    Message,
-)
+from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, CompressedVideo, Event, Measurement, Message
 from ipsys_log.plain_text import shell_words
 
 # After an interrupt, the recorder waits no longer than this for a write.

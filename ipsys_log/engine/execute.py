@@ -29,14 +29,7 @@ from ipsys_log.engine.view import inputs
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    ChannelWritten,
-    Event,
-    Lens,
-    Message,
-    Model,
-    Run,
-)
+from ipsys_log.messages import ChannelWritten, Event, Lens, Message, Model, Run
 from ipsys_log.messages.channels import MODEL, Channel, channel_of
 from ipsys_log.messages.rig_file import hide_passwords
 from ipsys_log.messages.stage import Stage, Timed

@@ -18,14 +18,7 @@ from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
-from ipsys_log.messages.channels import (
-    CAMERA_POINTS,
-    EVALUATION,
-    MARKERS,
-    POSITIONS,
-    RIG,
-    Channel,
-)
+from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, POSITIONS, RIG, Channel
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.models.table import needs_height
 from ipsys_log.plain_text import shell_words

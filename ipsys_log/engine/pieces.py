@@ -20,13 +20,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import (
-    CameraCalibration,
-    CompressedVideo,
-    Encoded,
-    Message,
-    Rig,
-)
+from ipsys_log.messages import CameraCalibration, CompressedVideo, Encoded, Message, Rig
 from ipsys_log.messages.channels import ANNOTATIONS, RIG
 from ipsys_log.messages.stage import Pieces, Resets
 from ipsys_log.stages import load_stage

@@ -12,16 +12,7 @@ from mcap.opcode import Opcode
 from ipsys_log.log.byte_source import FileBytes, open_for_reading
 from ipsys_log.log.chunks import unpack
 from ipsys_log.log.codec import decode
-from ipsys_log.log.records import (
-    ENTRY,
-    HEADER,
-    INDEX_HEAD,
-    MAGIC,
-    MESSAGE,
-    RecordAt,
-    parse,
-    parse_chunk_head,
-)
+from ipsys_log.log.records import ENTRY, HEADER, INDEX_HEAD, MAGIC, MESSAGE, RecordAt, parse, parse_chunk_head
 
 
 class GrowingChannel:

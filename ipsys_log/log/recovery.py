@@ -19,10 +19,7 @@ from ipsys_log.log.journal import DISK, Storage, roll_back, write_all
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.output import SMALL_APPENDED, PendingAppend
 from ipsys_log.log.part_copier import PartCopier
-from ipsys_log.log.records import (
-    MAGIC,
-    index_records,
-)
+from ipsys_log.log.records import MAGIC, index_records
 from ipsys_log.log.summary import load_contents, read_intact_summary
 from ipsys_log.log.survey import Kind, Survey
 from ipsys_log.log.writer import LogWriter

@@ -15,12 +15,7 @@ from ipsys_log.log.byte_source import LogBytes, reason_of
 from ipsys_log.log.chunks import ChunkContents, parse_chunk_contents, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import ChannelHash
-from ipsys_log.log.record_search import (
-    IN_DATA,
-    PRIVATE,
-    RecordSearch,
-    index_rows,
-)
+from ipsys_log.log.record_search import IN_DATA, PRIVATE, RecordSearch, index_rows
 from ipsys_log.log.records import (
     DATA_END,
     HEADER,

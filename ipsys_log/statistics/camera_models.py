@@ -10,13 +10,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array, CameraModel, Model, Noise, Pair, Parameter
 from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import (
-    fit_cameras,
-    inputs,
-    min_pairs,
-    parameters,
-    reads_height,
-)
+from ipsys_log.models.table import fit_cameras, inputs, min_pairs, parameters, reads_height
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty, ruler_sigmas
 from ipsys_log.statistics.cross_validation import gather_points, make_folds, predict_without
 

@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array, LearningPoint, Measurement, Pair
 from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import (
-    fit_cameras,
-    group_dependent_cameras,
-    inputs,
-    min_pairs,
-    predict_array,
-)
+from ipsys_log.models.table import fit_cameras, group_dependent_cameras, inputs, min_pairs, predict_array
 from ipsys_log.statistics.tape import RiggedMeasurement
 
 FOLDS = 5

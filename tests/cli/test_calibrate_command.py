@@ -19,13 +19,7 @@ from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
-from tests.calibration.boards_seen import (
-    chessboard_pattern,
-    fisheye_rays,
-    pixels_of,
-    random_pose,
-    render,
-)
+from tests.calibration.boards_seen import chessboard_pattern, fisheye_rays, pixels_of, random_pose, render
 from tests.capture.streams import ffmpeg
 from tests.conftest import Done, Ipsys
 

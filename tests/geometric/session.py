@@ -32,13 +32,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MARKERS, RECORD
 from ipsys_log.units import NS_PER_S
 from tests.geometric.lab import GeometricLab, PlacedMarkers
-from tests.geometric.sightings import (
-    drive_times_ns,
-    pose_array,
-    simulate_sightings,
-    start_ns,
-    still_times_ns,
-)
+from tests.geometric.sightings import drive_times_ns, pose_array, simulate_sightings, start_ns, still_times_ns
 
 MARKERS_RUN = "geometric"
 # From the end of a frame to its arrival, and from the last frame at a point to the end of its measurement.

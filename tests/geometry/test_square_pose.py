@@ -11,13 +11,7 @@ from scipy.spatial.transform import Rotation
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import camera_point, marker_corners, pixel_slopes, whiten
-from ipsys_log.vision.square_pose import (
-    SquarePoses,
-    fit_squares,
-    is_convex,
-    reprojection_px,
-    solve_squares,
-)
+from ipsys_log.vision.square_pose import SquarePoses, fit_squares, is_convex, reprojection_px, solve_squares
 from tests.geometry.squares import (
     CENTRE,
     EDGE,

@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from sklearn.model_selection import KFold
 
 from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import (
-    create,
-    fit_cameras,
-    group_dependent_cameras,
-    inputs,
-)
+from ipsys_log.models.table import create, fit_cameras, group_dependent_cameras, inputs
 from tests import labs
 
 

@@ -20,14 +20,7 @@ from ipsys_log.engine.states import recorded_stages
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    CameraPoints,
-    ChannelRead,
-    ChannelWritten,
-    CompressedImage,
-    Message,
-    Run,
-)
+from ipsys_log.messages import CameraPoints, ChannelRead, ChannelWritten, CompressedImage, Message, Run
 from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.tools.compact import compact, superseded_runs
 from ipsys_log.tools.cut import cut

@@ -19,14 +19,7 @@ from ipsys_log.live_runs import pipeline
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.messages import (
-    CameraCalibration,
-    Measurement,
-    Message,
-    Rig,
-    Run,
-    Tracks,
-)
+from ipsys_log.messages import CameraCalibration, Measurement, Message, Rig, Run, Tracks
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, RUN_EVENTS
 from ipsys_log.messages.rig_file import load_rig
 from tests.changed_logs import rewrite

@@ -39,13 +39,7 @@ from threading import Thread
 
 from tests.same_bytes.allowed import AllowList, AllowListError
 from tests.same_bytes.cases import CASES, Case, case_names
-from tests.same_bytes.differences import (
-    EXIT_CODE,
-    Difference,
-    compare_files,
-    compare_json,
-    compare_logs,
-)
+from tests.same_bytes.differences import EXIT_CODE, Difference, compare_files, compare_json, compare_logs
 from tests.same_bytes.inputs import Inputs, MissingInputError, UnmadeInputError
 
 ROOT = Path(__file__).resolve().parent.parent.parent

@@ -20,15 +20,7 @@ from ipsys_log.log.journal import journal_path
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import repair
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.messages import (
-    CameraCalibration,
-    Distance,
-    Event,
-    Measurement,
-    Message,
-    Rig,
-    RigCamera,
-)
+from ipsys_log.messages import CameraCalibration, Distance, Event, Measurement, Message, Rig, RigCamera
 from ipsys_log.tools.soundness.check import check_logs
 from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
 from ipsys_log.tools.soundness.references import MessageTimes

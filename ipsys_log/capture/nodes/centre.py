@@ -20,13 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
 from ipsys_log.capture.nodes.network import AUTHORITY, NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
-from ipsys_log.capture.nodes.wire import (
-    FrameHeader,
-    NodeState,
-    frames_key,
-    missing_key,
-    state_key,
-)
+from ipsys_log.capture.nodes.wire import FrameHeader, NodeState, frames_key, missing_key, state_key
 from ipsys_log.messages import RigCamera
 from ipsys_log.messages.rig_file import check_name
 from ipsys_log.units import NS_PER_S

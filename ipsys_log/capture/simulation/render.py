@@ -30,13 +30,7 @@ from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Array
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project
-from ipsys_log.vision.markers import (
-    MovingMarker,
-    PlacedBoard,
-    PlacedMarker,
-    print_outline,
-    printed_cells,
-)
+from ipsys_log.vision.markers import MovingMarker, PlacedBoard, PlacedMarker, print_outline, printed_cells
 from ipsys_log.vision.poses import transform
 
 # Largest motion of a print between two instants without motion blur.

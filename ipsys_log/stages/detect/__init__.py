@@ -27,15 +27,7 @@ from ipsys_log.messages import (
     SkippedVideo,
     TextAnnotation,
 )
-from ipsys_log.messages.channels import (
-    ANNOTATIONS,
-    CALIBRATIONS,
-    EVENTS,
-    IMAGES,
-    MARKERS,
-    RIG,
-    RUN_EVENTS,
-)
+from ipsys_log.messages.channels import ANNOTATIONS, CALIBRATIONS, EVENTS, IMAGES, MARKERS, RIG, RUN_EVENTS
 from ipsys_log.messages.events import skipped_frames
 from ipsys_log.messages.stage import Pieces, Plan, Resets, Stage, StageView
 from ipsys_log.stages.detect.adjustment import MarkerFit

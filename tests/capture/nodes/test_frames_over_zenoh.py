@@ -23,13 +23,7 @@ from ipsys_log.capture.nodes.network import NodeNetwork, read_network
 from ipsys_log.capture.nodes.wire import FrameHeader, frames_key
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera, RigNodes
-from tests.capture.nodes.lab_of_nodes import (
-    Received,
-    ShiftedClock,
-    make_certificates,
-    receiving,
-    sending,
-)
+from tests.capture.nodes.lab_of_nodes import Received, ShiftedClock, make_certificates, receiving, sending
 from tests.capture.nodes.tcp_relay import Relay
 from tests.ports import free_port
 from tests.waiting import wait_until

@@ -26,7 +26,6 @@ from ipsys_log.log.writer import LogWriter
 from ipsys_log.units import format_bytes
 
 _BLOCK = 1 << 20
-_SECTOR = 512
 _MOST_IN_MEMORY = 64 << 20  # bytes: a longer end of an unfinished log is copied with the rest
 _SPARE_BYTES = 1 << 20  # for larger indexes than in the old log
 _LOST = "/lost"

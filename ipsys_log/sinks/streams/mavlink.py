@@ -24,8 +24,6 @@ from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
 
-# The direction of north by default: the y axis of the lab.
-NORTH_RAD = pi / 2
 _NS_PER_US = 1000
 _RESETS = 256
 # A heading without a stated sigma. The autopilots need a number: this one is the default of PX4.

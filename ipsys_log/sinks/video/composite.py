@@ -185,11 +185,6 @@ class Composite:
         look = MapLook(size, self._font_px, scene.colours, scene.enlarged, scene.fade_ns)
         self.floor = FloorMap(scene.rig, scene.part, look)
 
-    @property
-    def floor_corner_px(self) -> tuple[int, int]:
-        """The place (x, y) of the map of the floor in the picture."""
-        return self._left, self._head
-
     def add(self, message: Message) -> None:
         """Show a message from now on."""
         payload = message.payload

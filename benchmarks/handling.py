@@ -103,7 +103,7 @@ def _cut(logs: Sequence[Path], part: Path) -> None:
 
 
 def _compact(logs: Sequence[Path], copy: Path) -> None:
-    from ipsys_log.tools.compact import compact
+    from ipsys_log.tools.cut import compact
 
     compact(logs[0], copy)
 

@@ -30,7 +30,7 @@ from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, measured
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.statistics.cross_validation import Study, cross_validate, gather_points, labelled_subsets
-from ipsys_log.statistics.point_evaluation import evaluate_model
+from ipsys_log.statistics.model_kinds import evaluate_model
 from ipsys_log.statistics.tape import RiggedMeasurement
 
 # Best was selected with other folds.

@@ -16,7 +16,7 @@ from pathlib import Path
 from scenes import simulator_key
 
 from ipsys_log.capture.simulation.calibration_points import place_marker
-from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.cameras import FloorView, prepare_view
 from ipsys_log.capture.simulation.lab import moving_marker
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import Purpose, random_stream

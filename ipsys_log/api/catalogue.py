@@ -15,12 +15,12 @@ from ipsys_log.engine.graph import VERSIONS
 from ipsys_log.engine.output import check_source, derived_log_of
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError, os_error_text, reason_without
-from ipsys_log.exchange.parquet_rows import Columns, escape_surrogates, read_rows, write_rows
+from ipsys_log.exchange.row_files import Columns, escape_surrogates, read_rows, write_rows
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation, LogState
 from ipsys_log.log.log_files import read_log_state, states_below
 from ipsys_log.messages.channels import EVALUATION, EVENTS, MEASUREMENTS
-from ipsys_log.tools.compact import outdated_runs
+from ipsys_log.tools.cut import outdated_runs
 from ipsys_log.tools.recording import find_gaps
 from ipsys_log.units import NS_PER_S
 

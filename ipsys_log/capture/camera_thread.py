@@ -11,6 +11,8 @@ from ipsys_log.capture.frames import (
     CameraState,
     Clock,
     Frame,
+    Heartbeat,
+    LateFrameDetector,
     NodeRefusedError,
     Open,
     Say,
@@ -20,7 +22,6 @@ from ipsys_log.capture.frames import (
 )
 from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
-from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import find_size, frame_payload, is_decodable_start
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, schema_name

@@ -16,10 +16,9 @@ from types import TracebackType
 from typing import Any
 
 from ipsys_log.capture.camera_thread import Arrival, CameraReader, Pause, ReaderContext, imported_run
-from ipsys_log.capture.frames import Clock, Open, Say, SourceError
+from ipsys_log.capture.frames import Clock, Heartbeat, Open, Say, SourceError
 from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.receiver import passing_period_s
-from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 from ipsys_log.units import NS_PER_S
 

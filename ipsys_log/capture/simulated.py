@@ -14,8 +14,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings
-from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.floor import Check
+from ipsys_log.capture.simulation.cameras import Check, mount_cameras
 from ipsys_log.capture.simulation.live_lab import (
     LIVE_SETTINGS,
     Film,

@@ -23,8 +23,7 @@ from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.models.table import needs_height
 from ipsys_log.plain_text import shell_words
 from ipsys_log.statistics.calibration_points import measured, split_ids, training_pairs
-from ipsys_log.statistics.model_kinds import model_kind
-from ipsys_log.statistics.point_evaluation import can_evaluate
+from ipsys_log.statistics.model_kinds import can_evaluate, model_kind
 from ipsys_log.statistics.tape import RiggedMeasurement, world_point
 from ipsys_log.units import format_time
 

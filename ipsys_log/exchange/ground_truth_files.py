@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.csv_rows import open_as_text, parse_number, read_cells
 from ipsys_log.exchange.image_folders import parse_time
+from ipsys_log.exchange.row_files import open_as_text, parse_number, read_cells
 from ipsys_log.messages import Array
 from ipsys_log.units import MM_PER_M, NS_PER_S
 

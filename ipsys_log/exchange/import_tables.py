@@ -15,9 +15,9 @@ from ipsys_log.engine.output import append_run, open_target
 from ipsys_log.engine.provenance import check_run_name, fingerprint, free_name
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import announce_assumed
-from ipsys_log.exchange.csv_rows import NamedRow, read_rows
 from ipsys_log.exchange.image_folders import parse_time
 from ipsys_log.exchange.lab_files import load_lenses
+from ipsys_log.exchange.row_files import NamedRow, read_named_rows
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     IMPORTED,
@@ -88,7 +88,7 @@ def read_pairs(file: Path, rig: Rig) -> PairTable:
         A cell is wrong, the rig does not know a marker, or the rows of a point contradict each other.
     """
     table = PairTable()
-    for row in read_rows(file, _PAIR_COLUMNS):
+    for row in read_named_rows(file, _PAIR_COLUMNS):
         name = row.text("id")
         if not name:
             raise IpsysError(f"{row.where}: id is empty; name the calibration point")
@@ -265,7 +265,7 @@ def _read_frames(file: Path) -> list[_Frame]:
     """Return the frames of a table in log order, with their markers sorted by id."""
     by_frame: dict[tuple[int, int, str], dict[int, Marker]] = {}
     first_rows: dict[str, str] = {}
-    for row in read_rows(file, _NEEDED):
+    for row in read_named_rows(file, _NEEDED):
         camera = check_name(row.text("camera"), f"{row.where}: camera name")
         first_rows.setdefault(camera, row.where)
         time_ns = _time_ns(row)

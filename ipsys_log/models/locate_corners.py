@@ -15,7 +15,7 @@ from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, Marker, Markers, Message, Model, Position, Positions, Rig
-from ipsys_log.models.contradicted_heights import ContradictedHeights, HeightSighting
+from ipsys_log.models.locate_points import ContradictedHeights, HeightSighting
 from ipsys_log.units import NS_PER_S
 
 # Corners without a covariance have about this error.

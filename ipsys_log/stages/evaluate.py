@@ -10,8 +10,7 @@ from ipsys_log.messages.stage import Plan, Progress, Stage, StageView, model_rea
 from ipsys_log.statistics.calibration_points import find_pairs, held_out_ids, measured, split_parameters
 from ipsys_log.statistics.cross_validation import FOLDS, Study, labelled_subsets
 from ipsys_log.statistics.ground_truth import gather_tracks, true_points
-from ipsys_log.statistics.model_kinds import JOINT_READS, model_kind
-from ipsys_log.statistics.point_evaluation import can_evaluate, can_refit
+from ipsys_log.statistics.model_kinds import JOINT_READS, can_evaluate, can_refit, model_kind
 
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:

@@ -20,7 +20,7 @@ from ipsys_log.api.batch.tasks import BatchTask, LogResult, compute_alone, perfo
 from ipsys_log.engine import pieces
 from ipsys_log.engine.pieces import PiecePlan, PieceResult
 from ipsys_log.engine.provenance import fingerprint
-from ipsys_log.exchange.parquet_rows import read_rows
+from ipsys_log.exchange.row_files import read_rows
 from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Message, Tracks
 from tests.batch.piece_works import PARAMETERS, UNTIL

@@ -20,7 +20,7 @@ import pytest
 from ipsys_log.api import python_api as api
 from ipsys_log.api.batch.execution import MOST_ENDED_WORKERS
 from ipsys_log.api.batch.log_work import replay_log
-from ipsys_log.exchange.parquet_rows import read_rows
+from ipsys_log.exchange.row_files import read_rows
 from ipsys_log.tools.soundness.finding import BROKEN
 from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, read_json, wait_for
 from tests.conftest import ROOT, small_disk

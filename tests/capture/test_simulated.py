@@ -18,8 +18,7 @@ from ipsys_log.capture import simulated
 from ipsys_log.capture.frames import Clock, Frame
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.capture.simulation.calibration_points import place_marker
-from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.floor import prepare_view
+from ipsys_log.capture.simulation.cameras import mount_cameras, prepare_view
 from ipsys_log.capture.simulation.live_lab import POSES, board_film, image_index, lab_film, plan_live_lab
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CompressedImage, RigCamera

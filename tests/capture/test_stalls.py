@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.frames import STALL_NS, Clock, Frame, Heartbeat, LateFrameDetector, Say
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.stalls import STALL_NS, Heartbeat, LateFrameDetector
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from ipsys_log.units import NS_PER_S
 

@@ -20,7 +20,7 @@ from ipsys_log.engine import output
 from ipsys_log.engine.graph import VERSIONS
 from ipsys_log.engine.output import append_messages
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.parquet_rows import Columns, read_rows, write_rows
+from ipsys_log.exchange.row_files import Columns, read_rows, write_rows
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Event, Message

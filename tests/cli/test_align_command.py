@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
-from ipsys_log.capture.simulation.floor import prepare_view
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings

@@ -22,8 +22,7 @@ from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraPoints, ChannelRead, ChannelWritten, CompressedImage, Message, Run
 from ipsys_log.messages.channels import MEASUREMENTS
-from ipsys_log.tools.compact import compact, superseded_runs
-from ipsys_log.tools.cut import cut
+from ipsys_log.tools.cut import compact, cut, superseded_runs
 from ipsys_log.tools.cut_selection import CutOptions
 from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys

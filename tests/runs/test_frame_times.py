@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.engine.frame_times import channel_times
+from ipsys_log.engine.provenance import channel_times
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 

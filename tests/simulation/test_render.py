@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
-from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.cameras import Camera, FloorView, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.render import encode_jpeg, expose, render
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.vision.markers import PlacedMarker, project_corners

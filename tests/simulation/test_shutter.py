@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from ipsys_log.capture.simulation.calibration_points import place_marker
-from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
-from ipsys_log.capture.simulation.floor import prepare_view
 from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.capture.simulation.render import expose
 from ipsys_log.capture.simulation.settings import LabSettings

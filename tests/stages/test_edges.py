@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
-from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.cameras import Camera, FloorView, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import plan_drive
-from ipsys_log.capture.simulation.floor import FloorView, prepare_view
 from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings

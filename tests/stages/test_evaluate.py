@@ -33,7 +33,7 @@ from ipsys_log.statistics.cross_validation import (
     published_curve,
 )
 from ipsys_log.statistics.ground_truth import gather_tracks, track_errors
-from ipsys_log.statistics.point_evaluation import evaluate_model
+from ipsys_log.statistics.model_kinds import evaluate_model
 from ipsys_log.statistics.tape import RiggedMeasurement, world_point
 from tests import labs
 

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.capture.simulation.calibration_points import place_marker
-from ipsys_log.capture.simulation.cameras import mount_cameras
+from ipsys_log.capture.simulation.cameras import mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import plan_drive
-from ipsys_log.capture.simulation.floor import prepare_view
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CompressedImage, Event, Marker

@@ -17,7 +17,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.log_files import name_places, read_log_state
-from ipsys_log.tools.compact import outdated_runs
+from ipsys_log.tools.cut import outdated_runs
 from ipsys_log.tools.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck
 
 # States of a log after its work; the check of a log has its own ones.

@@ -27,7 +27,7 @@ from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.log.location import LogLocation
-    from ipsys_log.tools.compact import DroppedRun
+    from ipsys_log.tools.cut import DroppedRun
     from ipsys_log.tools.merge import MergeResult
     from ipsys_log.tools.merge_plan import LogOffset
 
@@ -139,7 +139,7 @@ def _compact(
     from ipsys_log.engine.output import check_copy
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.log_files import read_log_state
-    from ipsys_log.tools import compact as compaction
+    from ipsys_log.tools.cut import compact, dropped_runs
 
     if len(logs) != 1:
         raise IpsysError("--compact: compacts one log; name only one")
@@ -148,13 +148,13 @@ def _compact(
     (log,) = logs
     if output is not None:
         check_copy([log], output, overwrite)
-    dropped, size = compaction.dropped_runs(log), read_log_state(log).size
+    dropped, size = dropped_runs(log), read_log_state(log).size
     written = output if dropped and not dry_run else None
     if not as_json:
         _show_dropped(log, size, dropped)
     if written is not None:
         with progress_bar() as progress:
-            compaction.compact(log, written, overwrite, progress)
+            compact(log, written, overwrite, progress)
     if as_json:
         print_json(_compact_json(log, size, written, dropped))
     elif written is not None:

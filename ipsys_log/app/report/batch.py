@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ipsys_log.api.batch.tasks import LogResult
 from ipsys_log.app.report.rows import Rows, counted
-from ipsys_log.exchange.parquet_rows import write_rows
+from ipsys_log.exchange.row_files import write_rows
 from ipsys_log.plain_text import plain_text
 
 # A longer list is counted by state.

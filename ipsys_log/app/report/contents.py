@@ -11,8 +11,7 @@ from typing import Any
 from rich.text import Text
 
 from ipsys_log.app.report.rows import Rows, mm, name_cell, percent
-from ipsys_log.engine.frame_times import channel_times
-from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.provenance import channel_times, newest_run
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.from_log import FinishedLog

@@ -16,9 +16,8 @@ from ipsys_log.capture.simulation.calibration_points import (
     reference_points,
     split,
 )
-from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
+from ipsys_log.capture.simulation.cameras import Camera, FloorView, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
-from ipsys_log.capture.simulation.floor import FloorView, prepare_view
 from ipsys_log.capture.simulation.render import encode_jpeg, exposure_interval, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.messages import (

@@ -23,9 +23,8 @@ from ipsys_log.capture.simulation.calibration_points import (
     place_marker,
     tape_lengths_m,
 )
-from ipsys_log.capture.simulation.cameras import Camera, mount_cameras, sees
+from ipsys_log.capture.simulation.cameras import Camera, Check, FloorView, mount_cameras, prepare_view, sees
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
-from ipsys_log.capture.simulation.floor import Check, FloorView, prepare_view
 from ipsys_log.capture.simulation.lab import build_rig, moving_marker
 from ipsys_log.capture.simulation.render import Print, add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.capture.simulation.floor import FIELD_PX, FloorView, Plane, to_light
+from ipsys_log.capture.simulation.cameras import FIELD_PX, FloorView, Plane, to_light
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Array
 from ipsys_log.units import NS_PER_S
@@ -274,7 +274,7 @@ def render(
 
     Parameters
     ----------
-    view : view of the camera, from :func:`~ipsys_log.capture.simulation.floor.prepare_view`.
+    view : view of the camera, from :func:`~ipsys_log.capture.simulation.cameras.prepare_view`.
     placed : the markers. If two overlap, the later one is on top. A moving marker is a function of the time
         in s since the time of the frame. This is the middle of the exposure of its first row.
     settings : the grey levels, blur, gamma and dictionary of the scene; row time and exposure.

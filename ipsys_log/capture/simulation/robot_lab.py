@@ -12,8 +12,7 @@ from math import atan2, cos, exp, sin, sqrt
 import numpy as np
 
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
-from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.floor import FloorView, prepare_view
+from ipsys_log.capture.simulation.cameras import FloorView, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.lab import build_rig
 from ipsys_log.capture.simulation.render import add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream

@@ -24,8 +24,7 @@ from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, TRACKS, TRUTH, Channel
 from ipsys_log.plain_text import shell_words
 from ipsys_log.statistics.accuracy import root_mean_square_m
-from ipsys_log.statistics.ground_truth import gather_paths
-from ipsys_log.tools.trajectory_errors import trajectory_errors
+from ipsys_log.statistics.ground_truth import gather_paths, trajectory_errors
 
 if TYPE_CHECKING:
     import pandas as pd

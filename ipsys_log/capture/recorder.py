@@ -21,8 +21,7 @@ from ipsys_log.capture.disk import (
 from ipsys_log.capture.frames import Clock, Say
 from ipsys_log.engine.output import serialize, write_message
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
-from ipsys_log.log.journal import DISK, roll_back
-from ipsys_log.log.lock import open_locked
+from ipsys_log.log.journal import DISK, open_locked, roll_back
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, CompressedVideo, Event, Measurement, Message
 from ipsys_log.plain_text import shell_words

@@ -15,8 +15,7 @@ from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, journal_path
-from ipsys_log.log.location import LogLocation, LogUrl, is_one_of
-from ipsys_log.log.lock import describe_broken_link
+from ipsys_log.log.location import LogLocation, LogUrl, describe_broken_link, is_one_of
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelWritten, Message, Rig, Run, kind_of

@@ -12,7 +12,7 @@ from ipsys_log.capture.simulated import intrinsics_of
 from ipsys_log.capture.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
-from ipsys_log.log.lock import describe_broken_link
+from ipsys_log.log.location import describe_broken_link
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig, rig_toml
 from ipsys_log.stages.detect.search import marker_detector

@@ -24,7 +24,7 @@ from rosbags.typesys.store import Typestore
 
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log.bounds import ReadLimits, chunk_excess
+from ipsys_log.log.byte_source import ReadLimits, chunk_excess
 from ipsys_log.log.chunks import unpack
 from ipsys_log.log.contents import parse_foreign_camera
 from ipsys_log.log.reader import LogReader

@@ -12,8 +12,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, BoundError, chunk_excess
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import LARGEST_CHUNK, LARGEST_DEFINITION, BoundError, LogBytes, chunk_excess
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse, parse_chunk_head, to_bytes
 
 

@@ -26,7 +26,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log import messages
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import PartCounter
+from ipsys_log.log.byte_source import PartCounter
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
 NS = 1_000_000_000

@@ -21,7 +21,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import PartCounter
+from ipsys_log.log.byte_source import PartCounter
 from ipsys_log.log.codec import proto_class
 
 Bytes = NDArray[np.uint8]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError, PartCounter
+from ipsys_log.log.byte_source import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.contents import (
     RawMessage,

@@ -144,3 +144,13 @@ def file_beside(log: LogLocation, suffix: str) -> Path:
     if isinstance(log, Path) and os.access(log.absolute().parent, os.W_OK):
         return log.with_suffix(suffix)
     return Path(f"{log.stem}{suffix}")
+
+
+def describe_broken_link(path: Path) -> str | None:
+    """Return an error text for a path that is a broken link; None for any other path.
+
+    Such a path does not exist, but no file can be created there.
+    """
+    if not path.is_symlink() or path.exists():
+        return None
+    return f"{path} is a link to {path.readlink()}, which does not exist: remove it, or choose another name"

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError, UnreadError
-from ipsys_log.log.bounds import ReadLimits
-from ipsys_log.log.byte_source import FileBytes, LogBytes, open_for_reading
+from ipsys_log.log.byte_source import FileBytes, LogBytes, ReadLimits, open_for_reading
 from ipsys_log.log.channel_sizes import ChannelSize, read_sizes
 from ipsys_log.log.chunk_messages import (
     ALWAYS,
@@ -33,10 +32,9 @@ from ipsys_log.log.chunks import has_wrong_crc
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
 from ipsys_log.log.file_check import FileCheck, check_file
 from ipsys_log.log.hashing import ChannelHash, stored_hashes
-from ipsys_log.log.journal import attach_journal
+from ipsys_log.log.journal import attach_journal, is_being_written
 from ipsys_log.log.known_contents import contents_of, open_remote
 from ipsys_log.log.location import LogLocation, LogUrl
-from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.summary import NoFooterError
 from ipsys_log.log.survey import Watch

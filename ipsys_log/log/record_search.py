@@ -15,8 +15,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, UnreadError
-from ipsys_log.log.bounds import LARGEST_DEFINITION, BoundError
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import LARGEST_DEFINITION, BoundError, LogBytes
 from ipsys_log.log.chunks import check_definition, parse_chunk_contents, unpack
 from ipsys_log.log.records import (
     ENTRY,

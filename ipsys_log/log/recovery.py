@@ -15,8 +15,7 @@ from pathlib import Path
 from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.byte_source import FileBytes, open_for_reading
 from ipsys_log.log.file_check import disagreement
-from ipsys_log.log.journal import DISK, Storage, roll_back, write_all
-from ipsys_log.log.lock import open_locked
+from ipsys_log.log.journal import DISK, Storage, open_locked, roll_back, write_all
 from ipsys_log.log.output import SMALL_APPENDED, PendingAppend
 from ipsys_log.log.part_copier import PartCopier
 from ipsys_log.log.records import MAGIC, index_records

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError, ReadLimits
+from ipsys_log.log.byte_source import BoundError, ReadLimits
 from ipsys_log.log.location import LogUrl
 from ipsys_log.log.remote_object import RemoteObject, open_object
 

@@ -13,7 +13,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import PartCounter
+from ipsys_log.log.byte_source import PartCounter
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.units import NS_PER_S
 

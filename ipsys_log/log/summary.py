@@ -10,8 +10,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, UnreadError
-from ipsys_log.log.bounds import BoundError
-from ipsys_log.log.byte_source import LogBytes
+from ipsys_log.log.byte_source import BoundError, LogBytes
 from ipsys_log.log.chunks import ChunkContents, check_definition, parse_chunk_contents, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import (

@@ -10,8 +10,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, UnreadError
-from ipsys_log.log.bounds import BoundError
-from ipsys_log.log.byte_source import LogBytes, reason_of
+from ipsys_log.log.byte_source import BoundError, LogBytes, reason_of
 from ipsys_log.log.chunks import ChunkContents, parse_chunk_contents, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import ChannelHash

@@ -14,13 +14,11 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
-from ipsys_log.log.bounds import LARGEST_MESSAGE
-from ipsys_log.log.byte_source import FileBytes
+from ipsys_log.log.byte_source import LARGEST_MESSAGE, FileBytes
 from ipsys_log.log.contents import Contents, Schema, free_id
 from ipsys_log.log.hashing import METADATA_NAME, Buffer, ChannelHash, metadata_of_hashes, stored_hashes
-from ipsys_log.log.journal import DISK, Storage, roll_back
+from ipsys_log.log.journal import DISK, Storage, check_free, open_locked, roll_back
 from ipsys_log.log.known_contents import contents_of, note_contents
-from ipsys_log.log.lock import check_free, open_locked
 from ipsys_log.log.output import (
     IMAGE_SCHEMAS,
     IMAGES,

@@ -18,8 +18,7 @@ from mcap.writer import Writer
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents, Schema
-from ipsys_log.log.journal import DISK, Storage, journal_path
-from ipsys_log.log.lock import check_locks
+from ipsys_log.log.journal import DISK, Storage, check_locks, journal_path
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, ChunkRef, to_bytes
 from ipsys_log.log.recovery import repair

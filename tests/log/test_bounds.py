@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_MESSAGE, BoundError, ReadLimits, chunk_excess
+from ipsys_log.log.byte_source import LARGEST_CHUNK, LARGEST_MESSAGE, BoundError, ReadLimits, chunk_excess
 from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError, PartCounter
+from ipsys_log.log.byte_source import BoundError, PartCounter
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.columns import read_columns
 from ipsys_log.messages import Track, Tracks

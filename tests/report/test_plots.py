@@ -25,7 +25,7 @@ from ipsys_log.app.report.paper_figures import models_figure, residuals_figure, 
 from ipsys_log.app.report.points_figure import places_figure
 from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Residual
-from ipsys_log.tools.trajectory_errors import TrajectoryErrors
+from ipsys_log.statistics.ground_truth import TrajectoryErrors
 from tests.conftest import Ipsys
 from tests.report.conftest import find, lab_messages, many_models, only, scale, with_accuracies
 

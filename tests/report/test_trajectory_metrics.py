@@ -23,8 +23,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import TRUTH_TOPIC, ErrorStatistics, Message
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.statistics.accuracy import root_mean_square_m
-from ipsys_log.statistics.ground_truth import gather_paths
-from ipsys_log.tools.trajectory_errors import TrajectoryErrors, pairs_at, trajectory_errors
+from ipsys_log.statistics.ground_truth import TrajectoryErrors, gather_paths, pairs_at, trajectory_errors
 from ipsys_log.units import NS_PER_S
 from tests.exchange.driven_lab import ROBOTS, START_NS, instants_ns, path_of, tracked, write_lab
 

@@ -257,7 +257,7 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
 def _check_free(path: Path, force: bool) -> None:
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.lock import describe_broken_link
+    from ipsys_log.log.location import describe_broken_link
 
     if (text := describe_broken_link(path)) is not None:
         raise IpsysError(text)

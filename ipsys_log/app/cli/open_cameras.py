@@ -90,9 +90,8 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, LogLocati
     """
     from ipsys_log.app.report.files import check_file
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.journal import DISK, journal_path
+    from ipsys_log.log.journal import DISK, check_free, check_locks, journal_path, open_locked
     from ipsys_log.log.location import is_one_of
-    from ipsys_log.log.lock import check_free, check_locks, open_locked
 
     try:
         journal_path(output).exists()

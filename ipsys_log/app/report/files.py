@@ -13,8 +13,7 @@ from ipsys_log.app.report.findings import Findings, errors_in
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.atomic_files import replacement_of
-from ipsys_log.log.location import LogLocation, is_one_of
-from ipsys_log.log.lock import describe_broken_link
+from ipsys_log.log.location import LogLocation, describe_broken_link, is_one_of
 from ipsys_log.units import CM_PER_M
 
 # Names of the methods in Tables I and II of the paper.

@@ -24,8 +24,8 @@ from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.models.table import reads_corners
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.statistics.consistency import FEWEST_POINTS
+from ipsys_log.statistics.ground_truth import pool_trajectories
 from ipsys_log.statistics.model_kinds import SCREENING
-from ipsys_log.tools.trajectory_errors import pool_trajectories
 
 # Number of outliers with an explanation in the answer; the other outliers are only named.
 _EXPLAINED = 3

@@ -14,7 +14,7 @@ from ipsys_log.app.report.findings import in_space, overall_row, rank, ranking_e
 from ipsys_log.app.report.rows import Rows, cm
 from ipsys_log.messages import CameraEvaluation
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
-from ipsys_log.tools.trajectory_errors import DELTAS, TrajectoryErrors, pool_trajectories
+from ipsys_log.statistics.ground_truth import DELTAS, TrajectoryErrors, pool_trajectories
 
 _TRUTH = "truth"
 # The camera of a row over all cameras, and the robot of a row over all robots.

@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.byte_source import BoundError
 from ipsys_log.log.codec import PAYLOADS, payload_type, schema_data
 from ipsys_log.log.contents import Schema, StoredChannel, camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session

@@ -9,7 +9,7 @@ from ipsys_log.engine.graph import writes
 from ipsys_log.engine.request import Progress
 from ipsys_log.engine.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.errors import IpsysError, UnreadError, os_error_text, reason_without
-from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.byte_source import BoundError
 from ipsys_log.log.contents import StoredChannel, camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading

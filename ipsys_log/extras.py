@@ -1,7 +1,5 @@
 """Optional libraries: the extras of the package that install each, and the error if one is missing."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Text that is safe to print: without control characters, without passwords, and names in one line."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import unicodedata

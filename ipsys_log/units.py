@@ -1,7 +1,5 @@
 """Units of texts and reports. All other values are in metres, radians and nanoseconds."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 CM_PER_M = 100.0

@@ -1,7 +1,5 @@
 """The catalogue of a folder: a Parquet table with a row for each log, brought up to date log by log."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """Export of logs to files for other programs: tables, trajectories, ROS 2 bags, videos and data sets."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

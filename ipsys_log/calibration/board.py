@@ -3,8 +3,6 @@
 The layout follows OpenCV 4.6 and later: the square at the top left is black for any number of rows.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import NamedTuple

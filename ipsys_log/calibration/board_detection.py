@@ -6,8 +6,6 @@ towards its white or its black side. White changes to the other side of the edge
 of the edge have opposite shifts, and the edge still passes through the corner.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Search for a board in images from any source, and selection of the images for a calibration."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

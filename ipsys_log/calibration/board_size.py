@@ -1,7 +1,5 @@
 """Estimates of the size of a board, and hints for images that show another board than the stated one."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

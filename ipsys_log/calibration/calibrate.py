@@ -1,7 +1,5 @@
 """Intrinsic calibration of one camera, or of several cameras separately."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ corner has four whole squares around it, alternately black and white. A corner a
 not have four whole squares.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

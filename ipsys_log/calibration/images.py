@@ -1,7 +1,5 @@
 """Images of a board from logs, folders, image files and videos, for each camera."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

@@ -3,8 +3,6 @@
 The intrinsic parameters are one row: fx, fy, cx, cy in px, then the coefficients in the order of OpenCV.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -4,8 +4,6 @@ The search tries several focal lengths. With a focal length, each corner gives a
 plane of the board. No equation divides by a depth, so the rays may also come from the side or from behind.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple

@@ -5,8 +5,6 @@ reprojection error, and each set of intrinsics is fitted to its images. The firs
 opposite gradients at the joint fit, and images with similar names.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

@@ -5,8 +5,6 @@ lens elements. These are decentering and thin prism (Brown 1966; Weng, Cohen and
 linear step from the fit shows their size, and the change of the other parameters.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

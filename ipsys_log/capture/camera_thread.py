@@ -1,7 +1,5 @@
 """The reader of one camera: it reads the frames, and opens the camera again after a disconnection."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace

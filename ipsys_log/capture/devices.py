@@ -1,7 +1,5 @@
 """The functions that open a camera by its ``source`` in the rig: USB, network, files, simulation."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager

@@ -5,8 +5,6 @@ wait in buffers. Afterwards they arrive in a burst. Frames with a capture stamp 
 get the time of their arrival, which is wrong until the end of the burst.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

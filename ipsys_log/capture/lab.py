@@ -1,7 +1,5 @@
 """The cameras of a lab: described by files, and open with the first messages of their recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace

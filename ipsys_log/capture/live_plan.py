@@ -1,7 +1,5 @@
 """The plan of a live run: its stages, and its runs with the names of a replay."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple

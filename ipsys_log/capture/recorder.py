@@ -1,7 +1,5 @@
 """Recording of cameras into a log: frames are written first, processed later."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping

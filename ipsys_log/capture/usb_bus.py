@@ -1,7 +1,5 @@
 """The USB bus: attached cameras, their connections and modes, and the bandwidth that they need."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections import defaultdict

@@ -5,8 +5,6 @@ References
 https://docs.kernel.org/userspace-api/media/v4l/v4l2.html
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 from collections.abc import Callable, Iterator

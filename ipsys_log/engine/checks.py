@@ -1,7 +1,5 @@
 """Checks of the input before any computation."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace

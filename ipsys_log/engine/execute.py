@@ -1,7 +1,5 @@
 """Execution of one stage on a log: find its run, complete it, or compute and append it. One BLAS thread."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -4,8 +4,6 @@ A new stage needs a file with its row and an entry in the table of :mod:`ipsys_l
 needs a line in the table of :mod:`ipsys_log.messages.channels`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

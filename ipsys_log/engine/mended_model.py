@@ -1,7 +1,5 @@
 """A mended model as a new run of a log: the model before the motion, and the markers that show the motion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of measurements and models before any computation, and remarks on a stage while it runs."""
 
-from __future__ import annotations
-
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Output of messages to logs: to a new log, or as a run at the end of a log."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ The process has a session of its own: the keys of the terminal and a closed term
 It ends with its pipe, whatever it does, so that none remains after its parent.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

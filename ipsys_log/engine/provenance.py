@@ -7,8 +7,6 @@ The message indexes of images are spread over the whole log, one beside each chu
 would need a request for each of them.
 """
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

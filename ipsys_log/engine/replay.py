@@ -1,7 +1,5 @@
 """The stages of a replay in order: those that all models share, and then those of each model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

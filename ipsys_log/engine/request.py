@@ -1,7 +1,5 @@
 """The requests of the user, and the models, the rig and the settings of a log that they select."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """The state of recorded runs: would this software compute the same, and which one does a stage continue?"""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 

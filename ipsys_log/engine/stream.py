@@ -1,7 +1,5 @@
 """Streams of messages through stages: in one thread, or with one thread for each camera."""
 
-from __future__ import annotations
-
 import builtins
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

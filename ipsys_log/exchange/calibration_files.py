@@ -1,7 +1,5 @@
 """Camera intrinsics of files and logs, and writers of calibration files for OpenCV, ROS and Kalibr."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path

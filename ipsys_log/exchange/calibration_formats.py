@@ -7,8 +7,6 @@ https://github.com/ethz-asl/kalibr/wiki/yaml-formats,
 https://www.mathworks.com/help/vision/ref/cameraintrinsics.html
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass

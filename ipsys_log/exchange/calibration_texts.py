@@ -8,8 +8,6 @@ References
 http://wiki.ros.org/camera_calibration_parsers, https://colmap.github.io/format.html
 """
 
-from __future__ import annotations
-
 import codecs
 import json
 import re

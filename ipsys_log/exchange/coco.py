@@ -5,8 +5,6 @@ References
 Lin et al., "Microsoft COCO: Common Objects in Context", ECCV 2014; https://cocodataset.org/#format-data.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

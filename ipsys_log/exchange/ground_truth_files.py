@@ -1,7 +1,5 @@
 """Reader of ground truth from motion capture systems: CSV tables and TUM trajectories."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence

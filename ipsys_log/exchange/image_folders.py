@@ -1,7 +1,5 @@
 """Reader of folders of images as messages, with the times from their names or from a table."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator, Mapping

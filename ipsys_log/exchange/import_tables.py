@@ -1,7 +1,5 @@
 """Import of tables (CSV): calibration points, and detected markers as a run of a log."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Import of ground truth from another system: its clock and coordinates become those of the lab."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack

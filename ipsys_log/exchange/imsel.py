@@ -7,8 +7,6 @@ SciPy's reader of MAT files is not used: wrong types or flags in a file crash it
 Layout of the files: "MAT-File Format", The MathWorks, chapter 1.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator

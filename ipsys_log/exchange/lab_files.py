@@ -1,7 +1,5 @@
 """The files of a lab: cameras of the rig file with their intrinsics, and the new files of a simulated lab."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType

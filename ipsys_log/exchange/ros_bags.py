@@ -3,8 +3,6 @@
 The library decompresses whole chunks, files and messages, without a limit. The limits here are those of logs.
 """
 
-from __future__ import annotations
-
 import bz2
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

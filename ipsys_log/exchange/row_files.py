@@ -1,7 +1,5 @@
 """Files of rows: CSV with a header, with errors by file and line; and Parquet with nested columns."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re

@@ -1,7 +1,5 @@
 """Time offset and rigid alignment between ground truth of another system and the tracks of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

@@ -27,8 +27,6 @@ run (``execute``). :mod:`ipsys_log.capture` moves frames from the cameras into t
 from the log to the stages, as long as the stages keep up (``backlog``).
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Repair of logs whose recorder was killed: the recorder's runs are completed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 

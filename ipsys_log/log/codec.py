@@ -6,8 +6,6 @@ type from the type hints, so no field is defined twice. Numbers are stored witho
 So a payload that is read back equals the written payload, bit for bit.
 """
 
-from __future__ import annotations
-
 import json
 import types
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The messages of one topic in a log that this process is still writing."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

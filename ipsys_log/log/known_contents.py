@@ -1,7 +1,5 @@
 """Known contents of logs: a table of contents is parsed once, until another process changes the file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar

@@ -1,7 +1,5 @@
 """Locations of logs: a file, or the URL of an object in a store or on a server."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The logs of a list of locations, where a folder or a pattern stands for several logs."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Several logs as one: their conditions, their messages in one new log, and times shifted without a loss."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

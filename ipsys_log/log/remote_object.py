@@ -6,8 +6,6 @@ Each request asks for the version that was opened: by its ETag where the protoco
 by a look at size and time after the request.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

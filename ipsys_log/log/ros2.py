@@ -1,7 +1,5 @@
 """Conversion of ROS 2 messages (CDR) into payloads: images and camera intrinsics."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The channels of a log, in one table: their topics, their payloads, and their recognition by a reader."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import lru_cache

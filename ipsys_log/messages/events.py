@@ -1,7 +1,5 @@
 """Payloads about the log itself: events, latencies, clocks of nodes, and records of runs, cuts, merges."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Payloads of images: images, video frames, drawings, detected markers and their camera points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ipsys_log.messages.message import Corners, Mat33, Mat88, TimeNs, Vec3

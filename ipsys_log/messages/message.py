@@ -1,7 +1,5 @@
 """Messages: a payload on a topic; the types of the fields of payloads, and of other arrays."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Payloads of the calibration of a lab: tape measurements, fitted models, and their evaluation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, TimeNs, Vec3

@@ -1,7 +1,5 @@
 """Payloads of the lab: the rig, and the camera calibrations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ipsys_log.messages.message import Floats, Mat33, Mat34, TimeNs

@@ -1,7 +1,5 @@
 """Checks of a rig file: values in a wrong unit, and marker ids that do not exist."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Rig file ``lab.toml``: its reader, its checks, and its commented example."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -3,8 +3,6 @@
 The waypoints of robot runs are here, too, with the commands to the wheels that follow from positions.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ipsys_log.messages.message import Mat33, TimeNs, Vec3

@@ -1,7 +1,5 @@
 """Positions of markers by the joint model: the step of a frame, and the fitted model of the Python API."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Positions of markers by models of camera points: the step of a frame, and reports of wrong heights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from statistics import median

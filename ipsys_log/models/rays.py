@@ -4,8 +4,6 @@ A marker's depth from its size (eq. 3) is ten times as uncertain as its directio
 is known, its position on the floor follows from the direction alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 A log stores a fitted model as named arrays (:func:`parameters`, :func:`restore`), not as a pickle.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

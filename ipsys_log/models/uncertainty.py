@@ -7,8 +7,6 @@ points and on the error of the tape. It is small between the calibration points,
 and outside.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -4,8 +4,6 @@ The first hues are from Okabe and Ito (2008); some are lighter for a dark backgr
 than these hues: each further colour is the one with the greatest perceived distance from all colours before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 

@@ -4,8 +4,6 @@ The message paths of Foxglove cannot subtract. So small user scripts in the layo
 errors from the messages of the log.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Playback of a log in real time: the messages at the spacing of their capture times, under control."""
 
-from __future__ import annotations
-
 import heapq
 import threading
 from collections.abc import Callable, Iterable, Iterator

@@ -5,8 +5,6 @@ References
 https://mcap.dev/spec/registry#ros2, and ``rosbag2_storage_mcap`` for the metadata of topics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 from typing import BinaryIO, NamedTuple

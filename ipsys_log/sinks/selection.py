@@ -1,7 +1,5 @@
 """The runs and topics of a log that a display, a playback or an export shows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

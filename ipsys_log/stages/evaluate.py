@@ -1,7 +1,5 @@
 """The stage *evaluate*: errors of a model, effect of the number of points, and suspect measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ipsys_log.messages import Evaluation, Model

@@ -1,7 +1,5 @@
 """The stage *fit*: a model for the calibration points of each camera."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ipsys_log.messages import Model

@@ -1,7 +1,5 @@
 """The stage *fuse*: the positions of all cameras to one track per robot."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from math import cos, sin

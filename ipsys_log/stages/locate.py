@@ -1,7 +1,5 @@
 """The stage *locate*: camera points or corners to world positions, with the model of each camera."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ipsys_log.messages import Model

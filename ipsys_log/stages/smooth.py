@@ -1,7 +1,5 @@
 """The stage *smooth*: tracks that use the sightings before and after each instant, of the whole log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 

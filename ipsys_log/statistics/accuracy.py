@@ -1,7 +1,5 @@
 """Errors of models on held-out and cross-validated points (eq. 26, 27), and their statistics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

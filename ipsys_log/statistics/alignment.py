@@ -1,7 +1,5 @@
 """Camera poses relative to the floor, from markers on the floor (sect. 3 of the paper)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

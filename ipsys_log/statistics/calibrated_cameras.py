@@ -6,8 +6,6 @@ delays of the network that differ between both directions, or a latency of the c
 give.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Calibration points: the valid measurements, their world points and camera points, and training and test."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 

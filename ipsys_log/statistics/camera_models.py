@@ -1,7 +1,5 @@
 """Fitted models of cameras, each with the covariance of its positions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

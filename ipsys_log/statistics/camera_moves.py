@@ -1,7 +1,5 @@
 """Moves of cameras over several logs: which camera moved, and when, by mean corners of reference markers."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Usual errors of predictions by position and direction: the unit for the detection of outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Coverage of the floor by the fields of view, and areas where no image contains a whole marker."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Models fitted without some calibration points: cross-validation, leave-one-out, learning curves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

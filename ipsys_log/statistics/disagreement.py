@@ -7,8 +7,6 @@ by 0.3 mm at most, and a line of 0.3 s by 2.5 mm (v^2 t^2 / 8 r). The disagreeme
 that both cameras share.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ References
 Bishop, Pattern recognition and machine learning, 2006, sect. 3.5: the evidence approximation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Ground truth: true positions of markers; errors, ATE and RPE of positions and tracks against it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

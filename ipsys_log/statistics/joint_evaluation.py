@@ -1,7 +1,5 @@
 """The joint calibration of a log: its fit, and its errors on points that are not in the fit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any

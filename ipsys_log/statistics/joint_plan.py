@@ -5,8 +5,6 @@ is information about the cameras and the floor. The information of all sightings
 modes of the calibration, give the expected error after the drive, without a fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Latency ledger: the wall-clock time of each processing step of a position."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ than the errors of a calibration, beside its own uncertainty; or if the corners 
 squares. Markers in a hand explain nothing: their scatter makes the correction uncertain.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple

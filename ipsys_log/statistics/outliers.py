@@ -1,7 +1,5 @@
 """Outliers among measurements, and the typical blunder with tape and pencil that explains each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 The speed of a body does not depend on the coordinates. So the time offset is found before the alignment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ is larger if the tape measures the point more accurately. Greedy I-optimal desig
 other, the point that gives the least mean error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The mean error that remains after the stated error of the tape, with its confidence interval."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Stationary intervals of markers: in a whole log, and in the last second."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

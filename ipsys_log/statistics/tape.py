@@ -1,7 +1,5 @@
 """World points of calibration points by tape and ruler (eq. 25), and their covariances."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 

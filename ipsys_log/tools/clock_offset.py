@@ -4,8 +4,6 @@ The search correlates the pixel speeds of the same marker in both recordings. Th
 one image to positions in the other one: with the right offset, a smooth map fits best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Smaller copies of a log: a cut with a part of its messages, and a copy without superseded runs."""
 
-from __future__ import annotations
-
 import hashlib
 import heapq
 import re

@@ -1,7 +1,5 @@
 """Selection of a part of a log: its time range, topics, cameras, runs, robots and frames."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime

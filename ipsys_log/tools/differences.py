@@ -1,7 +1,5 @@
 """Differences between two runs, or between a run and a repetition of its stage, message by message."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

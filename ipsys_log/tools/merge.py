@@ -1,7 +1,5 @@
 """Merge of the logs of several recorders of one session: their clock offsets, and the new log."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Plan of a merge: the channels that come with each log, one rig of all, after a check for contradictions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, NamedTuple

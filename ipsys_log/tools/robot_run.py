@@ -1,7 +1,5 @@
 """A robot run in a log: its errors at the waypoints, the errors of its positions, and its stops."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, groupby

@@ -1,7 +1,5 @@
 """Verification that a log replays: every run is repeated from its input and compared byte for byte."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace

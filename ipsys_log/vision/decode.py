@@ -1,7 +1,5 @@
 """Decoding of images to grey pixels, after a check of the stated size."""
 
-from __future__ import annotations
-
 import struct
 import threading
 from collections.abc import Sequence

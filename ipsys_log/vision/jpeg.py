@@ -8,8 +8,6 @@ A decoder warns of flaws as of real damage. The pixels tell the difference: byte
 coded data change pixels only if coded data are missing.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from math import lcm

@@ -1,7 +1,5 @@
 """Lens distortion models: pixels to rays and back, horizontal planes, and intrinsics that no camera has."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Square markers: prints, camera points and headings (sect. 2.1 of the paper), and the corner noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

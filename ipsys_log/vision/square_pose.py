@@ -1,7 +1,5 @@
 """Pose estimation of square markers: both poses that explain the four corners."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The known times around other times, and values between them, except in gaps."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

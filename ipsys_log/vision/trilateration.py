@@ -1,7 +1,5 @@
 """World points from tape distances (eq. 25 of the paper), by least squares, and their covariance."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Each work can run twice: a log has its results as runs, and a run that exists is not computed again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

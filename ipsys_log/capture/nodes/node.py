@@ -1,7 +1,5 @@
 """The node: it sends the frames that its recorder has written, and sends again what did not arrive."""
 
-from __future__ import annotations
-
 import secrets
 import threading
 from collections import OrderedDict, deque

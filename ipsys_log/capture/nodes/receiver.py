@@ -4,8 +4,6 @@ With many nodes, the threads of Zenoh would take the time of the thread that com
 runs one of them at a time. The process passes on all arrivals together, up to a thousand times a second.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections import deque

@@ -5,8 +5,6 @@ ones. A video cannot be decoded in another order, so its packets are passed on i
 wait at the node.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Simulated calibration points: poses of the markers, and readings of tape and ruler."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Cameras of the simulated lab, like those of the paper, and their images of the empty floor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

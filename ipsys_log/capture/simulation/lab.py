@@ -1,7 +1,5 @@
 """Simulated session: rig, camera intrinsics, calibration points, driving robots, and ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

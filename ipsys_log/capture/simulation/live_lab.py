@@ -3,8 +3,6 @@
 Stationary markers can be used for alignment and measured at any time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

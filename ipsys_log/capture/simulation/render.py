@@ -16,8 +16,6 @@ The blurred coverage of each print is the weight of its light against the light 
 and rounding follow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

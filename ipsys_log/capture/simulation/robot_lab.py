@@ -1,7 +1,5 @@
 """The simulated lab with robots of two driven wheels: motion by commands of other programs, and images."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Sequence

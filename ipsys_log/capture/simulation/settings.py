@@ -1,7 +1,5 @@
 """Settings and random numbers of the simulated lab, and of a hall with a grid of cameras."""
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib

@@ -7,8 +7,6 @@ the ticks, which the simulator sends to the same port; the relay answers with th
 has sent on. With ``--ros2`` it does the same with the poses of ROS 2: see ``ros2_relay.py``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import select

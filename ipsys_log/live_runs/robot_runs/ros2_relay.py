@@ -4,8 +4,6 @@ Zenoh runs over TCP, which loses no message. So the relay is a node between the 
 loses whole messages.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A robot run: the paper's experiment with a mobile robot (sect. 4.3), in the simulated lab."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass

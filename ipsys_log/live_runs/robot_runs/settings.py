@@ -1,7 +1,5 @@
 """The settings of a robot run, its ports on loopback, and the checks of both before any work."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 They belong to the simulator, and are no stream: streams take no commands. docs/robot-run.md lists the fields.
 """
 
-from __future__ import annotations
-
 import json
 import select
 import socket

@@ -1,7 +1,5 @@
 """Warnings on a measurement: a point outside of the floor, a flat crossing angle, a contradicting model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Plausibility check of a measurement before it is saved, and of a typed distance AB."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

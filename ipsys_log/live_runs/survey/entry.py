@@ -1,7 +1,5 @@
 """Parser of typed measurements: text fields in centimetres become an entry in metres, or faults."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass

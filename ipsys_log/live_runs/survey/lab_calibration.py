@@ -1,7 +1,5 @@
 """Result of a joint calibration of a lab: expected errors, coverage, residuals, outliers, and what to add."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Measuring with live cameras: their present views, and measurements that go into the running log."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Joint calibration beside a recording: coverage and expected error while the robots drive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 

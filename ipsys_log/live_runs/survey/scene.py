@@ -1,7 +1,5 @@
 """The scene of a survey: a log or live cameras, and the predictions of its markers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

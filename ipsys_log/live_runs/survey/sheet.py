@@ -1,7 +1,5 @@
 """Sheets of tape measurements (CSV): their reader, and their append to a log. See docs/measuring.md."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re

@@ -1,7 +1,5 @@
 """Sightings of robots from the positions of a frame: by robot, at their capture times, with their errors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import isfinite

@@ -1,7 +1,5 @@
 """The recent sightings of one robot in order of time, and the growth of its covariance without them."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from functools import lru_cache

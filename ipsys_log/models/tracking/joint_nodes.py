@@ -1,7 +1,5 @@
 """The errors of a joint model at nodes of a grid: those of level markers, and of their height."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

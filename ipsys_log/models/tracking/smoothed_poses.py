@@ -6,8 +6,6 @@ differences between cameras and places, and leave the error that all sightings s
 considers the amplitudes has no optimal smoother, so this one estimates them.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

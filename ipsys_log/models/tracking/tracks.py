@@ -1,7 +1,5 @@
 """Tracks of robots from the sightings of all cameras, in the order in which they arrive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple

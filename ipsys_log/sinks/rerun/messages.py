@@ -1,7 +1,5 @@
 """Conversion of messages to Rerun entities, one message after the other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The scene of a Rerun recording: floor, calibration points, layout, and trails of robots that fade."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The Rerun viewer: its process, in a window or on a page, and the thread that sends messages to it live."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

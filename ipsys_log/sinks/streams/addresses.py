@@ -1,7 +1,5 @@
 """Addresses of streams: destinations and local addresses, loopback unless the user names a host."""
 
-from __future__ import annotations
-
 import errno
 import ipaddress
 import socket

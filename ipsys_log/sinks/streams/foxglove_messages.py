@@ -3,8 +3,6 @@
 Reference: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

@@ -1,7 +1,5 @@
 """The poses that streams send: position, velocity, covariance, age, and the number of the session."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass

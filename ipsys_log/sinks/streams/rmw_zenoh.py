@@ -7,8 +7,6 @@ References: ``docs/design.md``, ``liveliness_utils.cpp``, ``attachment_helpers.c
 ``rmw_publisher_data.cpp`` of https://github.com/ros2/rmw_zenoh (branches jazzy and kilted).
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import threading

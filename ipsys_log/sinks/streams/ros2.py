@@ -1,7 +1,5 @@
 """ROS 2 stream: poses as transforms, poses with covariance and odometry, over Zenoh and without ROS."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Mapping

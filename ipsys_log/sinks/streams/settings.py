@@ -1,7 +1,5 @@
 """The streams of a command: their settings, their check before any work, and the open streams."""
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager

@@ -1,7 +1,5 @@
 """UDP stream: one JSON object in each datagram, optionally signed (HMAC-SHA256)."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

@@ -5,8 +5,6 @@ the ids of its sender and its type, and a count. Header and content are padded t
 All numbers are big-endian. Each side numbers its own senders and types, and describes them by name.
 """
 
-from __future__ import annotations
-
 import struct
 from math import cos, sin
 from typing import NamedTuple

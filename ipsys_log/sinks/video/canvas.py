@@ -1,7 +1,5 @@
 """A picture to draw on: text, lines, discs and ellipses at fractions of pixels, with smooth edges."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path

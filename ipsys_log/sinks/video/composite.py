@@ -1,7 +1,5 @@
 """The pictures of a video: a panel for each camera on the left, and the map with the time on the right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime

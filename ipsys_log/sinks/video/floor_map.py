@@ -1,7 +1,5 @@
 """The map of the floor to scale: its grid, reference points, robots with trails, covariance ellipses."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The stage *detect*: frames to markers, tracked and fitted at their edges, or as in the paper."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress

@@ -6,8 +6,6 @@ distortion. A point x of the plane moves by d. The camera at c then sees the poi
 x + d_xy + (x - c)_xy d_z / c_z.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

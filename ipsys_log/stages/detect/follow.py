@@ -1,7 +1,5 @@
 """Tracking of the markers of one camera from frame to frame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

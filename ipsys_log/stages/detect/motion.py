@@ -1,7 +1,5 @@
 """Motion in the images of one camera: changed areas, and tracks of markers with their predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple

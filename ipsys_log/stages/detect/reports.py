@@ -1,7 +1,5 @@
 """Reports of detection over the whole log: unknown markers, other prints, and frames of another size."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ the cells of a far or foreshortened marker are too small for identification. All
 identified as markers are therefore read again at full size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any, NamedTuple

@@ -8,8 +8,6 @@ Under glare or half in a shadow, no single threshold separates black from white.
 differ if the print changes its colour between them, and hardly differ if it does not.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The dataset card: the form that an author fills in, and texts that are safe in Markdown."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import dataclass

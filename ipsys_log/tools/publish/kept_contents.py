@@ -1,7 +1,5 @@
 """Contents of a log that a pack keeps: channels, and images in which only the markers are sharp."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from glob import escape

@@ -6,8 +6,6 @@ Croissant Format Specification 1.0, MLCommons, http://mlcommons.org/croissant/1.
 the specification, with the prefix ``ipsys`` for the version of the pack.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Packing of logs: a folder or a zip archive with logs, rig, card (README), checksums and expected scores."""
 
-from __future__ import annotations
-
 import secrets
 import shutil
 import tempfile

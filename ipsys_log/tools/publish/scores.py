@@ -1,7 +1,5 @@
 """Scores of models on logs: the errors of an evaluation in mm, and the file of the expected scores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path

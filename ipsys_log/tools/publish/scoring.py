@@ -1,7 +1,5 @@
 """Re-scoring of a pack in a temporary copy, and of a model of the user, from a file that the user names."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import tempfile

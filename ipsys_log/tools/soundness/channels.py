@@ -1,7 +1,5 @@
 """Channels of a log: their schemas, the decoding of their messages, their rates, and recorded events."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The check of a log: its file first, then its channels, references and runs."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 

@@ -1,7 +1,5 @@
 """References between the messages of a log, and their times: order, stamps, outliers, clocks of nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 

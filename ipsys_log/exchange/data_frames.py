@@ -125,16 +125,13 @@ def read_table(
     return joined
 
 
-def read_table_parts(
-    session: Session, name: str, run: str | None, start_ns: int | None = None, end_ns: int | None = None
-) -> Iterator[pd.DataFrame]:
+def read_table_parts(session: Session, name: str, run: str | None) -> Iterator[pd.DataFrame]:
     """Yield a channel as tables of limited size, in log order: at least one, which may be empty.
 
     Parameters
     ----------
     name : one of :data:`TABLES`.
     run : the run to read; None for a recorded channel.
-    start_ns, end_ns : log times; the end is not included.
 
     Raises
     ------
@@ -143,10 +140,10 @@ def read_table_parts(
     """
     pandas = _import_for(name)
     if name in _ITEMS:
-        for part in _item_parts(session, _ITEMS[name], run, start_ns, end_ns):
+        for part in _item_parts(session, _ITEMS[name], run, None, None):
             yield _typed(pandas, pandas.DataFrame(part, copy=False))
     else:
-        yield _read_run(pandas, session, name, run, start_ns, end_ns)
+        yield _read_run(pandas, session, name, run, None, None)
 
 
 def _import_for(name: str) -> Any:

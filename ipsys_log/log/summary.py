@@ -51,17 +51,13 @@ def temporary_tail_data_end(view: LogBytes, offset: int) -> int | None:
     return mark[3] if mark[:3] == expected and len(MAGIC) <= mark[3] < offset else None
 
 
-def tail_bytes(contents: Contents, offset: int | None = None, *, index_chunks: bool = True) -> bytes:
-    """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`.
-
-    If a log has chunk indexes, other readers search for messages only in chunks. So a log that also has
-    messages outside of chunks gets no chunk indexes (`index_chunks`).
-    """
+def tail_bytes(contents: Contents, offset: int | None = None) -> bytes:
+    """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`."""
     start = (contents.data_end if offset is None else offset) + DATA_END.size
     summary, offsets = b"", b""
     for opcode, records in _groups(contents):
         group = to_bytes(*records)
-        if group and (index_chunks or opcode != Opcode.CHUNK_INDEX):
+        if group:
             offsets += to_bytes(mcap.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
     footer = FOOTER.pack(Opcode.FOOTER, 20, start, start + len(summary), 0)[:-4]

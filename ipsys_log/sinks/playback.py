@@ -224,18 +224,12 @@ class Playback:
 _TURN_S = 0.1
 
 
-def in_capture_order(messages: Iterable[Message], window_ns: int = _LOGGED_AFTER_NS) -> Iterator[Message]:
-    """Yield messages in the order of their capture times.
-
-    Parameters
-    ----------
-    messages : messages in log order.
-    window_ns : the longest time between the capture of a message and its log time.
-    """
+def in_capture_order(messages: Iterable[Message]) -> Iterator[Message]:
+    """Yield messages in log order in the order of their capture times."""
     waiting: list[tuple[int, int, Message]] = []
     for number, message in enumerate(messages):
         heapq.heappush(waiting, (message.publish_time_ns, number, message))
-        while waiting and waiting[0][0] + window_ns <= message.log_time_ns:
+        while waiting and waiting[0][0] + _LOGGED_AFTER_NS <= message.log_time_ns:
             yield heapq.heappop(waiting)[-1]
     while waiting:
         yield heapq.heappop(waiting)[-1]

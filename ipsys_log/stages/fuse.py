@@ -30,7 +30,7 @@ from ipsys_log.models.tracking.track_messages import (
     track_reads,
     tracked_part,
 )
-from ipsys_log.models.tracking.tracks import Pose, RobotTracks, TrackSettings
+from ipsys_log.models.tracking.tracks import Pose, RobotTracks
 
 
 class Fuse:
@@ -46,10 +46,10 @@ class Fuse:
     Late frames have wrong times; an event of their camera names them. Their positions are in no pose.
     """
 
-    def __init__(self, run: str, model: Model | None = None, settings: TrackSettings | None = None) -> None:
+    def __init__(self, run: str, model: Model | None = None) -> None:
         self._run, self._reader = run, FrameReader(model)
         self._rig: Rig | None = None
-        self._settings, self._tracks = settings, RobotTracks(settings)
+        self._tracks = RobotTracks()
         self._late_frames = LateFrames()
 
     def __call__(self, message: Message) -> Iterator[Any]:
@@ -69,7 +69,7 @@ class Fuse:
         count = self._reader.modes.count
         self._reader.use_rig(rig)
         if count != self._reader.modes.count:
-            self._tracks = RobotTracks(self._settings, self._reader.modes.fade_m)
+            self._tracks = RobotTracks(fade_m=self._reader.modes.fade_m)
 
     def _poses(self, message: Message) -> list[Pose]:
         poses = self._tracks.coast_before(message.publish_time_ns)

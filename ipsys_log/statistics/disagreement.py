@@ -32,6 +32,7 @@ LONGEST_GAP_NS = 300_000_000
 _SQUARE_95 = -2 * np.log(1 - 0.95)
 _FIELDS = ("id", "x_m", "y_m", "covariance_m2", "inside", "time_offset_ns")
 _FEWEST = 3
+_MOST_INTERVALS = 60
 _FARTHEST_M = 1e6
 
 
@@ -231,10 +232,10 @@ def divide_floor(pairs: Sequence[PairDisagreement], size_m: float = 0.25) -> lis
     return cells
 
 
-def divide_time(pair: PairDisagreement, most: int = 60) -> list[DisagreementInterval]:
-    """Return at most so many intervals with at least three differences, each of at least a second."""
+def divide_time(pair: PairDisagreement) -> list[DisagreementInterval]:
+    """Return at most 60 intervals with at least three differences, each of at least a second."""
     first_ns, last_ns = int(pair.times_ns[0]), int(pair.times_ns[-1]) + 1
-    step_ns = max(NS_PER_S, -(-(last_ns - first_ns) // most))
+    step_ns = max(NS_PER_S, -(-(last_ns - first_ns) // _MOST_INTERVALS))
     numbers = (pair.times_ns - first_ns) // step_ns
     intervals = []
     for number in np.unique(numbers).tolist():

@@ -199,19 +199,13 @@ class TrajectoryErrors(NamedTuple):
 
 
 def trajectory_errors(
-    tracks: Mapping[int, TrackedPath],
-    ground_truth: Mapping[int, TrackedPath],
-    deltas: Sequence[tuple[float, str]] = DELTAS,
+    tracks: Mapping[int, TrackedPath], ground_truth: Mapping[int, TrackedPath]
 ) -> list[TrajectoryErrors]:
     """Return the absolute trajectory error (ATE) and the relative pose error (RPE) of each robot.
 
     All instants of a track with a ground truth count. The truth is interpolated linearly between instants up
-    to 0.1 s apart. A pair of the RPE is each instant with the later one that is nearest to ``delta``: within
-    10 % of a distance along the true path, or within half an interval of a time.
-
-    Parameters
-    ----------
-    deltas : distances in ``m`` or times in ``s`` of the relative pose error.
+    to 0.1 s apart. A pair of the RPE is each instant with the later one that is nearest to a distance
+    or a time of ``DELTAS``: within 10 % of a distance along the true path, or half an interval of a time.
 
     References
     ----------
@@ -222,7 +216,7 @@ def trajectory_errors(
     found = []
     for marker_id, track in sorted(tracks.items()):
         if marker_id in ground_truth:
-            errors = _errors_of(track, ground_truth[marker_id], deltas)
+            errors = _errors_of(track, ground_truth[marker_id])
             if errors is not None:
                 found.append(errors)
     return found
@@ -241,9 +235,7 @@ def pool_trajectories(trajectories: Sequence[TrajectoryErrors]) -> TrajectoryErr
     return TrajectoryErrors("", np.vstack([one.offsets_m for one in trajectories]), tuple(relative))
 
 
-def _errors_of(
-    track: TrackedPath, truth: TrackedPath, deltas: Sequence[tuple[float, str]]
-) -> TrajectoryErrors | None:
+def _errors_of(track: TrackedPath, truth: TrackedPath) -> TrajectoryErrors | None:
     rows = last_poses(track.positions)
     times_ns = track.positions.times_ns[rows]
     brackets = bracket_times(truth.positions.times_ns, times_ns, LONGEST_GAP_NS)
@@ -260,7 +252,6 @@ def _errors_of(
         times_ns[used],
         (points_m[used], true_m[used]),
         (headings_rad[used], true_rad[used]) if has_headings.any() else None,
-        deltas,
     )
     return TrajectoryErrors(track.robot, points_m - true_m, tuple(relative))
 
@@ -276,14 +267,13 @@ def _relative_errors(
     times_ns: NDArray[np.int64],
     points_m: tuple[Array, Array],
     headings_rad: tuple[Array, Array] | None,
-    deltas: Sequence[tuple[float, str]],
 ) -> list[RelativeErrors]:
     steps_m = np.linalg.norm(np.diff(points_m[1], axis=0), axis=1)
     passed = {"m": np.append(0.0, np.cumsum(steps_m)), "s": (times_ns - times_ns[0]) / NS_PER_S}
     intervals_s = np.diff(passed["s"])
     half_s = _INTERVAL_SHARE * float(np.median(intervals_s)) if len(intervals_s) else 0.0
     found = []
-    for delta, unit in deltas:
+    for delta, unit in DELTAS:
         start, end = pairs_at(passed[unit], delta, half_s if unit == "s" else _DISTANCE_SHARE * delta)
         if len(start):
             moves_m = [rows[end] - rows[start] for rows in points_m]

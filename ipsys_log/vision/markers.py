@@ -257,11 +257,11 @@ def printed_cells(placed: PlacedMarker | PlacedBoard, dictionary: str) -> tuple[
     return cells, (len(cells) - 2) / placed.length_m
 
 
-def print_outline(placed: PlacedMarker | PlacedBoard, dictionary: str, per_side: int = 8) -> Array:
-    """Return points around the edge of a print, white margin included, (4 per_side, 3) in world m."""
+def print_outline(placed: PlacedMarker | PlacedBoard, dictionary: str) -> Array:
+    """Return points around the edge of a print, white margin included, (32, 3) in world m."""
     cells, cells_per_m = printed_cells(placed, dictionary)
     corners = marker_corners(1 / cells_per_m) * [cells.shape[1], cells.shape[0], 1]
-    step = np.linspace(0, 1, per_side, endpoint=False)[None, :, None]
+    step = np.linspace(0, 1, 8, endpoint=False)[None, :, None]
     sides = corners[:, None] + step * (np.roll(corners, -1, axis=0) - corners)[:, None]
     return transform(placed.world_from_marker, sides.reshape(-1, 3))
 

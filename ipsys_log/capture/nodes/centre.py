@@ -125,7 +125,6 @@ class Centre:
     cameras : cameras whose source is a node.
     network : the address and the certificates.
     version : the version of ipsys here; a node with another version is refused.
-    is_stopped : ends the wait for the first answer of a node.
 
     Raises
     ------
@@ -133,15 +132,9 @@ class Centre:
         On entering: the centre cannot listen.
     """
 
-    def __init__(
-        self,
-        cameras: Sequence[RigCamera],
-        network: NodeNetwork,
-        version: str,
-        is_stopped: Callable[[], bool] = lambda: False,
-    ) -> None:
+    def __init__(self, cameras: Sequence[RigCamera], network: NodeNetwork, version: str) -> None:
         self._nodes = {camera.name: node_of(camera) for camera in cameras}
-        self._network, self._version, self._is_stopped = network, version, is_stopped
+        self._network, self._version = network, version
         self._session: zenoh.Session | None = None
         self._links: dict[str, _Link] = {}
 
@@ -174,7 +167,7 @@ class Centre:
             period_s = partial(exchange_period_s, nodes=len(self._nodes))
             link = _Link(self._session, camera, self._nodes[camera.name], stream, clock, period_s)
             self._links[camera.name] = link
-        yield chain(link.await_node(self._network, say, self._is_stopped), link.items(self._network))
+        yield chain(link.await_node(self._network, say), link.items(self._network))
 
 
 def _directly(receive: Callable[[Any], None]) -> Any:
@@ -212,8 +205,8 @@ class _Link:
         self._asks_frames = False
         self._subscriber = session.declare_subscriber(frames_key(node), _directly(self._receive))
 
-    def await_node(self, network: NodeNetwork, say: Say, is_stopped: Callable[[], bool]) -> Iterator[None]:
-        """Yield None until the node has answered, or until a stop; ``say`` reports a longer wait.
+    def await_node(self, network: NodeNetwork, say: Say) -> Iterator[None]:
+        """Yield None until the node has answered; ``say`` reports a longer wait.
 
         Raises
         ------
@@ -224,7 +217,7 @@ class _Link:
         is_said, is_first = False, not self._stream.is_known
         while not (self._exchanges >= _OPENING_EXCHANGES and self._stream.is_known):
             waited_s = (self._clock.now_ns() - start_ns) / NS_PER_S
-            if waited_s > _FIRST_ANSWER_S or is_stopped():
+            if waited_s > _FIRST_ANSWER_S:
                 break
             if waited_s > _WAIT_UNSAID_S and not is_said and not self._exchanges:
                 is_said = True

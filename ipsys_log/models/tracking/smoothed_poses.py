@@ -223,7 +223,6 @@ def smooth_positions(
     frames: Iterable[Frame],
     rig: Rig,
     model: Model | None,
-    settings: TrackSettings | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[SmoothedPose]:
     """Return the smoothed poses of all robots, one for each instant of a sighting, in order of time.
@@ -237,11 +236,10 @@ def smooth_positions(
     frames : of all cameras, in any order.
     rig : the markers of the robots.
     model : the model of the positions; None for positions of another program.
-    settings : the limits of tracks.
     progress : called with the share of the work after the reading of the frames: half of it is the filter of
         all frames, half the smoothing of the tracks.
     """
-    limits, reader, sources = settings or TrackSettings(), FrameReader(model), _Sources()
+    limits, reader, sources = TrackSettings(), FrameReader(model), _Sources()
     reader.use_rig(rig)
     tracks = _filter(frames, reader, sources, limits, lambda share: progress(share / 2))
     histories = [(robot, history.everything()) for robot, history in tracks.histories()]

@@ -58,12 +58,7 @@ def sample(grey: Grey) -> Grey:
     return np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
 
 
-def search(
-    grey: Grey,
-    dictionary: str,
-    region: tuple[slice, slice] = WHOLE,
-    samples: Grey | None = None,
-) -> list[Candidate]:
+def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
     """Find markers in an image, with approximate corners.
 
     Parameters
@@ -71,10 +66,9 @@ def search(
     grey : (height, width).
     dictionary : OpenCV's name, such as DICT_4X4_100.
     region : rows and columns to search.
-    samples : reduced image of the region, if it is known.
     """
     part = np.ascontiguousarray(grey[region])
-    return _placed(search_squares(part, dictionary, samples)[0], region)
+    return _placed(search_squares(part, dictionary)[0], region)
 
 
 def search_squares(grey: Grey, dictionary: str, samples: Grey | None = None) -> tuple[list[Candidate], Array]:

@@ -192,7 +192,7 @@ class MavlinkStream:
         north_rad: float,
     ) -> None:
         self.name = f"MAVLink {endpoint.robot}={endpoint.target}"
-        self._robot, self._encode = endpoint.robot, _MESSAGES[endpoint.message]
+        self._encode = _MESSAGES[endpoint.message]
         self._poses, self._now_ns, self._north_rad = poses, now_ns, north_rad
         self._drops = DropReport(self.name, warn)
         self._destination = find_destination(endpoint.target, "--mavlink")

@@ -3,6 +3,8 @@
 A compressor stores 1 GB of zeros in 33 kB, and half a million empty messages in about 1 kB. Recorded
 logs stay far below every limit. Each byte of their file unpacks to 2 to 4 bytes, and a message takes
 170 bytes or more.
+
+In a file, an unfinished append takes the old tail from its journal.
 """
 
 import os

@@ -2,9 +2,6 @@
 
 A version rises by one with each change of the output for the same input. The parameters of a run name its
 versions, except version 1. Versions of packages make no run out of date: they are in its fingerprint.
-
-The message indexes of images are spread over the whole log, one beside each chunk of images. A log at a URL
-would need a request for each of them.
 """
 
 import platform
@@ -278,7 +275,8 @@ def channel_times(session: Session, topic: str) -> NDArray[np.int64]:
     """Return the log times of the messages of a topic in ns, sorted, shape (N,).
 
     A derived message has the log time of the message that it was made from. So the times of images are those
-    of their markers, if a complete run has read these images, and has a message for each of them.
+    of their markers, if a complete run has read these images, and has a message for each of them. The message
+    indexes of images are spread over the whole log, so a log at a URL would need a request for each of them.
     """
     source = _marker_topic(session, topic) if topic in session.images.values() else None
     wanted = source or topic

@@ -64,7 +64,7 @@ def test_frames_show_each_marker_where_it_is() -> None:
     lying = {where.marker_id: where for where in lab.stationary}
     seen = set()
     for time_ns, (_, frame) in list(zip(times_ns, came, strict=True))[::3]:
-        since_s = image_index(round(time_ns * 20 / NS_PER_S), 20) / 20
+        since_s = lab.time_of(image_index(round(time_ns * 20 / NS_PER_S), lab.images))
         grey = decode_grey(CompressedImage(time_ns, "red", frame.data, frame.format))
         for marker in detect_markers(grey, seat.lab.dictionary):
             where = lying.get(marker.id) or lab.drive.pose_at(marker.id, since_s)

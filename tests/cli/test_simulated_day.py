@@ -40,13 +40,12 @@ PATIENCE_S = 900
 def errors_m(log: Path, run: str = "poly") -> np.ndarray:
     """Return the distances between the tracks of a log and the true simulated positions, (n,), in m."""
     lab = plan_live_lab(LIVE_SETTINGS)
-    count = round(LIVE_SETTINGS.drive_s * LIVE_SETTINGS.rate_hz)
     lying = {where.marker_id: where for where in lab.stationary}
     offsets = []
     with Session([log]) as session:
         for tracks in session.payloads(session.topics(TRACKS, run)):
             frame = round(tracks.timestamp * LIVE_SETTINGS.rate_hz / 1e9)
-            time_s = image_index(frame, count) / LIVE_SETTINGS.rate_hz
+            time_s = lab.time_of(image_index(frame, lab.images))
             for track in tracks.tracks:
                 true = lying.get(track.id) or lab.drive.pose_at(track.id, time_s)
                 offsets.append((track.x_m - true.x_m, track.y_m - true.y_m, track.z_m - true.z_m))

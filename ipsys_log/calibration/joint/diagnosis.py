@@ -240,7 +240,7 @@ def _wrong_sightings(fit: JointFit) -> list[Finding]:
     findings = []
     problem, observations = fit.problem, fit.observations
     for factors in problem.sightings:
-        chi2 = (factors.residuals(fit.state, problem.layout, problem.trajectories) ** 2).sum(axis=1)
+        chi2 = factors.chi2(fit.state, problem.layout, problem.trajectories)
         camera = observations.cameras[factors.camera].name
         for row in np.flatnonzero(chi2 > 2 * factors.limit).tolist():
             score = float(np.sqrt(chi2[row]))

@@ -172,7 +172,7 @@ def explain_divergence(error: ConvergenceError, observations: Observations) -> F
     problem, state = error.problem, error.state
     counts = {camera: [0, 0] for camera in range(len(observations.cameras))}
     for factors in problem.sightings:
-        chi2 = (factors.residuals(state, problem.layout, problem.trajectories) ** 2).sum(axis=1)
+        chi2 = factors.chi2(state, problem.layout, problem.trajectories)
         counts[factors.camera][0] += len(chi2)
         counts[factors.camera][1] += int((chi2 <= factors.limit).sum())
     lost = [
@@ -211,7 +211,7 @@ def _fit(
         # The wobble of a robot acts on its corners by the poses, so that these come first.
         tilts = settings.wobble_sigma_rad, settings.wobble_time_s
         problem = problem.reweighted(state, *tilts)
-        state = solve(problem, state, progress, _ROUGH, observations.in_hall).state
+        state = solve(problem, state, progress, _ROUGH, observations.in_hall, settings.follows_valleys).state
         problem = problem.reweighted(state, *tilts)
     if not problem.layout.floor.count or not settings.floor_sigma_spread:
         return _solve(observations, settings, problem, state, progress)
@@ -231,7 +231,7 @@ def _solve(
     progress: Callable[[int, float], None],
     short: float = SHORT,
 ) -> JointFit:
-    solution = solve(problem, state, progress, short)
+    solution = solve(problem, state, progress, short, follows_valleys=settings.follows_valleys)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
 
 

@@ -113,8 +113,13 @@ def _fit_readings(observations: Observations, settings: JointSettings, progress:
         raise
     except FitError as caught:
         error = caught
-    if fit is not None and not _is_contradicted(fit):
-        return fit
+    if fit is not None:
+        if not _is_contradicted(fit):
+            return fit
+        # A motion of a camera would spoil the shape of the points, which explains the readings.
+        moved = _explain_cameras(fit, settings, progress)
+        if not _is_contradicted(moved):
+            return moved
     explanations = _explain_tape(observations, settings, progress)
     if explanations and not explanations[0].changes:
         # The readings as they are need no other explanation.
@@ -151,11 +156,8 @@ def _is_contradicted(fit: JointFit) -> bool:
 
 
 def _outlier_share(fit: JointFit) -> float:
-    count = outliers = 0
-    for factors in fit.problem.sightings:
-        chi2 = (factors.residuals(fit.state, fit.problem.layout, fit.problem.trajectories) ** 2).sum(axis=1)
-        count, outliers = count + len(chi2), outliers + int((chi2 > factors.limit).sum())
-    return outliers / max(count, 1)
+    shares = fit.problem.shares_of_limit(fit.state)
+    return float((shares > 1).mean()) if len(shares) else 0.0
 
 
 def _explain_tape(
@@ -336,13 +338,13 @@ def _name_rivals(fit: JointFit, possible: Sequence[CameraMotion | None]) -> Find
 def _gain(fit: JointFit, trial: JointFit | None) -> float:
     """Return by how much twice the cost of a fit is more than that of a trial.
 
-    A reading costs no more than a wrong number: a motion of a camera explains no mistyped height.
+    A reading costs no more than a wrong number, and an outlier no more than its limit: a motion of a camera
+    explains no mistyped height, and no single sighting.
     """
     if trial is None:
         return 0.0
     before, after = (
-        2 * one.solution.cost - one.problem.points.excess_loss(one.state, one.problem.layout, WRONG_NUMBER)
-        for one in (fit, trial)
+        2 * one.solution.cost - one.problem.excess_loss(one.state, WRONG_NUMBER) for one in (fit, trial)
     )
     return before - after
 
@@ -404,8 +406,9 @@ def _try_motion(
 
 
 def _refit(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit | None:
-    """Return the fit of changed observations; None if they determine nothing."""
+    """Return the fit of changed observations; None if they determine nothing, or only after minutes."""
     try:
-        return fit_jointly(observations, settings, progress)
+        fit = fit_jointly(observations, replace(settings, follows_valleys=False), progress)
+        return replace(fit, settings=settings)
     except FitError:
         return None

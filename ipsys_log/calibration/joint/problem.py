@@ -34,7 +34,7 @@ class Problem:
         """Return half the sum of the losses; ``ease`` multiplies the limits between error and outlier."""
         total = self.points.cost(state, self.layout, ease)
         for factors in self.sightings:
-            chi2 = (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1)
+            chi2 = factors.chi2(state, self.layout, self.trajectories)
             total += float(robust_loss(chi2, factors.limit * ease)[0].sum()) / 2
         total += float((self.trajectories.acceleration_residuals(state) ** 2).sum()) / 2
         return total + float(self._prior_loss(state)[1].sum()) / 2
@@ -91,12 +91,21 @@ class Problem:
 
     def ease(self, state: State) -> float:
         """Return the factor by which the limits of the loss must grow so that half of the sightings fit."""
-        chi2 = [
-            (factors.residuals(state, self.layout, self.trajectories) ** 2).sum(axis=1) / factors.limit
-            for factors in self.sightings
-        ]
-        every = np.concatenate(chi2) if chi2 else np.zeros(1)
-        return max(1.0, 2 * float(np.median(every)))
+        shares = self.shares_of_limit(state)
+        return max(1.0, 2 * float(np.median(shares))) if len(shares) else 1.0
+
+    def shares_of_limit(self, state: State) -> Array:
+        """Return chi2 of all sightings, (n,), as shares of the largest chi2 of a normal error."""
+        shares = [one.chi2(state, self.layout, self.trajectories) / one.limit for one in self.sightings]
+        return np.concatenate([np.zeros(0), *shares])
+
+    def excess_loss(self, state: State, most: float) -> float:
+        """Return the sum of the losses of readings above ``most``, and of outliers above their limit."""
+        excess = self.points.excess_loss(state, self.layout, most)
+        for factors in self.sightings:
+            chi2 = factors.chi2(state, self.layout, self.trajectories)
+            excess += float(np.maximum(robust_loss(chi2, factors.limit)[0] - factors.limit, 0).sum())
+        return excess
 
 
 def find_blocks(

@@ -32,6 +32,7 @@ class JointSettings:
     robot_height_sigma_m : error of the height at which a robot carries its marker, where the rig has none.
     acceleration_sigma, turn_sigma : usual acceleration of a robot, in m/s^2 and rad/s^2. They bridge gaps of
         the path without sightings.
+    follows_valleys : whether a fit that does not converge in the usual steps goes on with long ones.
     """
 
     floor_sigma_m: float = 0.001
@@ -54,3 +55,4 @@ class JointSettings:
     robot_height_sigma_m: float = 0.001
     acceleration_sigma: float = 3.0
     turn_sigma: float = 10.0
+    follows_valleys: bool = True

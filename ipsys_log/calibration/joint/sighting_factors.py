@@ -106,6 +106,10 @@ class SightingFactors:
         pixels = project_points(block.model, state.values[block.lens], points_c.reshape(-1, 3))
         return self._whiten(pixels, state.values[block.edge])
 
+    def chi2(self, state: State, layout: Layout, trajectories: Trajectories) -> Array:
+        """Return the sums of the squares of the whitened residuals, (n,)."""
+        return np.asarray((self.residuals(state, layout, trajectories) ** 2).sum(axis=1))
+
     def add_to(
         self, normal: NormalEquations, state: State, layout: Layout, trajectories: Trajectories, ease: float
     ) -> None:

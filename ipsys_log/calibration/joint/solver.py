@@ -77,6 +77,7 @@ def solve(
     progress: Callable[[int, float], None] = lambda step, cost: None,
     short: float = SHORT,
     patient: bool = False,
+    follows_valleys: bool = True,
 ) -> Solution:
     """Minimise the cost of a problem, from a start.
 
@@ -92,6 +93,7 @@ def solve(
     patient : whether the limit falls only after convergence; until then, the whole lab moves to its measured
         points before each step. In a hall, the sightings fit long before the cameras fit to the few measured
         points, which would then count as outliers.
+    follows_valleys : whether long steps along a curved valley follow the usual ones; they may take minutes.
 
     Raises
     ------
@@ -127,7 +129,7 @@ def solve(
     if ease == 1.0 and decrement <= _TOLERABLE**2:
         # Outliers at the limit of the loss slow the last steps, without an effect on the result.
         return _finish(problem, state, cost, _MOST_STEPS)
-    if ease == 1.0:
+    if ease == 1.0 and follows_valleys:
         return _follow_valley(problem, state, normal, progress, short)
     raise ConvergenceError(_NOT_CONVERGED, problem, state)
 

@@ -151,7 +151,7 @@ class Drive:
         # The robot accelerates: its way on the path grows by this share of the time.
         share = np.where(times_s > 0, 1 - np.exp(-np.maximum(times_s, 0.0) / _START_S), 0.0)
         if pace is not None:
-            share = share * pace.share_at(_driven_s(times_s))
+            share = share * pace.share_at(eased_s(times_s))
         _, (dx, dy) = self.path.at(self._phase(way_s))
         return np.stack([dx, dy], axis=1) * (by_way * share)[:, None]
 
@@ -166,7 +166,7 @@ class Drive:
 
     def _way_s(self, ahead_s: float, times_s: Array, pace: Pace | None = None) -> Array:
         """Return the place on the path (n,), as the time from its start to there at full speed."""
-        driven_s = _driven_s(times_s)
+        driven_s = eased_s(times_s)
         if pace is not None:
             driven_s = pace.driven_s(driven_s)
         return np.asarray((ahead_s + driven_s) % self.times_s[-1])
@@ -175,7 +175,7 @@ class Drive:
         return np.interp(way_s, self.times_s, self.phases_rad)
 
 
-def _driven_s(times_s: Array) -> Array:
+def eased_s(times_s: Array) -> Array:
     """Return the ways (n,) of a robot that never stops, as the time for them at full speed."""
     driven_s: Array = times_s - _START_S * (1 - np.exp(-times_s / _START_S))
     return driven_s

@@ -22,7 +22,7 @@ from ipsys_log.capture.simulation.calibration_points import (
     tape_lengths_m,
 )
 from ipsys_log.capture.simulation.cameras import Camera, Check, FloorView, mount_cameras, prepare_view, sees
-from ipsys_log.capture.simulation.drive import Drive, plan_drive
+from ipsys_log.capture.simulation.drive import Drive, eased_s, plan_drive
 from ipsys_log.capture.simulation.lab import build_rig, moving_marker
 from ipsys_log.capture.simulation.render import Print, add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
@@ -160,6 +160,19 @@ class LiveLab:
     drive: Drive
     stationary: tuple[SimulatedPose, ...]
 
+    @property
+    def images(self) -> int:
+        """The number of different images of a camera."""
+        return max(round(self.settings.drive_s * self.settings.rate_hz), 1)
+
+    def time_of(self, image: int) -> float:
+        """Return the time of the drive in an image, in s; the robots brake before they turn back."""
+        last = self.images - 1
+        if not image:
+            return 0.0
+        left, whole = eased_s(np.array([last - image, last]) / self.settings.rate_hz)
+        return float(1 - left / whole) * last / self.settings.rate_hz
+
 
 def plan_live_lab(settings: LabSettings) -> LiveLab:
     """Plan a lab in which each camera sees about ``settings.stations`` stationary markers.
@@ -292,7 +305,7 @@ def lab_film(settings: LabSettings, number: int, check: Check) -> Film:
     check : called between the steps; its exceptions end the work.
     """
     lab = plan_live_lab(settings)
-    count = max(round(settings.drive_s * settings.rate_hz), 1)
+    count = lab.images
     check()
     bare = prepare_view(mount_cameras(settings)[number], settings, check)
     view = add_static_prints(bare, [place_marker(pose, settings) for pose in lab.stationary], settings)
@@ -350,7 +363,7 @@ def next_missing(film: Film, drawn: Container[int], frame: int) -> int | None:
 
 
 def _moving_marker(lab: LiveLab, index: int) -> list[Print]:
-    time_s = index / lab.settings.rate_hz
+    time_s = lab.time_of(index)
     return [moving_marker(lab.drive, marker_id, time_s, lab.settings) for marker_id in lab.drive.ahead_s]
 
 

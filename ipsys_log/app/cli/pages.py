@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ipsys_log.live_runs.player import Player
     from ipsys_log.live_runs.survey.scene import MeasuringScene
     from ipsys_log.messages import Model
-    from ipsys_log.sinks.streams.settings import Stream
+    from ipsys_log.sinks.streams.opening import Stream
 
 _USUAL_PORT = 8000
 _GAP = 4

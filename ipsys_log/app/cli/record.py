@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Model
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.sink import Sink
-    from ipsys_log.sinks.streams.settings import StreamSettings
+    from ipsys_log.sinks.streams import StreamSettings
 
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
 
@@ -283,7 +283,7 @@ def live(
     from ipsys_log.engine.options import Request
     from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
-    from ipsys_log.sinks.streams.settings import check_streams, open_live_streams
+    from ipsys_log.sinks.streams.opening import check_streams, open_live_streams
 
     for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
         if is_wanted:

@@ -11,10 +11,10 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_origin, get_type_hints
 
 import typer
 
@@ -22,11 +22,11 @@ from ipsys_log.app.cli.console import say
 from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option
 from ipsys_log.app.cli.pages import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
+from ipsys_log.sinks.streams import StreamOption, StreamSettings
 
 if TYPE_CHECKING:
     from ipsys_log.live_runs.player import Player
     from ipsys_log.messages import Rig
-    from ipsys_log.sinks.streams.settings import StreamSettings
 
 # The options of the streams, by the names of `choose_streams`.
 StreamOptions = dict[str, Any]
@@ -75,60 +75,26 @@ Restamp = Annotated[
 
 
 _PANEL = "Streams of positions"
-_option, _flag = partial(option, rich_help_panel=_PANEL), partial(flag, rich_help_panel=_PANEL)
+_option = partial(option, rich_help_panel=_PANEL)
 
 
-def _port(name: str, text: str) -> Option:
-    return _option(int | None, name, "PORT", text, min=1, max=65535)
+def _options_of(setting: str, described: StreamOption) -> Iterator[tuple[str, Option]]:
+    """Yield the option of a setting, and for a server that of its port."""
+    name = described.name or f"--{setting.replace('_', '-')}"
+    if described.metavar:
+        kind = _KINDS[setting]
+        kind = list[str] if get_origin(kind) is tuple else kind
+        yield setting, _option(kind | None, name, described.metavar, described.help)
+    else:
+        yield setting, flag(name, described.help, rich_help_panel=_PANEL)
+    if described.port is not None:
+        port = _option(int | None, f"{name}-port", "PORT", described.port_help, min=1, max=65535)
+        yield f"{setting}_port", port
 
 
-_OPTIONS: dict[str, Option] = {
-    "udp": _option(
-        list[str] | None, "--udp", "HOST:PORT",
-        "Send positions as JSON datagrams to this address; repeat it for several. 239.255.0.1:9870 is a "
-        "multicast group. docs/streams.md has receivers in Python and for ESP32.",
-    ),
-    "key": _option(
-        Path | None, "--key", "FILE", "Sign the datagrams with the key in this file (HMAC-SHA256)."
-    ),
-    "vrpn": _flag(
-        "--vrpn",
-        "Serve positions over VRPN on port 3883, as a motion-capture system: for ROS 2, MATLAB, Unity.",
-    ),
-    "vrpn_port": _port("--vrpn-port", "Serve VRPN on another port."),
-    "mavlink": _option(
-        list[str] | None, "--mavlink", "ROBOT=HOST:PORT",
-        "Send the pose of a robot to its autopilot (PX4, ArduPilot); repeat it for several. With /vision at "
-        "the end, the message is VISION_POSITION_ESTIMATE instead of ODOMETRY.",
-    ),
-    "ros2": _flag(
-        "--ros2",
-        "Publish positions to nodes of ROS 2 with rmw_zenoh, without ROS on this machine: /tf, and a pose "
-        "and odometry for each robot.",
-    ),
-    "ros2_port": _port(
-        "--ros2-port",
-        "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router.",
-    ),
-    "ros2_domain": _option(
-        int | None, "--ros2-domain", "ID", "Publish to this domain ID of ROS 2. Default: 0."
-    ),
-    "foxglove": _flag(
-        "--foxglove",
-        "Serve positions to Foxglove on port 8765. The printed address has a new secret at each start.",
-    ),
-    "foxglove_port": _port("--foxglove-port", "Serve Foxglove on another port."),
-    "rerun": _flag("--rerun", "Show positions in Rerun, in a browser of this machine."),
-    "images": _flag("--images", "Show images, too, in Foxglove and in Rerun."),
-    "host": _option(
-        str | None, "--host", "ADDRESS",
-        "Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. The "
-        "dashboard of --web is then open to the network, too. Default: only this machine.",
-    ),
-    "robots": _option(
-        list[str] | None, "--robot", "NAME", "Send only this robot; repeat it for several. Default: all."
-    ),
-}  # fmt: skip
+_KINDS = get_type_hints(StreamSettings)
+_DESCRIBED = {one.name: one.metadata["option"] for one in fields(StreamSettings) if one.metadata}
+_OPTIONS = dict(pair for one in _DESCRIBED.items() for pair in _options_of(*one))
 
 
 def takes_streams(command: Callable[..., None]) -> Callable[..., None]:
@@ -173,11 +139,12 @@ def choose_streams(
         There is no stream for an option, or the rig has no such robot.
     """
     from ipsys_log.messages.rig_file import check_robots
-    from ipsys_log.sinks.streams.settings import PORTS, settings_of_rig
+    from ipsys_log.sinks.streams.opening import settings_of_rig
 
-    for name, port in PORTS.items():
-        wanted = port if options.pop(name) else None
-        options[name] = options.pop(f"{name}_port") or wanted
+    for name, described in _DESCRIBED.items():
+        if described.port is not None:
+            usual = described.port if options.pop(name) else None
+            options[name] = options.pop(f"{name}_port") or usual
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in options.items()
@@ -194,9 +161,8 @@ def _check_effect(given: Collection[str], settings: StreamSettings) -> None:
     """Check that each option belongs to a stream."""
     from ipsys_log.errors import IpsysError
 
-    names = {"robots": "robot", "ros2_domain": "ros2-domain"}
     if given and not settings:
-        name = names.get(next(iter(given)), next(iter(given)))
+        name = next(iter(given)).replace("robots", "robot").replace("_", "-")
         raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
     if "ros2_domain" in given and settings.ros2 is None:
         raise IpsysError("--ros2-domain: has no effect without ROS 2; add --ros2")

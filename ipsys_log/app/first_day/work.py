@@ -41,7 +41,7 @@ from ipsys_log.messages import (
     Model,
 )
 from ipsys_log.sinks.sink import Sink
-from ipsys_log.sinks.streams.settings import Stream, check_streams, open_live_streams, settings_of_rig
+from ipsys_log.sinks.streams.opening import Stream, check_streams, open_live_streams, settings_of_rig
 from ipsys_log.units import NS_PER_S
 
 _LAST_STAGE = "camera-frame"

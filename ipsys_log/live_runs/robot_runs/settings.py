@@ -22,7 +22,7 @@ from ipsys_log.live_runs.robot_runs.ports import Ports, find_ports
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Waypoint
-from ipsys_log.sinks.streams.settings import StreamSettings
+from ipsys_log.sinks.streams import StreamSettings
 
 PORT = 9870
 PROGRAM = Path(__file__).parent / "example_robot" / "robot.py"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import select
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from ipsys_log.messages import Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.mavlink_messages import encode_odometry, encode_vision
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext
 
 # The autopilot takes messages from a companion computer with its own system number.
 _SYSTEM, _COMPONENT = 1, common.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
@@ -174,3 +174,11 @@ class MavlinkStream:
         with suppress(Exception):  # any error of the parser: the datagram is not MAVLink
             messages = parser.parse_buffer(data) or []
         return messages
+
+
+def open_all(context: StreamContext) -> Iterator[MavlinkStream]:
+    """Yield a stream for each autopilot."""
+    host, north_rad = context.settings.host, context.settings.north_rad
+    for endpoint in [parse_endpoint(text) for text in dict.fromkeys(context.settings.mavlink)]:
+        poses = context.poses([endpoint.robot])
+        yield MavlinkStream(endpoint, host, poses, context.now_ns, context.warn, north_rad)

@@ -23,7 +23,7 @@ from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.live_runs.player import Player
 from ipsys_log.messages import Model
 from ipsys_log.sinks.selection import PlayedScene
-from ipsys_log.sinks.streams.settings import Stream
+from ipsys_log.sinks.streams.opening import Stream
 
 _OWN = "ipsys_log.app.web.dashboard"
 _SCRIPTS = ("dashboard", "map", "tiles", "tables", "panels", "cameras_panel", "operate")

@@ -39,8 +39,8 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.sinks.selection import PlayedScene
+from ipsys_log.sinks.streams.opening import Stream
 from ipsys_log.sinks.streams.poses import NewSession
-from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.statistics.overlap_stream import OverlapSummary
 from ipsys_log.units import NS_PER_S
 

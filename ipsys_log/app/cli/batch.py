@@ -23,13 +23,16 @@ from ipsys_log.app.cli.options import (
 )
 from ipsys_log.app.cli.signals import say_kept
 from ipsys_log.app.cli.stages import build_command, options_until, replay_options
+from ipsys_log.app.report.files import check_file, check_parquet_name
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from ipsys_log.api.batch.tasks import BatchTask, LogResult
     from ipsys_log.api.batch.workers import WorkerSettings
-    from ipsys_log.log.location import LogLocation
 
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
 _KEPT = "complete results are kept; nothing else is changed"
@@ -161,8 +164,6 @@ def _replay_each(given: dict[str, Any], **further: Any) -> None:
 
 def _result_folder(folder: Path | None, option: str) -> Path:
     """Return the folder for derived logs, as workers with other working folders name it."""
-    from ipsys_log.errors import IpsysError
-
     if folder is not None and folder.exists() and not folder.is_dir():
         raise IpsysError(f"{option} {folder}: is not a folder; name a folder for the results")
     return (folder or Path()).absolute()
@@ -214,7 +215,6 @@ def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of `python_api.replay`; rig and intrinsics are read once."""
     from ipsys_log.app.cli.lab_inputs import load_calibrations, split_calibration
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.models.table import check_name
 
@@ -251,8 +251,6 @@ def _run(
     paths : the logs of the folders and patterns in ``logs``; None: they are searched here.
     """
     from ipsys_log.api.batch.workers import WorkerSettings
-    from ipsys_log.app.report.files import check_file, check_parquet_name
-    from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
 
     check_installed("batch needs", "dask", "distributed", "bokeh", "cryptography")

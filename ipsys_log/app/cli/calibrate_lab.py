@@ -8,8 +8,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import (
     FieldOfView,
@@ -33,16 +31,21 @@ from ipsys_log.app.cli.options import (
     NoLogs,
     Port,
     RigFile,
+    Train,
+    figure_option,
     log_argument,
     log_option,
+    named,
 )
 from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from ipsys_log.engine.options import Request
     from ipsys_log.live_runs.survey.lab_calibration import LabCalibration
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Rig
     from ipsys_log.sinks.sink import Sink
 
@@ -51,20 +54,13 @@ _MOST_GOAL_MM = 1000.0
 
 Goal = Annotated[
     float,
-    typer.Option("--goal-mm", metavar="MM", help="Wanted mean error over the floor of each camera, in mm."),
+    named("--goal-mm", "MM", "Wanted mean error over the floor of each camera, in mm."),
 ]
-Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 Output = Annotated[
     Path | None,
     log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
 ]
-Plot = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Draw the expected error over the floor of each camera: .png, .pdf, .svg or .jpg.",
-    ),
-]
+Plot = Annotated[Path | None, figure_option("the expected error over the floor of each camera")]
 
 Sources = Annotated[
     NoLogs,
@@ -75,13 +71,14 @@ Sources = Annotated[
 ]
 Seconds = Annotated[
     float | None,
-    typer.Option(min=1.0, metavar="SECONDS", help="Without LOG: stop the cameras after this time."),
+    named("--seconds", "SECONDS", "Without LOG: stop the cameras after this time.", min=1.0),
 ]
 Terminal = Annotated[
     bool,
-    typer.Option(
+    named(
         "--terminal",
-        help="Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
+        None,
+        "Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
     ),
 ]
 _LEAST_POINTS = 2
@@ -121,16 +118,12 @@ def calibrate_lab(
         ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
         ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
     """
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.engine.graph import writes
-    from ipsys_log.errors import IpsysError
     from ipsys_log.live_runs.survey.lab_calibration import describe_lab
     from ipsys_log.messages.channels import MODEL
 
     if not 0 < goal_mm <= _MOST_GOAL_MM:
         raise IpsysError(f"--goal-mm {goal_mm:g}: is not a length above 0 and up to {_MOST_GOAL_MM:g} mm")
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs or [])
     if logs:
         _refuse_live(seconds=seconds, terminal=terminal, host=host, force=force)
     else:
@@ -180,7 +173,6 @@ def calibrate_lab(
 def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:
     """Check that the logs have a rig and a marker or an image, before any stage runs."""
     from ipsys_log.engine.provenance import newest_run
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import MARKERS, RIG
 
@@ -197,8 +189,6 @@ def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:
 
 def _refuse_live(**options: object) -> None:
     """Refuse options that belong to a recording."""
-    from ipsys_log.errors import IpsysError
-
     for name, value in options.items():
         if value:
             raise IpsysError(f"--{name} is only for live cameras; leave out LOG or this option")
@@ -251,7 +241,6 @@ def _record_drive(
     force : overwrite an existing log.
     """
     from ipsys_log.engine.options import Request
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
     from ipsys_log.live_runs.survey.live_calibration import LiveCalibration
 

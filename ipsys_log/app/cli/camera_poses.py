@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.app.cli.open_cameras import check_target, prepare_lab, record_now
@@ -22,16 +20,18 @@ from ipsys_log.app.cli.options import (
     figure_option,
     log_argument,
     log_option,
+    named,
     other_log_option,
 )
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.alignment import AlignedLab
     from ipsys_log.capture.lab import Lab
     from ipsys_log.live_runs.survey.drift_reading import DriftReading
-    from ipsys_log.log.location import LogLocation
 
 NoOrLogs = Annotated[
     NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
@@ -57,9 +57,10 @@ ModelLog = Annotated[
 ]
 Fix = Annotated[
     bool,
-    typer.Option(
+    named(
         "--fix",
-        help="Append the joint model with the new poses of the moved cameras to the last log, as a new run.",
+        None,
+        "Append the joint model with the new poses of the moved cameras to the last log, as a new run.",
     ),
 ]
 
@@ -70,7 +71,7 @@ def align(
     calibration: Calibrations = None,
     corners: Corners = None,
     seconds: Annotated[
-        float, typer.Option(min=0.1, metavar="SECONDS", help="Without LOG: duration of the recording.")
+        float, named("--seconds", "SECONDS", "Without LOG: duration of the recording.", min=0.1)
     ] = 3.0,
     plot: Annotated[Path | None, figure_option("the floor map and the camera images")] = None,
     output: Output = None,
@@ -88,10 +89,6 @@ def align(
         ipsys align --rig lab.toml                     # use the cameras now
         ipsys align monday.mcap --plot alignment.png   # of a log, with a figure
     """
-    from ipsys_log.app.report.files import check_figure_file
-
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs or [])
     if logs:
         options: dict[str, Any] = {
             "rig": rig,
@@ -116,7 +113,6 @@ def _prepare_now(
     """Return the cameras to open, after all checks that are possible before they are opened."""
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.engine.options import Request
-    from ipsys_log.errors import IpsysError
 
     if rig is None:
         raise IpsysError("no log is given; name a log, or give --rig lab.toml to use its cameras now")
@@ -187,12 +183,9 @@ def drift(
         ipsys drift week*.mcap --model-from calibration.mcap --rig lab.toml
         ipsys drift week*.mcap --fix                       # correct its pose
     """
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.live_runs.survey.drift_reading import read_drift
     from ipsys_log.messages.rig_file import load_rig
 
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
     lab = load_rig(rig) if rig is not None else None
     with progress_bar(()) as progress:
         reading = read_drift(
@@ -211,7 +204,6 @@ def _fix(reading: DriftReading) -> str | None:
     """Append the mended model to the last log; return its run, or None if no camera has moved."""
     from ipsys_log.calibration.joint.payload import PoseChange
     from ipsys_log.engine.mended_model import append_mended_model
-    from ipsys_log.errors import IpsysError
 
     moved = reading.moved()
     if not moved:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ipsys_log.app.cli.console import console, print_json, print_outcomes, progress_bar, say, warn
-from ipsys_log.app.cli.options import AsJson, LogList, appended_log_argument, log_argument
+from ipsys_log.app.cli.options import AsJson, LogList, appended_log_argument, log_argument, named
 from ipsys_log.app.cli.signals import writes_nothing
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.tools.differences import Comparison
 
 Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
@@ -23,7 +24,7 @@ Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is re
 def check(
     logs: Logs,
     details: Annotated[
-        bool, typer.Option("--details", help="Also print notes: rates, unknown channels, current runs.")
+        bool, named("--details", None, "Also print notes: rates, unknown channels, current runs.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -64,15 +65,12 @@ def verify(
     ],
     run: Annotated[
         list[str] | None,
-        typer.Option(
-            "--run", metavar="NAME", help="Use only this run. With --compare, give it twice for two runs."
-        ),
+        named("--run", "NAME", "Use only this run. With --compare, give it twice for two runs."),
     ] = None,
     compare: Annotated[
         bool,
-        typer.Option(
-            "--compare",
-            help="Compare the runs of two logs, or two runs of one log, and compute nothing.",
+        named(
+            "--compare", None, "Compare the runs of two logs, or two runs of one log, and compute nothing."
         ),
     ] = False,
     as_json: AsJson = False,
@@ -90,7 +88,6 @@ def verify(
         ipsys verify monday.mcap --compare --run poly --run best
     """
     from ipsys_log.app.report.cameras import comparison_json, comparison_table, first_difference
-    from ipsys_log.errors import IpsysError
 
     why, reason = None, {}
     if compare:
@@ -117,7 +114,6 @@ def verify(
 
 def _compare(logs: Sequence[LogLocation], runs: list[str]) -> tuple[list[Comparison], str | None]:
     """Compare two logs, or two runs of one log; return the reason if they have no message in common."""
-    from ipsys_log.errors import IpsysError
     from ipsys_log.tools.verify import diff, explain_diff
 
     if len(runs) > 2 or len(logs) > 2:
@@ -161,7 +157,6 @@ def repair(
         ipsys repair monday.mcap
     """
     from ipsys_log.app.report.repair import repair_lines
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.recovery import repair as repair_log
 

@@ -184,6 +184,19 @@ def print_json(value: Any) -> None:
     print(json.dumps(result, indent=2, allow_nan=False))  # noqa: T201
 
 
+def print_result(
+    value: Any, parts: Iterable[RenderableType], as_json: bool, notes: Iterable[str] = ()
+) -> None:
+    """Print a result for programs, or its tables and lines; then remarks on it."""
+    if as_json:
+        print_json(value)
+    else:
+        for part in parts:
+            console.print(part)
+    for note in notes:
+        warn(note)
+
+
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """Print the stages that were computed, were up to date, or were left out."""
     rest = _print_many(outcomes)

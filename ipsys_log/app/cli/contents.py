@@ -8,18 +8,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say
-from ipsys_log.app.cli.options import AsJson, ReadLogs, figure_option
+from ipsys_log.app.cli.options import AsJson, ReadLogs, figure_option, named
 from ipsys_log.app.cli.signals import writes_nothing
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.location import LogLocation
 
 _Seconds = float | None
 
@@ -29,16 +29,15 @@ def info(
     logs: ReadLogs,
     runs: Annotated[
         bool,
-        typer.Option("--runs", help="Show the runs with their inputs, parameters, versions and states."),
+        named("--runs", None, "Show the runs with their inputs, parameters, versions and states."),
     ] = False,
     sizes: Annotated[
-        bool, typer.Option("--sizes", help="Show the size of each channel of each log, the largest first.")
+        bool, named("--sizes", None, "Show the size of each channel of each log, the largest first.")
     ] = False,
     latency: Annotated[
         bool,
-        typer.Option(
-            "--latency",
-            help="Show the latency of each step of a live run, from the frame to the position.",
+        named(
+            "--latency", None, "Show the latency of each step of a live run, from the frame to the position."
         ),
     ] = False,
     plot: Annotated[Path | None, figure_option("the processing steps of --latency")] = None,
@@ -60,8 +59,6 @@ def info(
         ipsys info monday.mcap --latency --plot latency.pdf
         ipsys info s3://lab/monday.mcap          # at a URL: docs/scale.md
     """
-    from ipsys_log.errors import IpsysError
-
     if plot is not None and not latency:
         raise IpsysError(f"--plot {plot}: has no effect without --latency; add --latency")
     parts: dict[str, Callable[[], tuple[Any, list[RenderableType]]]] = {}
@@ -118,11 +115,8 @@ def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[
     from dataclasses import asdict
 
     from ipsys_log.app.report.cameras import latency_table
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.statistics.latency import latency_percentiles, recorded_latencies, step_times_s
 
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
     times_s = step_times_s(recorded_latencies(logs))
     steps = latency_percentiles(times_s)
     if plot is not None:
@@ -138,23 +132,23 @@ def cat(
     logs: ReadLogs,
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topics", metavar="TOPIC,...", help="Print only these topics, separated by commas."),
+        named("--topics", "TOPIC,...", "Print only these topics, separated by commas."),
     ] = None,
     start_secs: Annotated[
         _Seconds,
-        typer.Option("--start-secs", metavar="SECONDS", help="Begin at this log time since 1970, in UTC."),
+        named("--start-secs", "SECONDS", "Begin at this log time since 1970, in UTC."),
     ] = None,
     end_secs: Annotated[
         _Seconds,
-        typer.Option("--end-secs", metavar="SECONDS", help="End before this log time since 1970, in UTC."),
+        named("--end-secs", "SECONDS", "End before this log time since 1970, in UTC."),
     ] = None,
     start_offset: Annotated[
         _Seconds,
-        typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first message."),
+        named("--start-offset", "SECONDS", "Begin so long after the first message."),
     ] = None,
     end_offset: Annotated[
         _Seconds,
-        typer.Option("--end-offset", metavar="SECONDS", help="End so long after the first message."),
+        named("--end-offset", "SECONDS", "End so long after the first message."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -191,8 +185,6 @@ def cat(
 
 def _wanted(session: Session, topics: list[str]) -> list[str]:
     """Return the topics to print: those of the options, or all that can be read."""
-    from ipsys_log.errors import IpsysError
-
     known = {topic for reader in session.readers for topic in reader.channels}
     named = [topic for words in topics for topic in words.split(",") if topic]
     for topic in named:
@@ -212,9 +204,6 @@ def _ns(seconds: float | None, start_ns: int = 0) -> int | None:
     IpsysError
         The value is not a number of seconds of these centuries.
     """
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.units import NS_PER_S
-
     if seconds is None:
         return None
     if not 0 <= seconds < 1e10:

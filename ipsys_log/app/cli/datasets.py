@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say
-from ipsys_log.app.cli.options import AsJson, file_log_argument
+from ipsys_log.app.cli.options import AsJson, file_log_argument, named
 from ipsys_log.app.cli.signals import say_kept
-from ipsys_log.plain_text import shell_words
-
-if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
+from ipsys_log.app.report.files import check_file, check_parquet_name
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, parse_location
+from ipsys_log.plain_text import plain_text, shell_words
 
 _MOST_LINES = 30
 
@@ -30,28 +31,26 @@ def catalogue(
     ],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="FILE", help="The catalogue: a Parquet file (.parquet)."),
+        named("--output,-o", "FILE", "The catalogue: a Parquet file (.parquet)."),
     ],
     baseline: Annotated[
         str | None,
-        typer.Option(
+        named(
             "--baseline",
-            metavar="LOG",
-            help="Also record the drift of the cameras since this log, by their reference markers.",
+            "LOG",
+            "Also record the drift of the cameras since this log, by their reference markers.",
         ),
     ] = None,
     model_from: Annotated[
         str | None,
-        typer.Option(
-            "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
-        ),
+        named("--model-from", "LOG", "The log with the model for the drift. Default: the baseline."),
     ] = None,
     derived: Annotated[
         Path | None,
-        typer.Option(
+        named(
             "--derived",
-            metavar="FOLDER",
-            help="The folder of -o in ipsys batch replay, with the results of logs that cannot be appended "
+            "FOLDER",
+            "The folder of -o in ipsys batch replay, with the results of logs that cannot be appended "
             "to. They count with their log. Default: the working folder.",
         ),
     ] = None,
@@ -69,11 +68,6 @@ def catalogue(
     """
     from ipsys_log.api.catalogue.row import Baseline
     from ipsys_log.api.catalogue.table import update_catalogue
-    from ipsys_log.app.report.files import check_file, check_parquet_name
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
-    from ipsys_log.log.location import parse_location
-    from ipsys_log.plain_text import plain_text
 
     check_installed("catalogue needs", "pyarrow")
     check_parquet_name(output, "-o")
@@ -104,9 +98,6 @@ def catalogue(
 
 
 def _log(name: str, text: str) -> LogLocation:
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.log.location import parse_location
-
     log = parse_location(text)
     if isinstance(log, Path) and not log.is_file():
         raise IpsysError(f"{name} {log}: is not a file; name a log")
@@ -120,39 +111,35 @@ def pack(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DATASET",
-            help="The dataset to write: a folder, or a zip archive if the name ends in .zip.",
+        named(
+            "--output,-o",
+            "DATASET",
+            "The dataset to write: a folder, or a zip archive if the name ends in .zip.",
         ),
     ] = None,
     card: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The filled form of the dataset card."),
+        named("--card", "FILE", "The filled form of the dataset card."),
     ] = None,
     card_form: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Only write the empty form of the dataset card."),
+        named("--card-form", "FILE", "Only write the empty form of the dataset card."),
     ] = None,
     model: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Score this model; repeat it for several. Default: all that the logs allow.",
+        named(
+            "--model", "NAME", "Score this model; repeat it for several. Default: all that the logs allow."
         ),
     ] = None,
     without_images: Annotated[
         bool,
-        typer.Option("--without-images", help="Leave out the images, and keep the detected markers."),
+        named("--without-images", None, "Leave out the images, and keep the detected markers."),
     ] = False,
     blur: Annotated[
         bool,
-        typer.Option(
-            "--blur", help="Blur the images outside of the detected markers: a new recording, in grey."
-        ),
+        named("--blur", None, "Blur the images outside of the detected markers: a new recording, in grey."),
     ] = False,
-    every: Annotated[int, typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera.")] = 1,
+    every: Annotated[int, named("--every", "N", "Keep each n-th frame of each camera.", min=1)] = 1,
 ) -> None:
     """Write logs as a dataset: the recorded channels, the rig, a card, checksums and the expected scores.
 
@@ -165,7 +152,6 @@ def pack(
         ipsys pack calibration.mcap -o small.zip --card card.toml --without-images
     """
     from ipsys_log.app.report.pack_scores import pack_text
-    from ipsys_log.errors import IpsysError
     from ipsys_log.tools.publish.card import write_card_form
     from ipsys_log.tools.publish.packing import pack as pack_logs
 
@@ -204,9 +190,10 @@ def score(
     ],
     model: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="MODEL",
-            help="Repeat only this model, or score your own as FILE.py:CLASS; repeat it for several.",
+        named(
+            "--model",
+            "MODEL",
+            "Repeat only this model, or score your own as FILE.py:CLASS; repeat it for several.",
         ),
     ] = None,
     as_json: AsJson = False,

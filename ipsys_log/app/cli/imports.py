@@ -23,6 +23,8 @@ from ipsys_log.app.cli.options import (
     read_files,
     with_options,
 )
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
 
 _MCAP_MAGIC = b"\x89MCAP"
@@ -125,8 +127,6 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
         ipsys import lab.bag -o lab.mcap                    # a ROS bag
         ipsys import vicon.csv --into monday.mcap           # ground truth
     """
-    from ipsys_log.errors import IpsysError
-
     for source in sources:
         _refuse_log(Path(str(source).rpartition("=")[2]))
     kind = kind or _find_kind(sources[0])
@@ -137,8 +137,6 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
 
 def _import_as(kind: str, sources: list[Path], output: Path | None, options: dict[str, Any]) -> None:
     """Call the importer of a kind with its options; refuse options that other kinds have."""
-    from ipsys_log.errors import IpsysError
-
     importer = KINDS[kind]
     read = {*inspect.signature(importer).parameters}
     for name, value in options.items():
@@ -155,8 +153,6 @@ def _import_as(kind: str, sources: list[Path], output: Path | None, options: dic
 
 def _find_kind(source: Path) -> str:
     """Return the kind of a source by its name, its files, or the header of its table."""
-    from ipsys_log.errors import IpsysError
-
     suffix = source.suffix.lower()
     if not source.exists():
         if "=" in str(source):
@@ -230,7 +226,6 @@ def _import_ros(
     source: Path, output: Path, camera: list[str] | None, rig: Path | None, calibration: list[str] | None
 ) -> None:
     from ipsys_log.engine.output import write_log
-    from ipsys_log.extras import check_installed
 
     check_installed("import of ROS bags needs", "rosbags")
     from ipsys_log.exchange.calibration_files import announce_assumed
@@ -308,7 +303,6 @@ def _import_detections(
 
 def _import_pairs(source: Path, output: Path, rig: Path | None) -> None:
     from ipsys_log.engine.output import write_log
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.pair_tables import pair_messages, read_pairs
     from ipsys_log.messages.rig_file import load_rig
 
@@ -334,8 +328,6 @@ KINDS: dict[str, Callable[..., None]] = {
 
 def _refuse_log(path: Path) -> None:
     """Refuse a file that is a log already, by its first bytes."""
-    from ipsys_log.errors import IpsysError
-
     try:
         with path.open("rb") as file:
             is_log = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
@@ -358,7 +350,6 @@ def _by_camera(files: list[str]) -> dict[str, Path]:
 
 def _split_names(words: list[str], kind: str, example: str) -> dict[str, str]:
     """Return the texts after the equals signs of words such as ``red=red.mp4``, by camera."""
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages.rig_file import check_name
 
     named: dict[str, str] = {}

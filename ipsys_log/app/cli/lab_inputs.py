@@ -7,39 +7,38 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from ipsys_log.app.cli.console import say, warn
+from ipsys_log.app.cli.options import named
+from ipsys_log.app.report.files import check_folder, write_files
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation, LogUrl, parse_location
 
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Rig
 
 Focal = Annotated[
     list[str] | None,
-    typer.Option(
+    named(
         "--focal",
-        metavar="[CAMERA=]PX",
-        help="Nominal focal length in pixels, of one camera, or of all cameras without a calibration. The "
+        "[CAMERA=]PX",
+        "Nominal focal length in pixels, of one camera, or of all cameras without a calibration. The "
         "fit estimates the intrinsics.",
     ),
 ]
 FieldOfView = Annotated[
     list[str] | None,
-    typer.Option(
-        "--field-of-view",
-        metavar="[CAMERA=]DEGREES",
-        help="Nominal horizontal field of view, instead of a focal length.",
+    named(
+        "--field-of-view", "[CAMERA=]DEGREES", "Nominal horizontal field of view, instead of a focal length."
     ),
 ]
 SaveNominal = Annotated[
     Path | None,
-    typer.Option(
+    named(
         "--save-nominal",
-        metavar="DIR",
-        help="With LOG: write the nominal intrinsics into this folder, such as red.yaml, for lab.toml and "
+        "DIR",
+        "With LOG: write the nominal intrinsics into this folder, such as red.yaml, for lab.toml and "
         "--calibration of later commands.",
     ),
 ]
@@ -62,7 +61,6 @@ def load_calibrations(
     """
     if not options:
         return {}
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
 
@@ -114,8 +112,6 @@ def split_calibration(option: str) -> tuple[str | None, LogLocation]:
 
     The query of a URL may have an equals sign, too.
     """
-    from ipsys_log.log.location import LogUrl, parse_location
-
     camera, equals, name = option.partition("=")
     if not equals or isinstance(parse_location(option), LogUrl):
         return None, parse_location(option)
@@ -260,7 +256,6 @@ def nominal_lenses(
         A text is not a number, or names no camera; or the size of an image is unknown.
     """
     from ipsys_log.calibration.nominal import nominal_intrinsics
-    from ipsys_log.errors import IpsysError
 
     lenses: dict[str, CameraCalibration] = {}
     for option, text in options:
@@ -288,8 +283,6 @@ def nominal_lenses(
 
 
 def _positive(option: str, text: str, number: str) -> float:
-    from ipsys_log.errors import IpsysError
-
     try:
         value = float(number)
     except ValueError:
@@ -306,9 +299,7 @@ def write_nominal(lenses: Mapping[str, CameraCalibration], folder: Path) -> None
     The estimated intrinsics of the fit are not for other uses: above a level floor, focal length and height
     of a camera are nearly the same unknown.
     """
-    from ipsys_log.app.report.files import check_folder, write_files
     from ipsys_log.calibration.joint.observations import lens_model_of
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import opencv_yaml
 
     check_folder(folder, "--save-nominal")

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say
 from ipsys_log.app.cli.options import (
     REQUIRED,
@@ -20,13 +18,16 @@ from ipsys_log.app.cli.options import (
     flag,
     log_argument,
     log_option,
+    named,
     option,
     with_options,
 )
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
+from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.tools.compact import DroppedRun
     from ipsys_log.tools.merge import MergeResult
     from ipsys_log.tools.merge_plan import LogOffset
@@ -104,10 +105,8 @@ def cut(
         ipsys cut monday.mcap -o poly.mcap --run poly
         ipsys cut calibration.mcap --compact --dry-run     # which runs, how much?
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.tools.cut import cut as cut_logs
     from ipsys_log.tools.cut_selection import CutOptions
-    from ipsys_log.units import format_bytes
 
     chosen: dict[str, Any] = {name: value for name, value in selection.items() if value is not None}
     options = CutOptions(**chosen)
@@ -137,7 +136,6 @@ def _compact(
 ) -> None:
     """Copy a log without its superseded and unfinished runs, or list them."""
     from ipsys_log.engine.output import check_copy
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.log_files import read_log_state
     from ipsys_log.tools import compact as compaction
 
@@ -169,9 +167,10 @@ def merge(
     output: NewLog,
     offset: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=SECONDS",
-            help="Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
+        named(
+            "--offset",
+            "NAME=SECONDS",
+            "Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -202,15 +201,11 @@ def merge(
         print_json(_merge_json(output, result))
         return
     _show_offsets(logs, offsets)
-    from ipsys_log.units import format_bytes
-
     console.print(f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}")
     say(f"next: ipsys replay {shell_words(output)}")
 
 
 def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> None:
-    from ipsys_log.units import format_bytes
-
     if not dropped:
         console.print(f"{log}: no run is superseded or unfinished; nothing is written")
         return
@@ -226,8 +221,6 @@ def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> Non
 
 
 def _show_saving(before: int, output: Path) -> None:
-    from ipsys_log.units import format_bytes
-
     after = output.stat().st_size
     console.print(f"{output} written: {format_bytes(after)} instead of {format_bytes(before)}")
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from ipsys_log.app.cli.console import console
+from ipsys_log.app.cli.options import named
+from ipsys_log.app.report.files import check_file, write_files
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.prints import Print
@@ -15,47 +17,45 @@ if TYPE_CHECKING:
 
 RigNow = Annotated[
     Path | None,
-    typer.Option("--rig", metavar="FILE", help="Print the markers of this rig file, in their true size."),
+    named("--rig", "FILE", "Print the markers of this rig file, in their true size."),
 ]
 Ids = Annotated[
     str | None,
-    typer.Option(
-        metavar="LIST", help="Print these ids, such as 1,2,3 or 0-9, instead of the ids of the rig."
-    ),
+    named("--ids", "LIST", "Print these ids, such as 1,2,3 or 0-9, instead of the ids of the rig."),
 ]
 Length = Annotated[
     float | None,
-    typer.Option(metavar="METRES", help="Side of the black square, in m, instead of the lengths of the rig."),
+    named("--length", "METRES", "Side of the black square, in m, instead of the lengths of the rig."),
 ]
 Dictionary = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Dictionary of --ids without a rig (default: DICT_4X4_100) and of a ChArUco board "
+    named(
+        "--dictionary",
+        "NAME",
+        "Dictionary of --ids without a rig (default: DICT_4X4_100) and of a ChArUco board "
         "(default: DICT_4X4_50).",
     ),
 ]
 BoardName = Annotated[
     str | None,
-    typer.Option(
-        metavar="COLUMNSxROWS",
-        help="Print a board for ipsys calibrate: inner corners of a chessboard, such as 6x4, or "
+    named(
+        "--board",
+        "COLUMNSxROWS",
+        "Print a board for ipsys calibrate: inner corners of a chessboard, such as 6x4, or "
         "squares of a ChArUco board, such as charuco:4x5.",
     ),
 ]
-Square = Annotated[float, typer.Option(metavar="METRES", help="Side of a square of the board, in m.")]
+Square = Annotated[float, named("--square", "METRES", "Side of a square of the board, in m.")]
 MarkerScale = Annotated[
     float,
-    typer.Option(metavar="SHARE", help="Side of a ChArUco marker, as a fraction of the side of a square."),
+    named("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
 PageName = Annotated[
     str | None,
-    typer.Option(
-        "--page", metavar="NAME", help="Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small."
-    ),
+    named("--page", "NAME", "Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small."),
 ]
-Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The PDF to write.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")]
+Output = Annotated[Path, named("--output,-o", "FILE", "The PDF to write.")]
+Force = Annotated[bool, named("--force", None, "Overwrite an existing file.")]
 
 _DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"
 _MOST = 2000
@@ -84,10 +84,6 @@ def markers(
         ipsys markers --ids 0-11 --length 0.08 --page letter
         ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
     """
-    from ipsys_log.app.report.files import check_file, write_files
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
-
     check_installed("markers needs", "matplotlib")
     from ipsys_log.app.report.print_pages import choose_paper, draw_pages, lay_out
 
@@ -117,7 +113,6 @@ def _marker_prints(
     rig: Path | None, ids: str | None, length: float | None, dictionary: str | None
 ) -> list[Print]:
     from ipsys_log.app.report.prints import rig_prints
-    from ipsys_log.errors import IpsysError
 
     lab = _lab(rig, length, dictionary)
     wanted = None if ids is None else _parse_ids(ids, lab.dictionary)
@@ -130,7 +125,6 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
     """Return the rig, or a rig with only a dictionary and a length."""
     from dataclasses import replace
 
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages import Rig
     from ipsys_log.messages.rig_checks import check_units
     from ipsys_log.messages.rig_file import check_rig, load_rig
@@ -159,7 +153,6 @@ def _parse_ids(text: str, dictionary: str) -> list[int]:
     IpsysError
         The text is no list, or has an id that the dictionary does not have.
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages.rig_checks import dictionary_size
 
     ids: list[int] = []

@@ -20,9 +20,12 @@ from ipsys_log.app.cli.options import (
     RigFile,
     Terminal,
     appended_log_argument,
+    named,
 )
 from ipsys_log.app.cli.pages import serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
@@ -33,25 +36,21 @@ if TYPE_CHECKING:
 Log = Annotated[Path, appended_log_argument(help="A finished log, which gets the measurements.")]
 Sheet = Annotated[
     Path | None,
-    typer.Option(
-        "--csv",
-        metavar="SHEET",
-        help="Read the measurements from a sheet; docs/measuring.md shows the columns.",
-    ),
+    named("--csv", "SHEET", "Read the measurements from a sheet; docs/measuring.md shows the columns."),
 ]
-Insist = Annotated[bool, typer.Option("--force", help="With --csv: write rows that look wrong, too.")]
+Insist = Annotated[bool, named("--force", None, "With --csv: write rows that look wrong, too.")]
 Places = Annotated[
     bool,
-    typer.Option(
-        "--places", help="Only list the stationary intervals of the markers, with their numbers for a sheet."
+    named(
+        "--places", None, "Only list the stationary intervals of the markers, with their numbers for a sheet."
     ),
 ]
 Baseline = Annotated[
     str | None,
-    typer.Option(
+    named(
         "--ab",
-        metavar="CM",
-        help="The distance between the first two reference points, read with this tape, in cm. It shows the "
+        "CM",
+        "The distance between the first two reference points, read with this tape, in cm. It shows the "
         "scale of the tape if the rig has ab_sigma_m.",
     ),
 ]
@@ -90,8 +89,6 @@ def measure(
     ends = csv is not None or places or ab is not None
     allow_interrupt(None if ends else SAVED)
     from ipsys_log.engine.options import Request
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs.survey.add_sheet import add_sheet, check_sheet
     from ipsys_log.live_runs.survey.from_log import open_finished_log
 
@@ -150,9 +147,9 @@ def exclude(
         list[str],
         typer.Argument(metavar="POINT", help="Names of calibration points, such as p007."),
     ],
-    reason: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which is written into the log.")],
+    reason: Annotated[str, named("--reason", "TEXT", "The reason, which is written into the log.")],
     readmit: Annotated[
-        bool, typer.Option("--readmit", help="Use excluded points again, instead of excluding points.")
+        bool, named("--readmit", None, "Use excluded points again, instead of excluding points.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-import typer
-
 from ipsys_log.app.cli.console import console, remarks, say
+from ipsys_log.app.cli.options import named
+from ipsys_log.errors import IpsysError
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.cameras import LiveStatus
@@ -26,15 +26,15 @@ _USUAL_PORT = 8000
 _GAP = 4
 _CODE_STYLE = "#ffffff on #000000"
 
-Web = Annotated[bool, typer.Option("--web", help="Show a page, the dashboard, for any number of browsers.")]
+Web = Annotated[bool, named("--web", None, "Show a page, the dashboard, for any number of browsers.")]
 WebPort = Annotated[
     int | None,
-    typer.Option(
+    named(
         "--web-port",
+        "PORT",
+        "Serve the dashboard on this port instead of 8000; 0 for any free port.",
         min=0,
         max=65535,
-        metavar="PORT",
-        help="Serve the dashboard on this port instead of 8000; 0 for any free port.",
     ),
 ]
 
@@ -176,8 +176,6 @@ def _serve(dashboard: Dashboard, host: str | None, port: int, has_viewers: bool)
 
 
 def _checked_port(is_wanted: bool, port: int | None) -> int:
-    from ipsys_log.errors import IpsysError
-
     if port is not None and not is_wanted:
         raise IpsysError("--web-port: has no effect without --web; add --web")
     return _USUAL_PORT if port is None else port

@@ -7,12 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import console, print_json, say, warn
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
-from ipsys_log.app.cli.options import AsJson, Calibrations, LogList, Logs, RigFile
+from ipsys_log.app.cli.options import (
+    AsJson,
+    Calibrations,
+    LogList,
+    Logs,
+    RigFile,
+    Train,
+    figure_option,
+    named,
+)
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.errors import IpsysError
 
 if TYPE_CHECKING:
     from ipsys_log.live_runs.survey.floor_plan import PlannedFloor
@@ -22,24 +30,18 @@ _MOST_PLACES = 50
 # Without a floor in the rig, this is the largest height of a marker.
 _HIGHEST_M = 5.0
 
-Places = Annotated[int, typer.Option(metavar="N", help="Number of points to propose.")]
-Model = Annotated[str, typer.Option(metavar="NAME", help="The model to improve.")]
+Places = Annotated[int, named("--places", "N", "Number of points to propose.")]
+Model = Annotated[str, named("--model", "NAME", "The model to improve.")]
 Heights = Annotated[
     list[float] | None,
-    typer.Option(
+    named(
         "--height-m",
-        metavar="METRES",
-        help="Height of the marker above the floor, in m; repeat it for several. Default: the heights of the "
+        "METRES",
+        "Height of the marker above the floor, in m; repeat it for several. Default: the heights of the "
         "measured points, in turn.",
     ),
 ]
-Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
-Plot = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE", help="Draw the error over the floor, before and after: .png, .pdf, .svg or .jpg."
-    ),
-]
+Plot = Annotated[Path | None, figure_option("the error over the floor, before and after")]
 
 
 def plan(
@@ -64,7 +66,6 @@ def plan(
 
         ipsys plan calibration.mcap --places 5 --plot next.png
     """
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.engine.graph import writes
     from ipsys_log.engine.select import copied_run
     from ipsys_log.live_runs.survey.floor_plan import plan_floor
@@ -74,8 +75,6 @@ def plan(
     given_rig = load_rig(rig) if rig else None
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
     _check(logs, given_rig, model, places, height_m or ())
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
     with derive(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if writes(outcome, MODEL)]
@@ -107,7 +106,6 @@ def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: S
     """Check that a plan is possible, before a model is fitted."""
     from ipsys_log.engine.select import copied_run
     from ipsys_log.engine.view import LogView
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import RIG
     from ipsys_log.statistics.calibration_points import measured

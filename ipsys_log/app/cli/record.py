@@ -10,8 +10,6 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import say, warn
 from ipsys_log.app.cli.measure import show_measured
 from ipsys_log.app.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
@@ -30,24 +28,27 @@ from ipsys_log.app.cli.options import (
     RigNow,
     Seconds,
     Terminal,
+    named,
     other_log_option,
 )
 from ipsys_log.app.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped
 from ipsys_log.app.cli.stream import StreamOptions, choose_streams, takes_streams
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.engine.options import Request
     from ipsys_log.live_runs.survey.live import LiveScene
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Measurement, Model
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
+View = Annotated[bool, named("--view", None, "Show cameras and robots in Rerun during the recording.")]
 
 _TURN_S = 0.05
 # After this time, the markers in the images and their stationary intervals are known.
@@ -61,19 +62,15 @@ def record(
     rig: RigNow = Path("lab.toml"),
     camera: Only = None,
     calibration: Calibrations = None,
-    detect: Annotated[bool, typer.Option("--detect", help="Detect the markers and write them, too.")] = False,
+    detect: Annotated[bool, named("--detect", None, "Detect the markers and write them, too.")] = False,
     corners: Corners = None,
     measure: Annotated[
         bool,
-        typer.Option(
-            "--measure", help="Enter tape measurements during the recording, on a page for the phone."
-        ),
+        named("--measure", None, "Enter tape measurements during the recording, on a page for the phone."),
     ] = False,
     points_only: Annotated[
         bool,
-        typer.Option(
-            "--points-only", help="With --measure: keep only about 1 s of frames of each measured point."
-        ),
+        named("--points-only", None, "With --measure: keep only about 1 s of frames of each measured point."),
     ] = False,
     terminal: Terminal = False,
     host: Host = None,
@@ -87,9 +84,7 @@ def record(
     ] = None,
     seconds: Seconds = None,
     force: Force = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", hidden=True, help="With --points-only: print JSON.")
-    ] = False,
+    as_json: Annotated[bool, named("--json", None, "With --points-only: print JSON.", hidden=True)] = False,
 ) -> None:
     """Record the camera frames, unchanged, until Ctrl-C.
 
@@ -106,8 +101,6 @@ def record(
     allow_interrupt(SAVED if points_only else _NOT_BEGUN)
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.engine.options import Request
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
 
     if not measure:
@@ -281,7 +274,6 @@ def live(
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log.capture.live_plan import check_start, shown_run
     from ipsys_log.engine.options import Request
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
     from ipsys_log.sinks.streams.settings import check_streams, open_live_streams
 

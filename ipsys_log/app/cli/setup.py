@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.app.cli.console import console, print_json, say
-from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, other_log_option
+from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, named, other_log_option
 from ipsys_log.app.cli.pages import print_code, say_faults
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
+from ipsys_log.app.report.files import check_folder
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import HIDDEN, shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.capture.usb_bus import UsbCamera
-    from ipsys_log.log.location import LogLocation
 
 _NONE = """no USB camera is attached
   for a network camera, put its address into lab.toml: source = "rtsp://..." or "http://..."
@@ -39,9 +42,10 @@ def init(
     ] = None,
     simulated: Annotated[
         bool,
-        typer.Option(
+        named(
             "--simulated",
-            help="Write the rig of the simulated lab, to try all commands without a camera, and a sheet of "
+            None,
+            "Write the rig of the simulated lab, to try all commands without a camera, and a sheet of "
             "its tape measurements.",
         ),
     ] = False,
@@ -54,7 +58,6 @@ def init(
         ipsys init lab.toml --from monday.mcap   # the rig of a log
         ipsys init lab.toml --simulated          # to try all commands
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.lab_files import write_new
     from ipsys_log.messages.rig_file import example_toml
 
@@ -105,10 +108,6 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
         ipsys setup lab --host 0.0.0.0           # also on a tablet
     """
     allow_interrupt("stopped; every finished step is in the folder")
-    from ipsys_log.app.report.files import check_folder
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
-
     check_installed("setup needs", "starlette", "uvicorn")
     check_folder(folder, "FOLDER")
     from ipsys_log.app.first_day.lab_folder import LabFolder
@@ -144,9 +143,7 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
 def cameras(
     rig: Annotated[
         Path | None,
-        typer.Option(
-            "--rig", metavar="FILE", help="Check that USB is fast enough for the cameras of this rig."
-        ),
+        named("--rig", "FILE", "Check that USB is fast enough for the cameras of this rig."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -160,7 +157,6 @@ def cameras(
         ipsys cameras --rig lab.toml     # is USB fast enough for the rig?
     """
     from ipsys_log.capture.usb_bus import advise_bandwidth, list_demands
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages.rig_file import load_rig
 
     if sys.platform != "linux":

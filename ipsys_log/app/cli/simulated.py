@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say
 from ipsys_log.app.cli.open_cameras import MODEL, check_target
-from ipsys_log.app.cli.options import AsJson, FittedModels, Force, NewLog, OneLog, other_log_option
+from ipsys_log.app.cli.options import AsJson, FittedModels, Force, NewLog, OneLog, named, other_log_option
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
@@ -19,15 +17,11 @@ if TYPE_CHECKING:
 
 Paths = Annotated[
     list[str] | None,
-    typer.Option(
-        "--path", metavar="ROBOT=X,Y...", help='Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'
-    ),
+    named("--path", "ROBOT=X,Y...", 'Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'),
 ]
 Failures = Annotated[
     list[str] | None,
-    typer.Option(
-        "--fail", metavar="CAMERA=START:SECONDS", help="Let a camera fail: white=20:5 is at 20 s, for 5 s."
-    ),
+    named("--fail", "CAMERA=START:SECONDS", "Let a camera fail: white=20:5 is at 20 s, for 5 s."),
 ]
 
 
@@ -35,29 +29,23 @@ def simulate(
     output: NewLog,
     cameras: Annotated[
         str | None,
-        typer.Option(
-            metavar="GRID",
-            help="Columns x rows of the cameras of a hall, such as 6x4. Default: a lab with three cameras.",
+        named(
+            "--cameras",
+            "GRID",
+            "Columns x rows of the cameras of a hall, such as 6x4. Default: a lab with three cameras.",
         ),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Seed of the random numbers. The same seed gives the same bytes."),
+        named("--seed", "N", "Seed of the random numbers. The same seed gives the same bytes."),
     ] = None,
     settings: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Read settings from a TOML file; docs/data.md lists them.",
-        ),
+        named("--settings", "FILE", "Read settings from a TOML file; docs/data.md lists them."),
     ] = None,
     changes: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Change a setting, such as drive_s=4; repeat it for several.",
-        ),
+        named("--set", "NAME=VALUE", "Change a setting, such as drive_s=4; repeat it for several."),
     ] = None,
 ) -> None:
     """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
@@ -94,37 +82,31 @@ def drive(
         ),
     ],
     model: FittedModels = None,
-    robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,
+    robots: Annotated[int, named("--robots", None, "Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
         Path | None,
-        typer.Option(
-            "--program", metavar="FILE", help="The program of the robots (default: the example of ipsys)."
-        ),
+        named("--program", "FILE", "The program of the robots (default: the example of ipsys)."),
     ] = None,
-    over: Annotated[
-        str, typer.Option("--over", metavar="udp|vrpn|ros2", help="The stream of the positions.")
-    ] = "udp",
-    loss: Annotated[
-        float, typer.Option("--loss", metavar="SHARE", help="Lose this share of the datagrams, such as 0.05.")
-    ] = 0.0,
-    delay_ms: Annotated[float, typer.Option("--delay-ms", help="Delay the datagrams, in ms.")] = 0.0,
+    over: Annotated[str, named("--over", "udp|vrpn|ros2", "The stream of the positions.")] = "udp",
+    loss: Annotated[float, named("--loss", "SHARE", "Lose this share of the datagrams, such as 0.05.")] = 0.0,
+    delay_ms: Annotated[float, named("--delay-ms", None, "Delay the datagrams, in ms.")] = 0.0,
     fail: Failures = None,
     lockstep: Annotated[
         bool,
-        typer.Option(
-            "--lockstep", help="Use simulated time: the result does not depend on the speed of the machine."
+        named(
+            "--lockstep", None, "Use simulated time: the result does not depend on the speed of the machine."
         ),
     ] = False,
-    rate_hz: Annotated[float, typer.Option("--rate-hz", help="Frames per second of each camera.")] = 5.0,
+    rate_hz: Annotated[float, named("--rate-hz", None, "Frames per second of each camera.")] = 5.0,
     seed: Annotated[
-        int, typer.Option("--seed", help="Seed of the start, the wheels, the noise and the lost datagrams.")
+        int, named("--seed", None, "Seed of the start, the wheels, the noise and the lost datagrams.")
     ] = 0,
-    lab_seed: Annotated[int, typer.Option("--lab-seed", help="Seed of the simulated lab.")] = 0,
+    lab_seed: Annotated[int, named("--lab-seed", None, "Seed of the simulated lab.")] = 0,
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65000, help="First of the used ports; 0: free ports.")
+        int, named("--port", None, "First of the used ports; 0: free ports.", min=0, max=65000)
     ] = 9870,
-    seconds: Annotated[float, typer.Option("--seconds", min=1.0, help="Stop after this time.")] = 300.0,
+    seconds: Annotated[float, named("--seconds", None, "Stop after this time.", min=1.0)] = 300.0,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:

@@ -27,6 +27,10 @@ from ipsys_log.app.cli.options import (
     with_options,
 )
 from ipsys_log.app.cli.signals import say_kept
+from ipsys_log.app.report.files import check_folder
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, parse_location
 from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
@@ -34,7 +38,6 @@ if TYPE_CHECKING:
     from ipsys_log.engine.options import Request
     from ipsys_log.engine.provenance import Outcome
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.location import LogLocation
 
 STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
 
@@ -149,7 +152,6 @@ def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
 def replay_options(**given: Any) -> dict[str, Any]:
     """Return the options of a command without rig and intrinsics as those of `python_api.replay`."""
     from ipsys_log.engine.options import Request
-    from ipsys_log.log.location import parse_location
     from ipsys_log.messages.rig_file import check_name
 
     run, models = given.pop("run"), given.pop("model", None) or ()
@@ -229,8 +231,6 @@ def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Se
 
 
 def _replay(until: str | None, **given: Any) -> None:
-    from ipsys_log.errors import IpsysError
-
     if until is not None and until not in STAGE_NAMES:
         raise IpsysError(f"--until {until}: is not a stage; use one of {', '.join(STAGE_NAMES)}")
     unread = {parameter.name: parameter for parameter in parameters_until(None)}
@@ -251,8 +251,9 @@ def _derive(
     details: bool = False,
     **given: Any,
 ) -> None:
-    if plot is not None or plots is not None:
-        _check_figures(logs, plot, plots)
+    if plots is not None:
+        check_installed("--plots needs", "matplotlib")
+        check_folder(plots, "--plots")
     with derive(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)
     if as_json:
@@ -261,17 +262,6 @@ def _derive(
         _print(accuracies, details)
     for line in drawn:
         say(line)
-
-
-def _check_figures(logs: Sequence[LogLocation], plot: Path | None, plots: Path | None) -> None:
-    from ipsys_log.app.report.files import check_figure_file, check_folder
-    from ipsys_log.extras import check_installed
-
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
-    if plots is not None:
-        check_installed("--plots needs", "matplotlib")
-        check_folder(plots, "--plots")
 
 
 def _draw(

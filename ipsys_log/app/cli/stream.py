@@ -16,12 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ipsys_log.app.cli.console import say
-from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option
+from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, named, option
 from ipsys_log.app.cli.pages import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 
 if TYPE_CHECKING:
     from ipsys_log.live_runs.player import Player
@@ -41,36 +41,26 @@ _RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
 RigFile = Annotated[
     Path | None,
-    typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),
+    named("--rig", "FILE", "Open the streams of this rig file (lab.toml)."),
 ]
-Rate = Annotated[
-    float, typer.Option("--rate", metavar="FACTOR", help="Play faster or slower: 2 is twice as fast.")
-]
-Loop = Annotated[bool, typer.Option("--loop", help="Begin again at the end.")]
-StartPaused = Annotated[bool, typer.Option("--start-paused", help="Wait for a key at the start.")]
+Rate = Annotated[float, named("--rate", "FACTOR", "Play faster or slower: 2 is twice as fast.")]
+Loop = Annotated[bool, named("--loop", None, "Begin again at the end.")]
+StartPaused = Annotated[bool, named("--start-paused", None, "Wait for a key at the start.")]
 StartOffset = Annotated[
     float,
-    typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first position."),
+    named("--start-offset", "SECONDS", "Begin so long after the first position."),
 ]
 Run = Annotated[
     str | None,
-    typer.Option("--run", metavar="NAME", help="Play the tracks of this run. Default: the newest."),
+    named("--run", "NAME", "Play the tracks of this run. Default: the newest."),
 ]
 Topics = Annotated[
     list[str] | None,
-    typer.Option(
-        "--topics",
-        metavar="TOPIC",
-        help="Play this topic instead, such as /truth/tracks; repeat it for several.",
-    ),
+    named("--topics", "TOPIC", "Play this topic instead, such as /truth/tracks; repeat it for several."),
 ]
 Restamp = Annotated[
     str,
-    typer.Option(
-        "--restamp",
-        metavar="original|now",
-        help="Give the positions their capture times, or the present time.",
-    ),
+    named("--restamp", "original|now", "Give the positions their capture times, or the present time."),
 ]
 
 
@@ -192,8 +182,6 @@ def choose_streams(
 
 def _check_effect(given: Collection[str], settings: StreamSettings) -> None:
     """Check that each option belongs to a stream."""
-    from ipsys_log.errors import IpsysError
-
     names = {"robots": "robot", "ros2_domain": "ros2-domain"}
     if given and not settings:
         name = names.get(next(iter(given)), next(iter(given)))
@@ -235,8 +223,6 @@ def stream(
         ipsys stream monday.mcap --vrpn --start-offset 20    # port 3883
     """
     allow_interrupt("stopped before the first position was sent")
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs.player import Player
     from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.sinks.playback import PlaybackOptions

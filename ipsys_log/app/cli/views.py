@@ -5,40 +5,37 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import Annotated, Any
 
 from ipsys_log.app.cli.console import console, progress_bar, say
-from ipsys_log.app.cli.options import ReadLogs
+from ipsys_log.app.cli.options import ReadLogs, named
 from ipsys_log.app.cli.stages import MORE, build_command, derive, options_until
-
-if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
+from ipsys_log.app.report.files import check_file, write_files
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, file_beside
 
 _COUNTED = ("bag", "video", "pictures")
 Runs = Annotated[
     list[str] | None,
-    typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),
+    named("--run", "NAME", "Show this run instead of the newest; repeat it for several."),
 ]
 Save = Annotated[
     Path | None,
-    typer.Option(
-        "--save", metavar="FILE", help="Write a Rerun recording (.rrd) instead of opening the viewer."
-    ),
+    named("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer."),
 ]
 FoxgloveLayout = Annotated[
     Path | None,
-    typer.Option(
+    named(
         "--foxglove-layout",
-        metavar="FILE",
-        help="Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
+        "FILE",
+        "Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
     ),
 ]
 _HTML = (
     Annotated[
         Path | None,
-        typer.Option("--html", metavar="FILE", help="The page to write. Default: the log's name with .html."),
+        named("--html", "FILE", "The page to write. Default: the log's name with .html."),
     ],
     None,
 )
@@ -62,7 +59,6 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
         ipsys view monday.mcap                             # the newest run
         ipsys view monday.mcap --run poly --save monday.rrd
     """
-    from ipsys_log.extras import check_installed
     from ipsys_log.log.dataset import Session
 
     if foxglove_layout is not None:
@@ -88,8 +84,6 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
 
 
 def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
-    from ipsys_log.app.report.files import check_file
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.atomic_files import replacement_of
     from ipsys_log.log.dataset import Session
     from ipsys_log.sinks.foxglove_layout import make_layout
@@ -106,21 +100,13 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
 
 def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
     """Check that a recording can be written, and that Rerun will open it by its name."""
-    from ipsys_log.app.report.files import check_file
-    from ipsys_log.errors import IpsysError
-
     if save.suffix != ".rrd":
         raise IpsysError(f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd")
     check_file(save, "--save", logs)
 
 
 def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:
-    from ipsys_log.app.report.files import check_file, write_files
-    from ipsys_log.extras import check_installed
-
     check_installed("report needs", "matplotlib", "jinja2")
-    from ipsys_log.log.location import file_beside
-
     target = html or file_beside(output or logs[-1], ".html")
     check_file(target, "--html", [*logs, *([output] if output else [])])
     if _report_robots(logs, target):
@@ -136,7 +122,6 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
 
 def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
     """Write the page of a session without calibration points; return False if the logs have some."""
-    from ipsys_log.app.report.files import write_files
     from ipsys_log.app.report.html import render_report
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import MEASUREMENTS
@@ -153,7 +138,6 @@ def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
 
 def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
     """Write the page and the figure of a robot run; return False if the logs have none."""
-    from ipsys_log.app.report.files import check_file, write_files
     from ipsys_log.app.report.robot_run import render_robot_run
     from ipsys_log.log.dataset import Session
     from ipsys_log.tools.robot_run import has_robot_run
@@ -178,45 +162,43 @@ def export(
     logs: ReadLogs,
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
+        named(
+            "--output,-o",
+            "FILE",
+            "The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
             "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
         ),
     ],
     format_: Annotated[
         str | None,
-        typer.Option(
+        named(
             "--format",
-            metavar="NAME",
-            help="csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
+            "NAME",
+            "csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
         ),
     ] = None,
     table: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
+        named(
+            "--table",
+            "NAME",
+            "tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
         ),
     ] = "tracks",
     run: Annotated[
         list[str] | None,
-        typer.Option(
-            "--run", metavar="NAME", help="Export this run instead of the newest; repeat it for several."
-        ),
+        named("--run", "NAME", "Export this run instead of the newest; repeat it for several."),
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Export only this robot."),
+        named("--robot", "NAME", "Export only this robot."),
     ] = None,
     without_images: Annotated[
-        bool, typer.Option("--without-images", help="Leave the images out of a ROS 2 bag.")
+        bool, named("--without-images", None, "Leave the images out of a ROS 2 bag.")
     ] = False,
-    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames per second of a video.")] = 25.0,
+    frame_rate: Annotated[float, named("--frame-rate", "HZ", "Frames per second of a video.")] = 25.0,
     size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a video in pixels, two even numbers.")
+        str, named("--size", "WIDTHxHEIGHT", "Size of a video in pixels, two even numbers.")
     ] = "1280x720",
 ) -> None:
     """Export positions, images or another channel to a file for other programs.
@@ -237,7 +219,6 @@ def export(
     """
     from ipsys_log.api import python_api as api
     from ipsys_log.api.log_export import find_format, parse_size
-    from ipsys_log.app.report.files import check_file
 
     wanted = find_format(output, format_)
     if wanted.suffix is not None:

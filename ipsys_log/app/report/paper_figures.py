@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +19,7 @@ from ipsys_log.app.report import calibration_figures
 from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.app.report.advice import has_published, label
 from ipsys_log.app.report.figures import ERROR_COLOURS, png, scale_logarithmic, style_axes
-from ipsys_log.app.report.files import cross_validation_csv, paper_csv, write_files
+from ipsys_log.app.report.files import write_files
 from ipsys_log.app.report.findings import Findings, PointErrors, errors_in, overall_row
 from ipsys_log.app.report.floor_figure import (
     Square,
@@ -180,6 +182,68 @@ def _ends_cm(errors: ErrorStatistics) -> list[float]:
     """Return the ends of the confidence interval of the mean, or the mean itself, in cm."""
     ends_m = (errors.mean_low_m, errors.mean_high_m)
     return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
+
+
+# Names of the methods in Tables I and II of the paper.
+_PAPER_NAMES = {
+    "rigid": "RT",
+    "poly": "PR",
+    "rigid+poly": "RT + PR",
+    "ann": "ANN",
+    "rigid+ann": "RT + ANN",
+    "kriging": "KI",
+    "rigid+kriging": "RT + KI",
+    "kriging-regression": "KR",
+    "rigid+kriging-regression": "RT + KR",
+}
+_FIGURES = ("mean", "min", "max", "std")
+
+
+def paper_csv(findings: Findings, in_space: bool) -> bytes:
+    """Return Table I of the paper (errors in space) or Table II (errors on the floor), one row per model.
+
+    The columns are those of the paper: the means of the cameras, then their minima, maxima and standard
+    deviations. The errors are on held-out points, against the tape. Unknown values are empty.
+    """
+    header = ["method", "paper"] + [f"{figure}_cm_{c}" for figure in _FIGURES for c in findings.cameras]
+    rows = []
+    for accuracy in findings.accuracies:
+        by_camera = {row.camera: row for row in accuracy.rows(False) if row.against == "tape"}
+        errors = [errors_in(by_camera.get(camera), in_space) for camera in findings.cameras]
+        cells = [_cm(getattr(e, f"{name}_m") if e else None) for name in _FIGURES for e in errors]
+        rows.append([accuracy.model, _PAPER_NAMES.get(accuracy.model, ""), *cells])
+    return _csv(header, rows)
+
+
+_STATISTICS = ("mean", "mean_low", "mean_high", "min", "median", "p95", "max", "std")
+
+
+def cross_validation_csv(findings: Findings) -> bytes:
+    """Return a table with one row per model, camera (``all``: all together) and reference (tape or truth)."""
+    header = ["method", "camera", "against", "places"]
+    header += [f"{name}_{space}_cm" for space in ("3d", "2d") for name in (*_STATISTICS, "rmse")]
+    header += [f"bias_{axis}_cm" for axis in "xyz"] + ["within_68", "within_95"]
+    rows = []
+    for accuracy in findings.accuracies:
+        for row in accuracy.rows(True):
+            cells = [accuracy.model, row.camera or "all", row.against, str(row.error_2d.count)]
+            for errors in (row.error_3d, row.error_2d):
+                cells += [_cm(getattr(errors, f"{name}_m") if errors else None) for name in _STATISTICS]
+                cells.append(_cm(accuracy.errors_of(row).rmse_m(errors)))
+            cells += map(_cm, [None] * 3 if row.bias_m is None else row.bias_m.tolist())
+            cells += ["" if v is None else f"{v:.4f}" for v in (row.within_68, row.within_95)]
+            rows.append(cells)
+    return _csv(header, rows)
+
+
+def _cm(value_m: float | None) -> str:
+    return "" if value_m is None else f"{value_m * CM_PER_M:.3f}"
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue().encode()
 
 
 # For each file: the condition to write it, and the function that returns its bytes.

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.app.first_day.camera_address import parse_camera_address
-from ipsys_log.app.first_day.camera_choice import add_camera
+from ipsys_log.app.first_day.camera_choice import add_camera, parse_camera_address
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.app.first_day.rig_text import replace_tables, replace_values, write_rig
+from ipsys_log.app.first_day.rig_entry import replace_tables, replace_values, write_rig
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, Rig, RigCamera, RigMarker
 from ipsys_log.messages.rig_file import example_toml, load_rig, rig_toml

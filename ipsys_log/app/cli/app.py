@@ -24,10 +24,9 @@ from ipsys_log.app.cli.datasets import catalogue, pack, score
 from ipsys_log.app.cli.imports import KINDS, import_
 from ipsys_log.app.cli.log_copies import cut, merge
 from ipsys_log.app.cli.markers import markers
-from ipsys_log.app.cli.measure import exclude, measure
 from ipsys_log.app.cli.node import node
 from ipsys_log.app.cli.options import needs_local_files
-from ipsys_log.app.cli.plan import plan
+from ipsys_log.app.cli.points import exclude, measure, plan
 from ipsys_log.app.cli.record import live, record
 from ipsys_log.app.cli.setup import cameras, init, setup
 from ipsys_log.app.cli.signals import interruptible

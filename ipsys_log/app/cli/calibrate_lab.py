@@ -195,7 +195,7 @@ def _refuse_live(**options: object) -> None:
 
 
 def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.app.report.expected_error_texts import lab_advice, lab_headline, lab_json, lab_table
+    from ipsys_log.app.report.calibration import lab_advice, lab_headline, lab_json, lab_table
 
     if plot is not None:
         from ipsys_log.app.report.expected_error_figures import draw_lab

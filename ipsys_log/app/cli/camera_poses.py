@@ -145,10 +145,10 @@ def _align(logs: Sequence[LogLocation], options: dict[str, Any], plot: Path | No
 
 
 def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.app.report.alignment_text import alignment_json, alignment_table, coverage_lines
+    from ipsys_log.app.report.camera_poses import alignment_json, alignment_table, coverage_lines
 
     if plot is not None:
-        from ipsys_log.app.report.alignment_figure import draw_alignment
+        from ipsys_log.app.report.camera_pose_figures import draw_alignment
 
         draw_alignment(lab, plot)
     if as_json:
@@ -194,7 +194,7 @@ def drift(
     run = _fix(reading) if fix else None
     _print(reading, run, as_json)
     if plot is not None:
-        from ipsys_log.app.report.drift_figure import draw_drift
+        from ipsys_log.app.report.camera_pose_figures import draw_drift
 
         draw_drift(reading, plot)
         say(f"{plot} drawn")
@@ -225,7 +225,7 @@ def _fix(reading: DriftReading) -> str | None:
 
 
 def _print(reading: DriftReading, run: str | None, as_json: bool) -> None:
-    from ipsys_log.app.report.drift import drift_json, drift_lines, drift_table
+    from ipsys_log.app.report.camera_poses import drift_json, drift_lines, drift_table
 
     if as_json:
         result = {**drift_json(reading), **({} if run is None else {"mended_run": run})}

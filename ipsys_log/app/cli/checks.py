@@ -40,7 +40,7 @@ def check(
         ipsys check lab.mcap derived.mcap        # derived.mcap has runs of lab.mcap
         ipsys check *.mcap --json                # also notes, for programs
     """
-    from ipsys_log.app.report.log_texts import check_json, check_lines
+    from ipsys_log.app.report.checks import check_json, check_lines
     from ipsys_log.tools.soundness.check import check_logs
     from ipsys_log.tools.soundness.finding import READABLE, SOUND, UNREAD, LogCheck
 
@@ -87,7 +87,7 @@ def verify(
         ipsys verify monday.mcap tuesday.mcap --compare
         ipsys verify monday.mcap --compare --run poly --run best
     """
-    from ipsys_log.app.report.cameras import comparison_json, comparison_table, first_difference
+    from ipsys_log.app.report.checks import comparison_json, comparison_table, first_difference
 
     why, reason = None, {}
     if compare:
@@ -156,7 +156,7 @@ def repair(
 
         ipsys repair monday.mcap
     """
-    from ipsys_log.app.report.repair import repair_lines
+    from ipsys_log.app.report.checks import repair_lines
     from ipsys_log.log.dataset import Session
     from ipsys_log.log.recovery import repair as repair_log
 

@@ -114,7 +114,7 @@ def _sizes(logs: Sequence[LogLocation]) -> tuple[Any, list[RenderableType]]:
 def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[RenderableType]]:
     from dataclasses import asdict
 
-    from ipsys_log.app.report.cameras import latency_table
+    from ipsys_log.app.report.log_texts import latency_table
     from ipsys_log.statistics.latency import latency_percentiles, recorded_latencies, step_times_s
 
     times_s = step_times_s(recorded_latencies(logs))

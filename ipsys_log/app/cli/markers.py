@@ -85,7 +85,7 @@ def markers(
         ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
     """
     check_installed("markers needs", "matplotlib")
-    from ipsys_log.app.report.print_pages import choose_paper, draw_pages, lay_out
+    from ipsys_log.app.report.prints import choose_paper, draw_pages, lay_out
 
     if output.suffix.lower() != ".pdf":
         raise IpsysError(f"--output {output}: only a PDF keeps the true size; use a name that ends in .pdf")

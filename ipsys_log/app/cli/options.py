@@ -149,7 +149,6 @@ def _location(text: str | None) -> Any:
 
 
 log_argument = partial(typer.Argument, metavar="LOG", callback=_locations)
-one_log_argument = partial(typer.Argument, metavar="LOG", callback=_location)
 other_log_option = partial(typer.Option, metavar="LOG", callback=_location)
 file_log_argument = partial(typer.Argument, metavar="LOG", callback=read_files)
 appended_log_argument = partial(typer.Argument, metavar="LOG", callback=appended_logs)

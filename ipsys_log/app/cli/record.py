@@ -11,7 +11,6 @@ from time import sleep
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli.console import say, warn
-from ipsys_log.app.cli.measure import show_measured
 from ipsys_log.app.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.app.cli.options import (
     Calibrations,
@@ -32,6 +31,7 @@ from ipsys_log.app.cli.options import (
     other_log_option,
 )
 from ipsys_log.app.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
+from ipsys_log.app.cli.points import show_measured
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped
 from ipsys_log.app.cli.stream import StreamOptions, choose_streams, takes_streams
 from ipsys_log.errors import IpsysError

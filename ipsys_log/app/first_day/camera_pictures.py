@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ipsys_log.app.first_day.camera_address import ADDRESS_FIELDS, fault_text
 from ipsys_log.app.first_day.camera_choice import (
+    ADDRESS_FIELDS,
     add_camera,
+    fault_text,
     list_attached,
     list_options,
     propose_names,

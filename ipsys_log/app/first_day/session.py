@@ -10,15 +10,12 @@ from typing import Any, NamedTuple
 from ipsys_log.app.first_day import work
 from ipsys_log.app.first_day.alignment import AlignmentResult
 from ipsys_log.app.first_day.board import BOARD_FIELDS, BoardSearch, parse_board_entry
-from ipsys_log.app.first_day.camera_address import parse_camera_address
-from ipsys_log.app.first_day.camera_choice import save_cameras, set_calibration
+from ipsys_log.app.first_day.camera_choice import parse_camera_address, save_cameras, set_calibration
 from ipsys_log.app.first_day.camera_pictures import CameraPictures
 from ipsys_log.app.first_day.jobs import Job, Jobs
-from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder
-from ipsys_log.app.first_day.outlier_points import exclude_outlier
+from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder, exclude_outlier
 from ipsys_log.app.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.app.first_day.steps import SetupProgress, Status, read_progress
-from ipsys_log.app.report.prints import Print, board_print, rig_prints
 from ipsys_log.app.report.rows import cm
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
@@ -228,18 +225,8 @@ class SetupSession:
         return next((one.picture for one in cameras if one.camera == name), None)
 
     def print_pdf(self, name: str, typed: Mapping[str, str]) -> bytes:
-        """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields.
-
-        Raises
-        ------
-        IpsysError
-            There is no such print, or it cannot be drawn.
-        """
-        if name == "markers":
-            return _print_markers(self._folder)
-        if name == "board":
-            return _print_board(typed)
-        raise IpsysError(f"the print {name!r} is not known; reload this page")
+        """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields."""
+        return _print(self._folder, name, typed)
 
     def close(self) -> None:
         """Stop the present job in order."""
@@ -300,37 +287,28 @@ def _describe_fit(fit: FitFacts) -> dict[str, Any]:
     return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}
 
 
-def _print_markers(folder: LabFolder) -> bytes:
-    """Return the markers of the rig file as PDF (``ipsys markers --rig lab.toml``).
+def _print(folder: LabFolder, name: str, typed: Mapping[str, str]) -> bytes:
+    """Return the markers of the rig file, or a board of typed fields, as PDF (``ipsys markers``).
 
     Raises
     ------
     IpsysError
-        The rig has a fault, or lists no markers. Or Matplotlib is not installed.
+        There is no such print, a field or the rig has a fault, or a board is larger than a page. Or
+        Matplotlib is not installed.
     """
-    rig = load_rig(folder.rig_file)
-    if not rig.all_markers:
-        raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
-    return _draw_pages(rig_prints(rig))
-
-
-def _print_board(typed: Mapping[str, str]) -> bytes:
-    """Return a calibration board as PDF (``ipsys markers --board 6x4``); ``typed`` are texts by field.
-
-    Raises
-    ------
-    IpsysError
-        A field has a fault, or the board is larger than a page. Or Matplotlib is not installed.
-    """
-    entry = parse_board_entry(typed)
-    if isinstance(entry, Fault):
-        raise IpsysError(entry.text)
-    return _draw_pages([board_print(entry.parse(), entry.board)])
-
-
-def _draw_pages(prints: list[Print]) -> bytes:
-    """Return prints as PDF, at true size."""
     check_installed("a print needs", "matplotlib")
-    from ipsys_log.app.report.print_pages import choose_paper, draw_pages, lay_out
+    from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out, rig_prints
 
+    if name == "markers":
+        rig = load_rig(folder.rig_file)
+        if not rig.all_markers:
+            raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
+        prints = rig_prints(rig)
+    elif name == "board":
+        entry = parse_board_entry(typed)
+        if isinstance(entry, Fault):
+            raise IpsysError(entry.text)
+        prints = [board_print(entry.parse(), entry.board)]
+    else:
+        raise IpsysError(f"the print {name!r} is not known; reload this page")
     return draw_pages(lay_out(prints, choose_paper(prints, None)))

@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 
 from ipsys_log.app.report import html_figures, html_sections
 from ipsys_log.app.report.accuracy import Accuracy, read_trajectories
-from ipsys_log.app.report.cameras import latency_table
 from ipsys_log.app.report.contents import runs_table, states_json
 from ipsys_log.app.report.figures import MOST_IN_LEGEND, new_figure, style_axes
 from ipsys_log.app.report.findings import Findings, gather_findings
 from ipsys_log.app.report.html_figures import picture
 from ipsys_log.app.report.latency_figure import draw_shares, draw_steps
+from ipsys_log.app.report.log_texts import latency_table
 from ipsys_log.app.report.rows import Rows
 from ipsys_log.app.report.styles import camera_styles, shorten
 from ipsys_log.app.report.tables import advice_table, height_note, suspects_table, trajectory_table

@@ -19,6 +19,7 @@ from ipsys_log.app.report.calibration_figures import (
     residual_limit_px,
     residuals_figure,
 )
+from ipsys_log.app.report.drive_figures import draw_tracks, read_drawn_tracks
 from ipsys_log.app.report.figures import PAGE_IN, add_bar, has_legend, new_figure, style_axes, svg_data_uri
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.floor_figure import draw_ground
@@ -33,7 +34,6 @@ from ipsys_log.app.report.paper_figures import (
 from ipsys_log.app.report.points_figure import draw_coverage
 from ipsys_log.app.report.styles import robot_colour, shorten
 from ipsys_log.app.report.tables import height_note
-from ipsys_log.app.report.tracks_figure import draw_tracks, read_drawn_tracks
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
 from ipsys_log.statistics.disagreement import PairDisagreement, divide_floor, divide_time

@@ -18,9 +18,9 @@ import cv2
 import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from ipsys_log.app.web.access import Guard
 from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.connections import Connections, PageLimits, derive_limits
+from ipsys_log.app.web.requests import Guard
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.scene import MeasuringScene
 

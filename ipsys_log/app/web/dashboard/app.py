@@ -11,12 +11,20 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from ipsys_log.app.web.access import MAY_WRITE, OperatorSeat, answer_claim, operator_of
 from ipsys_log.app.web.dashboard.feed import Feed
 from ipsys_log.app.web.dashboard.operator import Operator
 from ipsys_log.app.web.dashboard.pictures import shrink
 from ipsys_log.app.web.dashboard.state import Dashboard, DashboardSetting, PlayedLog
-from ipsys_log.app.web.requests import ERROR_HANDLERS, answer_file, read_json, whole_number
+from ipsys_log.app.web.requests import (
+    ERROR_HANDLERS,
+    MAY_WRITE,
+    OperatorSeat,
+    answer_claim,
+    answer_file,
+    operator_of,
+    read_json,
+    whole_number,
+)
 from ipsys_log.capture.lab import OpenLab
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.errors import FrameError, IpsysError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from ipsys_log.app.web.access import OperatorSeat
+from ipsys_log.app.web.requests import OperatorSeat
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import EVENTS_TOPIC, Event
 from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED

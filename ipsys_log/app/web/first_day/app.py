@@ -16,11 +16,18 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from ipsys_log.app.first_day.lab_folder import LabFolder
 from ipsys_log.app.first_day.session import Pages, SetupSession
 from ipsys_log.app.first_day.work import LiveRecording
-from ipsys_log.app.web.access import MAY_WRITE, OperatorSeat, answer_claim, operator_of
 from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.dashboard.app import build_dashboard, dashboard_of_recording
 from ipsys_log.app.web.dashboard.state import Dashboard
-from ipsys_log.app.web.requests import ERROR_HANDLERS, answer_file, read_json
+from ipsys_log.app.web.requests import (
+    ERROR_HANDLERS,
+    MAY_WRITE,
+    OperatorSeat,
+    answer_claim,
+    answer_file,
+    operator_of,
+    read_json,
+)
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.live_runs.survey.live import LiveScene

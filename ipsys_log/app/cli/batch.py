@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
-from ipsys_log.app.cli.console import console, print_json, remarks, say
+from ipsys_log.app.cli.console import print_result, remarks, say
 from ipsys_log.app.cli.options import (
     REQUIRED,
     AsJson,
@@ -297,12 +298,8 @@ def _collect(task: BatchTask, paths: Sequence[LogLocation], settings: WorkerSett
 def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> None:
     from ipsys_log.app.report.batch import batch_json, batch_table, failure_lines, write_results
 
-    if as_json:
-        print_json(batch_json(results))
-    else:
-        console.print(batch_table(results))
-        for line in failure_lines(results):
-            console.print(line, style="red")
+    failures = (Text(line, "red") for line in failure_lines(results))
+    print_result(batch_json(results), (batch_table(results), *failures), as_json)
     for trace in {result.trace for result in results if result.trace}:
         say(trace)
     if table is not None:

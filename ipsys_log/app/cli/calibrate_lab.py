@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import (
     FieldOfView,
     Focal,
@@ -197,22 +197,12 @@ def _refuse_live(**options: object) -> None:
 def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
     from ipsys_log.app.report.calibration import lab_advice, lab_headline, lab_json, lab_table
 
+    parts = (*lab_headline(lab), "", lab_table(lab), *lab_advice(lab))
+    print_result(lab_json(lab), parts, as_json, lab.notes)
     if plot is not None:
         from ipsys_log.app.report.expected_error_figures import draw_lab
 
         draw_lab(lab, plot)
-    if as_json:
-        print_json(lab_json(lab))
-    else:
-        for line in lab_headline(lab):
-            console.print(line)
-        console.print()
-        console.print(lab_table(lab))
-        for line in lab_advice(lab):
-            console.print(line)
-    for note in lab.notes:
-        warn(note)
-    if plot is not None:
         say(f"{plot} drawn")
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
+from rich.text import Text
+
+from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.app.cli.open_cameras import check_target, prepare_lab, record_now
 from ipsys_log.app.cli.options import (
@@ -147,20 +149,18 @@ def _align(logs: Sequence[LogLocation], options: dict[str, Any], plot: Path | No
 def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
     from ipsys_log.app.report.camera_poses import alignment_json, alignment_table, coverage_lines
 
+    parts = (alignment_table(lab), *_marked(coverage_lines(lab)))
+    print_result(alignment_json(lab), parts, as_json, lab.notes)
     if plot is not None:
         from ipsys_log.app.report.camera_pose_figures import draw_alignment
 
         draw_alignment(lab, plot)
-    if as_json:
-        print_json(alignment_json(lab))
-    else:
-        console.print(alignment_table(lab))
-        for line, good in coverage_lines(lab):
-            console.print(line, style="green" if good else "red", soft_wrap=False)
-    for note in lab.notes:
-        warn(note)
-    if plot is not None:
         say(f"{plot} drawn")
+
+
+def _marked(lines: Iterable[tuple[str, bool]]) -> Iterator[Text]:
+    """Yield lines in green if they are good, else in red."""
+    return (Text(line, "green" if is_good else "red") for line, is_good in lines)
 
 
 def drift(
@@ -227,13 +227,6 @@ def _fix(reading: DriftReading) -> str | None:
 def _print(reading: DriftReading, run: str | None, as_json: bool) -> None:
     from ipsys_log.app.report.camera_poses import drift_json, drift_lines, drift_table
 
-    if as_json:
-        result = {**drift_json(reading), **({} if run is None else {"mended_run": run})}
-        print_json(result)
-    else:
-        for line, is_good in drift_lines(reading):
-            console.print(line, style="green" if is_good else "red")
-        console.print()
-        console.print(drift_table(reading))
-    for remark in reading.remarks:
-        warn(remark)
+    result = {**drift_json(reading), **({} if run is None else {"mended_run": run})}
+    parts = (*_marked(drift_lines(reading)), "", drift_table(reading))
+    print_result(result, parts, as_json, reading.remarks)

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.text import Text
 
-from ipsys_log.app.cli.console import console, print_json, print_outcomes, progress_bar, say, warn
+from ipsys_log.app.cli.console import console, print_outcomes, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.options import AsJson, LogList, appended_log_argument, log_argument, named
 from ipsys_log.app.cli.signals import writes_nothing
 from ipsys_log.errors import IpsysError
@@ -46,12 +47,7 @@ def check(
 
     with progress_bar(()) as progress:
         checks = check_logs(logs, progress)
-    if as_json:
-        print_json(check_json(checks))
-    else:
-        for one in checks:
-            for line in check_lines(one, details):
-                console.print(line)
+    print_result(check_json(checks), [line for one in checks for line in check_lines(one, details)], as_json)
     code = {SOUND: 0, READABLE: 1, UNREAD: 3}.get(LogCheck.worst(checks), 2)
     if code:
         raise typer.Exit(code)
@@ -100,14 +96,12 @@ def verify(
             raise IpsysError("--run: is given twice; name one run, or add --compare to compare two")
         with progress_bar() as progress:
             comparisons = api.verify(*logs, run=run[0] if run else None, progress=progress, say=say)
-    if as_json:
-        print_json({**comparison_json(comparisons), **reason})
-    else:
-        sides = ("first", "second") if compare else ("log", "again")
-        console.print(comparison_table(comparisons, sides))
-        difference = why or first_difference(comparisons)
-        agreement = "no difference" if compare else _agreement(comparisons)
-        console.print(difference or agreement, style="green" if difference is None else "red")
+    sides = ("first", "second") if compare else ("log", "again")
+    difference = why or first_difference(comparisons)
+    agreement = "no difference" if compare else _agreement(comparisons)
+    answer = Text(difference or agreement, "green" if difference is None else "red")
+    parts = (comparison_table(comparisons, sides), answer)
+    print_result({**comparison_json(comparisons), **reason}, parts, as_json)
     if not all(comparison.equal for comparison in comparisons):
         raise typer.Exit(1)
 

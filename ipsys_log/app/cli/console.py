@@ -184,9 +184,7 @@ def print_json(value: Any) -> None:
     print(json.dumps(result, indent=2, allow_nan=False))  # noqa: T201
 
 
-def print_result(
-    value: Any, parts: Iterable[RenderableType], as_json: bool, notes: Iterable[str] = ()
-) -> None:
+def print_result(value: Any, parts: Iterable[object], as_json: bool, notes: Iterable[str] = ()) -> None:
     """Print a result for programs, or its tables and lines; then remarks on it."""
     if as_json:
         print_json(value)

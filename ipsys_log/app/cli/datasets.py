@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.options import AsJson, file_log_argument, named
 from ipsys_log.app.cli.signals import say_kept
 from ipsys_log.app.report.files import check_file, check_parquet_name
@@ -85,16 +86,13 @@ def catalogue(
         update = update_catalogue(
             place, output, since, derived, lambda done, total: progress("logs", done, total)
         )
-    if as_json:
-        print_json(asdict(update))
-        return
     removed = f", {update.removed} removed" if update.removed else ""
-    console.print(f"{output} written: {update.logs} logs, {update.read} read{removed}")
+    lines: list[str | Text] = [f"{output} written: {update.logs} logs, {update.read} read{removed}"]
     errors = [f"{log}: {text}" for log, text in update.errors.items()]
-    for line in errors[:_MOST_LINES]:
-        console.print(plain_text(line), style="yellow")
+    lines += [Text(plain_text(line), "yellow") for line in errors[:_MOST_LINES]]
     if len(errors) > _MOST_LINES:
-        console.print(f"and {len(errors) - _MOST_LINES} more logs with errors: --json lists all")
+        lines.append(f"and {len(errors) - _MOST_LINES} more logs with errors: --json lists all")
+    print_result(asdict(update), lines, as_json)
 
 
 def _log(name: str, text: str) -> LogLocation:
@@ -213,12 +211,7 @@ def score(
 
     with say_kept(lambda _: f"{dataset} is unchanged"), progress_bar(lines_in_pipe=True) as progress:
         result = api.score(dataset, models=model or (), progress=progress, say=say)
-    if as_json:
-        print_json(score_json(result))
-    else:
-        console.print(score_answer(result))
-        for table in score_tables(result):
-            console.print()
-            console.print(table)
+    tables = [part for table in score_tables(result) for part in ("", table)]
+    print_result(score_json(result), (score_answer(result), *tables), as_json)
     if result.as_stated is False:
         raise typer.Exit(1)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import load_calibrations, read_lab, say_remark, say_unusual
 from ipsys_log.app.cli.options import (
     REQUIRED,
@@ -267,11 +267,7 @@ def _import_truth(
         load_rig(rig) if rig else None,
     )
     imported = import_truth(sources, into, output, options)
-    if as_json:
-        print_json(truth_json(imported))
-    else:
-        for line in truth_lines(imported):
-            console.print(line)
+    print_result(truth_json(imported), truth_lines(imported), as_json)
     say(f"results are in {imported.path}")
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.options import (
     REQUIRED,
     AsJson,
@@ -22,6 +22,7 @@ from ipsys_log.app.cli.options import (
     option,
     with_options,
 )
+from ipsys_log.app.report.rows import counted
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
@@ -122,13 +123,9 @@ def cut(
     with progress_bar() as progress:
         result = cut_logs(logs, output, options, overwrite, progress)
     size = output.stat().st_size
-    if as_json:
-        print_json({"output": str(output), **result._asdict(), "bytes": size})
-        return
-    console.print(
-        f"{output} written: {result.kept} of {result.messages} messages, {result.channels} channels, "
-        f"{format_bytes(size)}"
-    )
+    text = f"{result.kept} of {result.messages} messages, {result.channels} channels, {format_bytes(size)}"
+    value = {"output": str(output), **result._asdict(), "bytes": size}
+    print_result(value, [f"{output} written: {text}"], as_json)
 
 
 def _compact(
@@ -148,15 +145,22 @@ def _compact(
         check_copy([log], output, overwrite)
     dropped, size = compaction.dropped_runs(log), read_log_state(log).size
     written = output if dropped and not dry_run else None
-    if not as_json:
-        _show_dropped(log, size, dropped)
+    for line in () if as_json else _dropped_lines(log, size, dropped):
+        console.print(line)
+    after, saved = None, []
     if written is not None:
         with progress_bar() as progress:
             compaction.compact(log, written, overwrite, progress)
-    if as_json:
-        print_json(_compact_json(log, size, written, dropped))
-    elif written is not None:
-        _show_saving(size, written)
+        after = written.stat().st_size
+        saved = [f"{written} written: {format_bytes(after)} instead of {format_bytes(size)}"]
+    value = {
+        "log": str(log),
+        "output": None if written is None else str(written),
+        "bytes": size,
+        "output_bytes": after,
+        "dropped": [_dropped_json(one) for one in dropped],
+    }
+    print_result(value, saved, as_json)
 
 
 def merge(
@@ -197,59 +201,38 @@ def merge(
     with progress_bar() as progress:
         offsets = choose_offsets(logs, offset or (), progress)
         result = merge_logs(logs, output, offsets, overwrite, progress)
-    if as_json:
-        print_json(_merge_json(output, result))
-        return
-    _show_offsets(logs, offsets)
-    console.print(f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}")
-    say(f"next: ipsys replay {shell_words(output)}")
+    lines = _offset_lines(logs, offsets)
+    written = f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}"
+    print_result(_merge_json(output, result), [*lines, written], as_json)
+    if not as_json:
+        say(f"next: ipsys replay {shell_words(output)}")
 
 
-def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> None:
+def _dropped_lines(log: LogLocation, size: int, dropped: list[DroppedRun]) -> Iterator[str]:
     if not dropped:
-        console.print(f"{log}: no run is superseded or unfinished; nothing is written")
+        yield f"{log}: no run is superseded or unfinished; nothing is written"
         return
     for one in dropped:
-        count = "1 message" if one.messages == 1 else f"{one.messages} messages"
-        stored = format_bytes(one.stored_bytes)
-        console.print(f"{one.run.run} is dropped: {one.run.reason}; {count}, about {stored}")
+        count, stored = counted(one.messages, "message"), format_bytes(one.stored_bytes)
+        yield f"{one.run.run} is dropped: {one.run.reason}; {count}, about {stored}"
     gained = sum(one.stored_bytes for one in dropped)
-    console.print(
-        f"{len(dropped)} run{'' if len(dropped) == 1 else 's'}, about {format_bytes(gained)} of "
-        f"{format_bytes(size)}",
-    )
+    yield f"{counted(len(dropped), 'run')}, about {format_bytes(gained)} of {format_bytes(size)}"
 
 
-def _show_saving(before: int, output: Path) -> None:
-    after = output.stat().st_size
-    console.print(f"{output} written: {format_bytes(after)} instead of {format_bytes(before)}")
-
-
-def _compact_json(
-    log: LogLocation, size: int, output: Path | None, dropped: list[DroppedRun]
-) -> dict[str, Any]:
+def _dropped_json(one: DroppedRun) -> dict[str, Any]:
     return {
-        "log": str(log),
-        "output": None if output is None else str(output),
-        "bytes": size,
-        "output_bytes": None if output is None else output.stat().st_size,
-        "dropped": [
-            {
-                "run": one.run.run,
-                "reason": one.run.reason,
-                "stages": one.run.stages,
-                "messages": one.messages,
-                "stored_bytes": one.stored_bytes,
-            }
-            for one in dropped
-        ],
+        "run": one.run.run,
+        "reason": one.run.reason,
+        "stages": one.run.stages,
+        "messages": one.messages,
+        "stored_bytes": one.stored_bytes,
     }
 
 
-def _show_offsets(logs: Sequence[LogLocation], offsets: Sequence[LogOffset]) -> None:
+def _offset_lines(logs: Sequence[LogLocation], offsets: Sequence[LogOffset]) -> Iterator[str]:
     for path, offset in zip(logs[1:], offsets[1:], strict=True):
         sigma = "" if offset.sigma_s is None else f" (estimated, sigma {offset.sigma_s * 1e3:.2f} ms)"
-        console.print(f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}")
+        yield f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}"
 
 
 def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
@@ -257,11 +240,7 @@ def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
         "output": str(output),
         "messages": result.messages,
         "logs": [
-            {
-                "name": one.name,
-                "offset_ns": one.offset_ns,
-                "offset_sigma_s": one.offset_sigma_s,
-            }
-            for one in result.logs
+            {"name": log.name, "offset_ns": log.offset_ns, "offset_sigma_s": log.offset_sigma_s}
+            for log in result.logs
         ],
     }

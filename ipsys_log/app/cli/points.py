@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.app.cli.console import console, print_json, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations, load_matching_rig
 from ipsys_log.app.cli.options import (
     AsJson,
@@ -218,10 +218,7 @@ def _show_places(scene: FinishedLog, as_json: bool) -> None:
     from ipsys_log.app.report.contents import intervals_json, intervals_table
 
     stops = intervals_json(scene)
-    if as_json:
-        print_json(stops)
-    else:
-        console.print(intervals_table(stops))
+    print_result(stops, [intervals_table(stops)], as_json)
 
 
 _MOST_PLACES = 50
@@ -285,18 +282,11 @@ def plan(
 def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
     from ipsys_log.app.report.calibration import plan_json, plan_lines, plan_table
 
+    print_result(plan_json(found), (plan_table(found), *plan_lines(found)), as_json, found.notes)
     if plot is not None:
         from ipsys_log.app.report.expected_error_figures import draw_plan
 
         draw_plan(found, plot)
-    if as_json:
-        print_json(plan_json(found))
-    else:
-        for part in (plan_table(found), *plan_lines(found)):
-            console.print(part)
-    for note in found.notes:
-        warn(note)
-    if plot is not None:
         say(f"{plot} drawn")
 
 

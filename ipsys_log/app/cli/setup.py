@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.app.cli.console import console, print_json, say
+from ipsys_log.app.cli.console import console, print_result, say
 from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, named, other_log_option
 from ipsys_log.app.cli.pages import print_code, say_faults
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
@@ -167,15 +167,9 @@ def cameras(
 
     attached = find_cameras()
     advice = advise_bandwidth(list_demands(attached, load_rig(rig) if rig else None))
-    if as_json:
-        print_json({"cameras": [_plain(camera) for camera in attached], "advice": advice})
-        return
-    for camera in attached:
-        console.print(_describe(camera))
-    if not attached:
-        console.print(_NONE)
-    for line in advice:
-        console.print(line)
+    lines = [_describe(camera) for camera in attached] or [_NONE]
+    result = {"cameras": [_plain(camera) for camera in attached], "advice": advice}
+    print_result(result, (*lines, *advice), as_json)
 
 
 def _plain(camera: UsbCamera) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import MODEL, check_target
 from ipsys_log.app.cli.options import AsJson, FittedModels, Force, NewLog, OneLog, named, other_log_option
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
@@ -161,8 +161,5 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
     drive_robots(run, output, request, force, say, stop_on_signal)
     with Session([output]) as session:
         result = read_robot_run(session)
-    if as_json:
-        print_json(robot_run_json(result))
-        return
-    console.print(robot_run_tables(result))
-    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}")
+    written = f"{output} written; its figure: ipsys report {shell_words(output)}"
+    print_result(robot_run_json(result), (robot_run_tables(result), written), as_json)

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ipsys_log.app.cli.console import console, print_json, print_outcomes, progress_bar, say
+from ipsys_log.app.cli.console import print_outcomes, print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
 from ipsys_log.app.cli.options import (
     REQUIRED,
@@ -34,6 +34,8 @@ from ipsys_log.log.location import LogLocation, parse_location
 from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from ipsys_log.app.report.accuracy import Accuracy
     from ipsys_log.engine.options import Request
     from ipsys_log.engine.provenance import Outcome
@@ -256,10 +258,9 @@ def _derive(
         check_folder(plots, "--plots")
     with derive(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)
-    if as_json:
-        _print_json(outcomes, accuracies)
-    else:
-        _print(accuracies, details)
+    print_result(_result(outcomes, accuracies), _parts(accuracies, details), as_json)
+    if accuracies and not (details or as_json):
+        say("--details prints errors by camera, every outlier and models by number of points")
     for line in drawn:
         say(line)
 
@@ -283,17 +284,16 @@ def _draw(
     return drawn
 
 
-def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> None:
+def _result(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> dict[str, Any]:
     from ipsys_log.app.report.accuracy import accuracy_json
     from ipsys_log.app.report.summary import answer_json
 
     stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
-    results = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
-    print_json(results)
+    return {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
 
 
-def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
-    """Print the answer first, then one table, and on request all numbers."""
+def _parts(accuracies: Sequence[Accuracy], details: bool) -> Iterator[RenderableType]:
+    """Yield the answer first, then one table, and on request all numbers."""
     from ipsys_log.app.report.summary import answer_text
     from ipsys_log.app.report.tables import accuracy_tables, models_table, trajectory_table
 
@@ -301,10 +301,8 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
     further = [*accuracy_tables(accuracies), trajectory_table(accuracies)] if details else []
     for part in [*parts, *further]:
         if part is not None:
-            console.print(part)
-            console.print()
-    if accuracies and not details:
-        say("--details prints errors by camera, every outlier and models by number of points")
+            yield part
+            yield ""
 
 
 def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -34,12 +33,7 @@ from ipsys_log.live_runs.survey.add_sheet import add_sheet, check_sheet
 from ipsys_log.live_runs.survey.entry import check_references
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from ipsys_log.live_runs.survey.live import LiveScene
-from ipsys_log.messages import (
-    CompressedImage,
-    CompressedVideo,
-    Message,
-    Model,
-)
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Model
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.settings import Stream, check_streams, open_live_streams, settings_of_rig
 from ipsys_log.units import NS_PER_S
@@ -93,13 +87,17 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
     with open_lab(Lab(rig, shown, {}, folder.path), job.say) as opened:
         attached = opened.cameras
         job.on_stop(attached.stop)
-        newest = _NewestImage(search.look)
-        with newest:
+        with ThreadPoolExecutor(1, "board") as pool:
+            working: Future[object] = pool.submit(str)
             for message in attached:
-                if message is not None and isinstance(message.payload, (CompressedImage, CompressedVideo)):
-                    newest.put(message.payload)
+                image = None if message is None else message.payload
+                # Images that arrive during a search are left out.
+                if isinstance(image, (CompressedImage, CompressedVideo)) and working.done():
+                    working.result()  # raises the error of the search
+                    working = pool.submit(search.look, image)
                 if search.is_enough:
                     attached.stop()
+        working.result()
     job.say(f"{search.count} pictures are in {pictures.parent.name}/{pictures.name}")
     # A stop ends the search early: the pictures so far count.
     (outcome,) = api.calibrate(
@@ -225,50 +223,6 @@ def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
         job.say(f"the cameras are open; {log.name} gets {seconds:g} s")
         enough = _Enough(opened.cameras, seconds, job)
         pipeline.record(opened.cameras, opened.settings, log, [enough])
-
-
-class _NewestImage:
-    """A context manager with a thread that handles the newest image, and leaves out those before it."""
-
-    def __init__(self, handle: Callable[[CompressedImage | CompressedVideo], None]) -> None:
-        self._handle = handle
-        self._image: CompressedImage | CompressedVideo | None = None
-        self._changed = threading.Condition()
-        self._is_ended = False
-        self._pool = ThreadPoolExecutor(1, "board")
-        self._working: Future[None] | None = None
-
-    def __enter__(self) -> None:
-        self._working = self._pool.submit(self._work)
-
-    def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._is_ended = True
-            self._changed.notify_all()
-        self._pool.shutdown()
-        self._raise()
-
-    def put(self, image: CompressedImage | CompressedVideo) -> None:
-        """Replace the waiting image; raise the error of the thread."""
-        if self._working is not None and self._working.done():
-            self._raise()
-        with self._changed:
-            self._image = image
-            self._changed.notify_all()
-
-    def _raise(self) -> None:
-        if self._working is not None:
-            self._working.result()
-
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._image is not None or self._is_ended)
-                image, self._image = self._image, None
-                if self._is_ended:
-                    return
-            assert image is not None
-            self._handle(image)
 
 
 class _Enough:

@@ -12,7 +12,7 @@ import typer
 
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.app.cli.open_cameras import SENT_NOW, prepare_lab, record_now
-from ipsys_log.app.cli.options import AsJson, figure_option, file_log_argument, named
+from ipsys_log.app.cli.options import AsJson, figure_option, file_log_argument, named, switch
 from ipsys_log.app.cli.signals import note_kept, say_kept
 from ipsys_log.app.report.files import check_file, check_folder, write_files
 from ipsys_log.errors import IpsysError
@@ -49,7 +49,7 @@ MarkerScale = Annotated[
     named("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
 Dictionary = Annotated[str, named("--dictionary", "NAME", "Dictionary of the markers of a ChArUco board.")]
-Inverted = Annotated[bool, named("--inverted", None, "The board has black and white exchanged.")]
+Inverted = Annotated[bool, switch("--inverted", "The board has black and white exchanged.")]
 Lens = Annotated[
     str,
     named(
@@ -79,9 +79,8 @@ Formats = Annotated[
 Plot = Annotated[Path | None, figure_option("coverage and residuals")]
 Force = Annotated[
     bool,
-    named(
+    switch(
         "--force",
-        None,
         "Write a result that a check refuses: the file exists; most images show a larger board than "
         "--board; RMS above 2 px; fewer than 5 images; images of two cameras.",
     ),
@@ -160,7 +159,10 @@ def calibrate(
                     outcomes.append(outcome._replace(reason=reason))
     lenses = [outcome for outcome in outcomes if isinstance(outcome, CalibrationResult)]
     if plot is not None and lenses:
-        _draw(lenses, plot)
+        from ipsys_log.app.report.calibration_figures import calibration_figure
+        from ipsys_log.app.report.figures import save_figure
+
+        save_figure(calibration_figure(lenses), plot, 110)
     _print_outcomes(outcomes, targets, plot, as_json, for_rig="opencv" in names)
 
 
@@ -261,13 +263,6 @@ def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
     for folder in dict.fromkeys(path.parent for path in contents):
         write_files(folder, {path.name: data for path, data in contents.items() if path.parent == folder})
         note_kept(", ".join(str(path) for path in contents if path.parent == folder))
-
-
-def _draw(lenses: list[CalibrationResult], plot: Path) -> None:
-    from ipsys_log.app.report.calibration_figures import calibration_figure
-    from ipsys_log.app.report.figures import figure_bytes
-
-    write_files(plot.parent, {plot.name: figure_bytes(calibration_figure(lenses), plot, 110)})
 
 
 def _show(one: CalibrationResult, files: list[Path], for_rig: bool) -> None:

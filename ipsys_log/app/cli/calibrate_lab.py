@@ -36,6 +36,7 @@ from ipsys_log.app.cli.options import (
     log_argument,
     log_option,
     named,
+    switch,
 )
 from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.app.cli.stages import derive
@@ -75,9 +76,8 @@ Seconds = Annotated[
 ]
 Terminal = Annotated[
     bool,
-    named(
+    switch(
         "--terminal",
-        None,
         "Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
     ),
 ]

@@ -24,6 +24,7 @@ from ipsys_log.app.cli.options import (
     log_option,
     named,
     other_log_option,
+    switch,
 )
 from ipsys_log.app.cli.stages import derive
 from ipsys_log.errors import IpsysError
@@ -59,9 +60,8 @@ ModelLog = Annotated[
 ]
 Fix = Annotated[
     bool,
-    named(
+    switch(
         "--fix",
-        None,
         "Append the joint model with the new poses of the moved cameras to the last log, as a new run.",
     ),
 ]

@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from ipsys_log.app.cli.console import console, print_outcomes, print_result, progress_bar, say, warn
-from ipsys_log.app.cli.options import AsJson, LogList, appended_log_argument, log_argument, named
+from ipsys_log.app.cli.options import AsJson, LogList, appended_log_argument, log_argument, named, switch
 from ipsys_log.app.cli.signals import writes_nothing
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -25,7 +25,7 @@ Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is re
 def check(
     logs: Logs,
     details: Annotated[
-        bool, named("--details", None, "Also print notes: rates, unknown channels, current runs.")
+        bool, switch("--details", "Also print notes: rates, unknown channels, current runs.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -65,9 +65,7 @@ def verify(
     ] = None,
     compare: Annotated[
         bool,
-        named(
-            "--compare", None, "Compare the runs of two logs, or two runs of one log, and compute nothing."
-        ),
+        switch("--compare", "Compare the runs of two logs, or two runs of one log, and compute nothing."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

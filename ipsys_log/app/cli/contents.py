@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say
-from ipsys_log.app.cli.options import AsJson, ReadLogs, figure_option, named
+from ipsys_log.app.cli.options import AsJson, ReadLogs, figure_option, named, switch
 from ipsys_log.app.cli.signals import writes_nothing
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -29,16 +29,14 @@ def info(
     logs: ReadLogs,
     runs: Annotated[
         bool,
-        named("--runs", None, "Show the runs with their inputs, parameters, versions and states."),
+        switch("--runs", "Show the runs with their inputs, parameters, versions and states."),
     ] = False,
     sizes: Annotated[
-        bool, named("--sizes", None, "Show the size of each channel of each log, the largest first.")
+        bool, switch("--sizes", "Show the size of each channel of each log, the largest first.")
     ] = False,
     latency: Annotated[
         bool,
-        named(
-            "--latency", None, "Show the latency of each step of a live run, from the frame to the position."
-        ),
+        switch("--latency", "Show the latency of each step of a live run, from the frame to the position."),
     ] = False,
     plot: Annotated[Path | None, figure_option("the processing steps of --latency")] = None,
     as_json: AsJson = False,

@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
-from ipsys_log.app.cli.options import AsJson, file_log_argument, named
+from ipsys_log.app.cli.options import AsJson, file_log_argument, named, switch
 from ipsys_log.app.cli.signals import say_kept
 from ipsys_log.app.report.files import check_file, check_parquet_name
 from ipsys_log.errors import IpsysError
@@ -131,11 +131,11 @@ def pack(
     ] = None,
     without_images: Annotated[
         bool,
-        named("--without-images", None, "Leave out the images, and keep the detected markers."),
+        switch("--without-images", "Leave out the images, and keep the detected markers."),
     ] = False,
     blur: Annotated[
         bool,
-        named("--blur", None, "Blur the images outside of the detected markers: a new recording, in grey."),
+        switch("--blur", "Blur the images outside of the detected markers: a new recording, in grey."),
     ] = False,
     every: Annotated[int, named("--every", "N", "Keep each n-th frame of each camera.", min=1)] = 1,
 ) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ipsys_log.app.cli.console import console
-from ipsys_log.app.cli.options import named
+from ipsys_log.app.cli.options import named, switch
 from ipsys_log.app.report.files import check_file, write_files
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -55,7 +55,7 @@ PageName = Annotated[
     named("--page", "NAME", "Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small."),
 ]
 Output = Annotated[Path, named("--output,-o", "FILE", "The PDF to write.")]
-Force = Annotated[bool, named("--force", None, "Overwrite an existing file.")]
+Force = Annotated[bool, switch("--force", "Overwrite an existing file.")]
 
 _DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"
 _MOST = 2000

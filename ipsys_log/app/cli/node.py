@@ -9,7 +9,7 @@ import typer
 
 from ipsys_log.app.cli.console import say, warn
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import Calibrations, Corners, Force, log_option, named
+from ipsys_log.app.cli.options import Calibrations, Corners, Force, log_option, named, switch
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -43,7 +43,7 @@ def node(
         named("--certificates", "FOLDER", "The folder of the certificates, instead of the rig's."),
     ] = None,
     detect: Annotated[
-        bool, named("--detect", None, "Detect the markers here, and send only the markers.")
+        bool, switch("--detect", "Detect the markers here, and send only the markers.")
     ] = False,
     calibration: Calibrations = None,
     corners: Corners = None,

@@ -97,6 +97,11 @@ def named(names: str, metavar: str | None, text: str, **settings: Any) -> Any:
     return typer.Option(*names.split(","), metavar=metavar, help=text, **settings)
 
 
+def switch(names: str, text: str, **settings: Any) -> Any:
+    """Return the description of an option without a value."""
+    return named(names, None, text, **settings)
+
+
 def option(
     kind: Any, names: str, metavar: str | None, text: str, default: Any = None, **settings: Any
 ) -> Option:
@@ -239,8 +244,8 @@ Only = Annotated[
     list[str] | None,
     named("--camera", "NAME", "Use only this camera of the rig; repeat it for several."),
 ]
-Force = Annotated[bool, named("--force", None, "Overwrite an existing log of this name.")]
-Overwrite = Annotated[bool, named("--overwrite,--force", None, "Replace an existing log of this name.")]
+Force = Annotated[bool, switch("--force", "Overwrite an existing log of this name.")]
+Overwrite = Annotated[bool, switch("--overwrite,--force", "Replace an existing log of this name.")]
 Host = Annotated[
     str | None,
     named(
@@ -256,7 +261,7 @@ Port = Annotated[
 ]
 RigNow = Annotated[Path, named("--rig", "FILE", "The rig file, with a source for each camera.")]
 Terminal = Annotated[
-    bool, named("--terminal", None, "Ask for the measurements in the terminal instead of on a page.")
+    bool, switch("--terminal", "Ask for the measurements in the terminal instead of on a page.")
 ]
 FittedModels = Annotated[
     list[str] | None,
@@ -269,4 +274,4 @@ FittedModels = Annotated[
 ]
 Seconds = Annotated[float | None, named("--seconds", "SECONDS", "Stop after this time.", min=0.1)]
 Train = Annotated[str, named("--train", "LABEL", "Fit on the measurements with this label.")]
-AsJson = Annotated[bool, named("--json", None, "Print JSON.")]
+AsJson = Annotated[bool, switch("--json", "Print JSON.")]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from ipsys_log.app.cli.console import console, remarks, say
-from ipsys_log.app.cli.options import named
+from ipsys_log.app.cli.options import named, switch
 from ipsys_log.errors import IpsysError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _USUAL_PORT = 8000
 _GAP = 4
 _CODE_STYLE = "#ffffff on #000000"
 
-Web = Annotated[bool, named("--web", None, "Show a page, the dashboard, for any number of browsers.")]
+Web = Annotated[bool, switch("--web", "Show a page, the dashboard, for any number of browsers.")]
 WebPort = Annotated[
     int | None,
     named(

@@ -26,6 +26,7 @@ from ipsys_log.app.cli.options import (
     appended_log_argument,
     figure_option,
     named,
+    switch,
 )
 from ipsys_log.app.cli.pages import serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
@@ -45,12 +46,10 @@ Sheet = Annotated[
     Path | None,
     named("--csv", "SHEET", "Read the measurements from a sheet; docs/measuring.md shows the columns."),
 ]
-Insist = Annotated[bool, named("--force", None, "With --csv: write rows that look wrong, too.")]
+Insist = Annotated[bool, switch("--force", "With --csv: write rows that look wrong, too.")]
 Places = Annotated[
     bool,
-    named(
-        "--places", None, "Only list the stationary intervals of the markers, with their numbers for a sheet."
-    ),
+    switch("--places", "Only list the stationary intervals of the markers, with their numbers for a sheet."),
 ]
 Baseline = Annotated[
     str | None,
@@ -156,7 +155,7 @@ def exclude(
     ],
     reason: Annotated[str, named("--reason", "TEXT", "The reason, which is written into the log.")],
     readmit: Annotated[
-        bool, named("--readmit", None, "Use excluded points again, instead of excluding points.")
+        bool, switch("--readmit", "Use excluded points again, instead of excluding points.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -27,8 +27,8 @@ from ipsys_log.app.cli.options import (
     RigNow,
     Seconds,
     Terminal,
-    named,
     other_log_option,
+    switch,
 )
 from ipsys_log.app.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
 from ipsys_log.app.cli.points import show_measured
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from ipsys_log.sinks.sink import Sink
     from ipsys_log.sinks.streams.settings import StreamSettings
 
-View = Annotated[bool, named("--view", None, "Show cameras and robots in Rerun during the recording.")]
+View = Annotated[bool, switch("--view", "Show cameras and robots in Rerun during the recording.")]
 
 _TURN_S = 0.05
 # After this time, the markers in the images and their stationary intervals are known.
@@ -62,15 +62,15 @@ def record(
     rig: RigNow = Path("lab.toml"),
     camera: Only = None,
     calibration: Calibrations = None,
-    detect: Annotated[bool, named("--detect", None, "Detect the markers and write them, too.")] = False,
+    detect: Annotated[bool, switch("--detect", "Detect the markers and write them, too.")] = False,
     corners: Corners = None,
     measure: Annotated[
         bool,
-        named("--measure", None, "Enter tape measurements during the recording, on a page for the phone."),
+        switch("--measure", "Enter tape measurements during the recording, on a page for the phone."),
     ] = False,
     points_only: Annotated[
         bool,
-        named("--points-only", None, "With --measure: keep only about 1 s of frames of each measured point."),
+        switch("--points-only", "With --measure: keep only about 1 s of frames of each measured point."),
     ] = False,
     terminal: Terminal = False,
     host: Host = None,
@@ -84,7 +84,7 @@ def record(
     ] = None,
     seconds: Seconds = None,
     force: Force = False,
-    as_json: Annotated[bool, named("--json", None, "With --points-only: print JSON.", hidden=True)] = False,
+    as_json: Annotated[bool, switch("--json", "With --points-only: print JSON.", hidden=True)] = False,
 ) -> None:
     """Record the camera frames, unchanged, until Ctrl-C.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.app.cli.console import console, print_result, say
-from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, named, other_log_option
+from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, named, other_log_option, switch
 from ipsys_log.app.cli.pages import print_code, say_faults
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.app.report.files import check_folder
@@ -42,9 +42,8 @@ def init(
     ] = None,
     simulated: Annotated[
         bool,
-        named(
+        switch(
             "--simulated",
-            None,
             "Write the rig of the simulated lab, to try all commands without a camera, and a sheet of "
             "its tape measurements.",
         ),

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import MODEL, check_target
-from ipsys_log.app.cli.options import AsJson, FittedModels, Force, NewLog, OneLog, named, other_log_option
+from ipsys_log.app.cli.options import (
+    AsJson,
+    FittedModels,
+    Force,
+    NewLog,
+    OneLog,
+    named,
+    other_log_option,
+    switch,
+)
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
@@ -82,7 +91,7 @@ def drive(
         ),
     ],
     model: FittedModels = None,
-    robots: Annotated[int, named("--robots", None, "Number of robots, 1 to 3; their paths cross.")] = 1,
+    robots: Annotated[int, switch("--robots", "Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
         Path | None,
@@ -90,23 +99,21 @@ def drive(
     ] = None,
     over: Annotated[str, named("--over", "udp|vrpn|ros2", "The stream of the positions.")] = "udp",
     loss: Annotated[float, named("--loss", "SHARE", "Lose this share of the datagrams, such as 0.05.")] = 0.0,
-    delay_ms: Annotated[float, named("--delay-ms", None, "Delay the datagrams, in ms.")] = 0.0,
+    delay_ms: Annotated[float, switch("--delay-ms", "Delay the datagrams, in ms.")] = 0.0,
     fail: Failures = None,
     lockstep: Annotated[
         bool,
-        named(
-            "--lockstep", None, "Use simulated time: the result does not depend on the speed of the machine."
-        ),
+        switch("--lockstep", "Use simulated time: the result does not depend on the speed of the machine."),
     ] = False,
-    rate_hz: Annotated[float, named("--rate-hz", None, "Frames per second of each camera.")] = 5.0,
+    rate_hz: Annotated[float, switch("--rate-hz", "Frames per second of each camera.")] = 5.0,
     seed: Annotated[
-        int, named("--seed", None, "Seed of the start, the wheels, the noise and the lost datagrams.")
+        int, switch("--seed", "Seed of the start, the wheels, the noise and the lost datagrams.")
     ] = 0,
-    lab_seed: Annotated[int, named("--lab-seed", None, "Seed of the simulated lab.")] = 0,
+    lab_seed: Annotated[int, switch("--lab-seed", "Seed of the simulated lab.")] = 0,
     port: Annotated[
-        int, named("--port", None, "First of the used ports; 0: free ports.", min=0, max=65000)
+        int, switch("--port", "First of the used ports; 0: free ports.", min=0, max=65000)
     ] = 9870,
-    seconds: Annotated[float, named("--seconds", None, "Stop after this time.", min=1.0)] = 300.0,
+    seconds: Annotated[float, switch("--seconds", "Stop after this time.", min=1.0)] = 300.0,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:

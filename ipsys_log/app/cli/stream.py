@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli.console import say
-from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, named, option
+from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, named, option, switch
 from ipsys_log.app.cli.pages import Web, WebPort, check_playback_page, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.errors import IpsysError
@@ -44,8 +44,8 @@ RigFile = Annotated[
     named("--rig", "FILE", "Open the streams of this rig file (lab.toml)."),
 ]
 Rate = Annotated[float, named("--rate", "FACTOR", "Play faster or slower: 2 is twice as fast.")]
-Loop = Annotated[bool, named("--loop", None, "Begin again at the end.")]
-StartPaused = Annotated[bool, named("--start-paused", None, "Wait for a key at the start.")]
+Loop = Annotated[bool, switch("--loop", "Begin again at the end.")]
+StartPaused = Annotated[bool, switch("--start-paused", "Wait for a key at the start.")]
 StartOffset = Annotated[
     float,
     named("--start-offset", "SECONDS", "Begin so long after the first position."),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ipsys_log.app.cli.console import console, progress_bar, say
-from ipsys_log.app.cli.options import ReadLogs, named
+from ipsys_log.app.cli.options import ReadLogs, named, switch
 from ipsys_log.app.cli.stages import MORE, build_command, derive, options_until
 from ipsys_log.app.report.files import check_file, write_files
 from ipsys_log.errors import IpsysError
@@ -194,7 +194,7 @@ def export(
         named("--robot", "NAME", "Export only this robot."),
     ] = None,
     without_images: Annotated[
-        bool, named("--without-images", None, "Leave the images out of a ROS 2 bag.")
+        bool, switch("--without-images", "Leave the images out of a ROS 2 bag.")
     ] = False,
     frame_rate: Annotated[float, named("--frame-rate", "HZ", "Frames per second of a video.")] = 25.0,
     size: Annotated[

@@ -108,7 +108,7 @@ def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float
     axes.yaxis.set_major_locator(_steps(square.half))
     axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
-    _draw_references(axes, rig.reference_points if rig else ())
+    draw_references(axes, rig.reference_points if rig else ())
 
 
 class Square(NamedTuple):
@@ -137,7 +137,8 @@ def show_square(axes: Axes, square: Square) -> None:
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
 
 
-def _draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
+def draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
+    """Draw the reference points with their names."""
     for point in points:
         axes.plot(point.x_m, point.y_m, "+", color="black", ms=11, mew=1.6, zorder=5)
         axes.annotate(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,7 +128,7 @@ def add_commands(
     add("replay", text, _replay, {**_stage_options(None), "output": _OUTPUT, "outdated": outdated})
     text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
     text += _MORE + _REPEAT
-    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _OUTPUT})
+    add("evaluate", text, partial(_replay, "evaluate"), {**_stage_options("evaluate"), "output": _OUTPUT})
     text = "Compute every run of each log again, and compare it byte for byte." + _MORE
     add("verify", text, _verify, {"run": run, "derived": derived})
     add("check", "Read each log completely and check it." + _MORE, _check, {"derived": derived})
@@ -145,21 +146,13 @@ def _stage_options(until: str | None) -> dict[str, Option]:
     return {name: option for name, option in options_until(until).items() if name not in left_out}
 
 
-def _replay(outdated: bool, **given: Any) -> None:
-    _replay_each(given, outdated=outdated)
-
-
-def _evaluate(**given: Any) -> None:
-    _replay_each(given, until="evaluate")
-
-
-def _replay_each(given: dict[str, Any], **further: Any) -> None:
+def _replay(until: str | None = None, outdated: bool = False, **given: Any) -> None:
     from ipsys_log.api.batch.log_work import replay_log
     from ipsys_log.api.batch.tasks import BatchTask
 
     options, batch = _divide(given)
     folder = _result_folder(options.pop("output"), "-o")
-    work = {**further, "folder": folder, **_replay_options(options)}
+    work = {"until": until, "outdated": outdated, "folder": folder, **_replay_options(options)}
     _run(BatchTask(replay_log, work, divides=True), **batch)
 
 

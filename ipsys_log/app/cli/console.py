@@ -15,6 +15,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
+from ipsys_log.app.report.rows import counted
 from ipsys_log.plain_text import plain_text
 
 if TYPE_CHECKING:
@@ -115,7 +116,10 @@ def progress_bar(
     if not remarks.is_terminal:
         yield progress_lines() if lines_in_pipe else lambda stage, done, total: None
         return
-    rated = _causal_stages() if frame_steps is None else frame_steps
+    if frame_steps is None:
+        from ipsys_log.engine.graph import STAGES
+
+        frame_steps = {stage.name for stage in STAGES if stage.causal}
     with Progress(*columns, console=remarks, transient=True) as bar:
         bars: dict[str, TaskID] = {}
         steps: dict[str, str] = {}
@@ -135,7 +139,7 @@ def progress_bar(
                 return
             drawn_s = now_s
             speed = bar.tasks[bars[stage]].speed
-            rate = f"{speed:,.0f} frames/s" if speed and stage in rated else ""
+            rate = f"{speed:,.0f} frames/s" if speed and stage in frame_steps else ""
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show
@@ -154,12 +158,6 @@ def progress_lines() -> Progress:
             say(f"{stage}: {done} of {total}")
 
     return show
-
-
-def _causal_stages() -> set[str]:
-    from ipsys_log.engine.graph import STAGES
-
-    return {stage.name for stage in STAGES if stage.causal}
 
 
 def say(text: str) -> None:
@@ -200,8 +198,7 @@ def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     rest = _print_many(outcomes)
     width = max((len(outcome.run) for outcome in rest), default=0)
     for outcome in rest:
-        count = "1 message" if outcome.messages == 1 else f"{outcome.messages} messages"
-        state = count if outcome.fresh else "up to date"
+        state = counted(outcome.messages, "message") if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<{width}} {state}")
         for remark in outcome.remarks:
             remarks.print(f"  {remark}", style="yellow")

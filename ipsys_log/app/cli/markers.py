@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from ipsys_log.app.cli.console import console
 from ipsys_log.app.cli.options import named, switch
 from ipsys_log.app.report.files import check_file, write_files
+from ipsys_log.app.report.rows import counted
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 
@@ -85,7 +86,7 @@ def markers(
         ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
     """
     check_installed("markers needs", "matplotlib")
-    from ipsys_log.app.report.prints import choose_paper, draw_pages, lay_out
+    from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out
 
     if output.suffix.lower() != ".pdf":
         raise IpsysError(f"--output {output}: only a PDF keeps the true size; use a name that ends in .pdf")
@@ -94,18 +95,18 @@ def markers(
         raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
     prints = _marker_prints(rig, ids, length, dictionary) if rig or ids else []
     if board is not None:
-        prints.append(_board(board, square, marker_scale, dictionary or _BOARD_DICTIONARY))
+        from ipsys_log.calibration.board import parse_board
+
+        drawn = parse_board(board, square, marker_scale, dictionary or _BOARD_DICTIONARY, False)
+        prints.append(board_print(drawn, board))
     if not prints:
         raise IpsysError("nothing to print: give --rig lab.toml, --ids 0-9 --length 0.1, or --board 6x4")
     paper = choose_paper(prints, page)
     pages = lay_out(prints, paper)
     write_files(output.parent, {output.name: draw_pages(pages)})
-    count = "1 page" if len(pages) == 1 else f"{len(pages)} pages"
-    console.print(f"{output} written: {count} of {paper.name}, {_contents(prints)}")
+    console.print(f"{output} written: {counted(len(pages), 'page')} of {paper.name}, {_contents(prints)}")
     if page is None and paper.name != "A4":
-        console.print(
-            "A4 is too small. Print on A3, or use --length 0.14 for markers that fit on A4",
-        )
+        console.print("A4 is too small. Print on A3, or use --length 0.14 for markers that fit on A4")
     console.print('print at 100 % ("actual size"), and check that the printed ruler is 10 cm long')
 
 
@@ -169,14 +170,7 @@ def _parse_ids(text: str, dictionary: str) -> list[int]:
     return list(dict.fromkeys(ids))
 
 
-def _board(text: str, square: float, marker_scale: float, dictionary: str) -> Print:
-    from ipsys_log.app.report.prints import board_print
-    from ipsys_log.calibration.board import parse_board
-
-    return board_print(parse_board(text, square, marker_scale, dictionary, False), text)
-
-
 def _contents(prints: list[Print]) -> str:
     count = sum(not item.is_board for item in prints)
-    parts = [f"{count} marker{'' if count == 1 else 's'}"] if count else []
+    parts = [counted(count, "marker")] if count else []
     return " and ".join([*parts, *(item.name for item in prints if item.is_board)])

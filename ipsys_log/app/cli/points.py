@@ -31,13 +31,13 @@ from ipsys_log.app.cli.options import (
 from ipsys_log.app.cli.pages import serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.app.report.rows import counted
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.live_runs.survey.floor_plan import PlannedFloor
-    from ipsys_log.live_runs.survey.from_log import FinishedLog
     from ipsys_log.live_runs.survey.scene import MeasuringScene
     from ipsys_log.messages import Measurement, Rig
 
@@ -113,7 +113,10 @@ def measure(
         with progress_bar() as progress:
             scene = stack.enter_context(open_finished_log(log, request, progress, say))
         if places:
-            _show_places(scene, as_json)
+            from ipsys_log.app.report.contents import intervals_json, intervals_table
+
+            stops = intervals_json(scene)
+            print_result(stops, [intervals_table(stops)], as_json)
             return
         before = len(scene.history())
         if ab is not None:
@@ -202,7 +205,7 @@ def show_measured(
         baselines = sum(measurement.from_reference is not None for measurement in added)
         also = f", {baselines} distance AB" if baselines else ""
         also += f", {withdrawn} withdrawn" if withdrawn else ""
-        console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}")
+        console.print(f"{counted(count, 'point')} measured into {log}{also}")
     active = len(active_measurements(history))
     if 0 < active < _GOOD:
         say(
@@ -211,13 +214,6 @@ def show_measured(
         )
     if active:
         say(f"next: ipsys replay {shell_words(log)}")
-
-
-def _show_places(scene: FinishedLog, as_json: bool) -> None:
-    from ipsys_log.app.report.contents import intervals_json, intervals_table
-
-    stops = intervals_json(scene)
-    print_result(stops, [intervals_table(stops)], as_json)
 
 
 _MOST_PLACES = 50

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -299,30 +299,30 @@ def live(
     with (
         open_cameras(lab, output, seconds) as (opened, status),
         open_live_streams(streamed, opened, run) as senders,
-        _page_viewer(opened, run, streamed) as pages,
+        _viewers(opened, run, streamed, view) as viewers,
         serve_dashboard(planned, opened, status, output, run, senders) as dashboards,
     ):
-        viewer = [_viewer(opened, run)] if view else []
-        sinks: list[Sink] = [status, *viewer, *pages, *dashboards, *senders]
+        sinks: list[Sink] = [status, *viewers, *dashboards, *senders]
         pipeline.live(opened.cameras, opened.settings, output, request, None, sinks, force)
 
 
-def _viewer(opened: OpenLab, run: str) -> LiveView:
-    from ipsys_log.sinks.rerun.live import LiveView
-
-    return LiveView(opened.rig, opened.cameras.states, run, say)
-
-
 @contextmanager
-def _page_viewer(opened: OpenLab, run: str, streamed: StreamSettings) -> Iterator[list[LiveView]]:
-    """Show the recording on a page for a browser of this machine, if the user asked for it."""
-    if not streamed.rerun:
+def _viewers(
+    opened: OpenLab, run: str, streamed: StreamSettings, has_window: bool
+) -> Iterator[list[LiveView]]:
+    """Show the recording in a window, and on a page for a browser of this machine, as the user asked."""
+    if not (has_window or streamed.rerun):
         yield []
         return
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.sinks.rerun.viewer import ViewerPage
 
-    shown = opened.cameras.states if streamed.images else ()
-    with closing(ViewerPage()) as page:
-        say(page.describe())
-        yield [LiveView(opened.rig, shown, run, say, page.show, page.name)]
+    cameras = opened.cameras.states
+    views = [LiveView(opened.rig, cameras, run, say)] if has_window else []
+    with ExitStack() as stack:
+        if streamed.rerun:
+            page = stack.enter_context(closing(ViewerPage()))
+            say(page.describe())
+            shown = cameras if streamed.images else ()
+            views.append(LiveView(opened.rig, shown, run, say, page.show, page.name))
+        yield views

@@ -67,7 +67,11 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
             return
     check_installed("view needs", "rerun")
     if save is not None:
-        _check_save(save, logs)
+        if save.suffix != ".rrd":  # Rerun opens a recording by its name
+            raise IpsysError(
+                f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd"
+            )
+        check_file(save, "--save", logs)
     from ipsys_log.engine.states import out_of_date_lines
     from ipsys_log.sinks.rerun.recording import write_recording
 
@@ -96,13 +100,6 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
     with replacement_of(path) as file:
         file.write(json.dumps(layout, indent=2).encode() + b"\n")
     say(f"{path} written; in Foxglove: Layouts, Import from file")
-
-
-def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
-    """Check that a recording can be written, and that Rerun will open it by its name."""
-    if save.suffix != ".rrd":
-        raise IpsysError(f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd")
-    check_file(save, "--save", logs)
 
 
 def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:

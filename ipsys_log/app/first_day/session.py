@@ -260,16 +260,8 @@ class SetupSession:
             return None
         result = self._alignment = log.alignment
         cameras = [
-            {
-                "camera": one.camera,
-                "level": one.level,
-                "advice": one.advice,
-                "size_px": one.size_px,
-                "centre_px": one.centre_px,
-                "plumb_px": one.plumb_px,
-                "markers_px": one.markers_px,
-                "picture": f"picture/alignment/{one.camera}?{log.start_ns}" if one.picture else None,
-            }
+            asdict(one)
+            | {"picture": f"picture/alignment/{one.camera}?{log.start_ns}" if one.picture else None}
             for one in result.cameras
         ]
         return {"cameras": cameras, "coverage": result.coverage, "notes": result.notes}

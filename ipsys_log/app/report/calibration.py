@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from ipsys_log.calibration.image_selection import ExcludedSighting
     from ipsys_log.live_runs.survey.floor_plan import PlannedFloor
     from ipsys_log.live_runs.survey.lab_calibration import CameraResult, LabCalibration
-    from ipsys_log.statistics.joint_plan import PlannedDrive
 
 _SHOWN_DROPPED = 6
 
@@ -283,6 +282,11 @@ def plan_json(found: PlannedFloor) -> dict[str, Any]:
         }
         for number, place in enumerate(found.plan.places, 1)
     ]
+    drive: dict[str, Any] = {}
+    if found.drive is not None:
+        from ipsys_log.statistics.joint_plan import DRIVE_S
+
+        drive = {"drive": {**plain(found.drive), "duration_s": DRIVE_S}}
     return {
         "model": found.model,
         "run": found.run,
@@ -290,12 +294,6 @@ def plan_json(found: PlannedFloor) -> dict[str, Any]:
         "mean_before_m": places[0]["mean_before_m"],
         "mean_after_m": places[-1]["mean_after_m"],
         "places": places,
-        **({} if found.drive is None else {"drive": _drive_json(found.drive)}),
+        **drive,
         "notes": list(found.notes),
     }
-
-
-def _drive_json(drive: PlannedDrive) -> dict[str, Any]:
-    from ipsys_log.statistics.joint_plan import DRIVE_S
-
-    return {**plain(drive), "duration_s": DRIVE_S}

@@ -35,7 +35,10 @@ def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
             {
                 "path": str(check.path),
                 "state": check.state,
-                "findings": [_finding_json(finding) for finding in check.findings],
+                "findings": [
+                    {key: value for key, value in asdict(finding).items() if value not in (None, "")}
+                    for finding in check.findings
+                ],
             }
             for check in checks
         ],
@@ -53,10 +56,6 @@ def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
             yield f"  {finding.advice}"
     if len(findings) > _MOST_LINES:
         yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
-
-
-def _finding_json(finding: LogFinding) -> dict[str, Any]:
-    return {key: value for key, value in asdict(finding).items() if value not in (None, "")}
 
 
 def _first_fault(check: LogCheck) -> LogFinding | None:

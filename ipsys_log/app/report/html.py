@@ -159,14 +159,11 @@ def _overlap(session: Session, findings: Findings) -> dict[str, Any]:
 def _tracks(session: Session) -> dict[str, Any]:
     """Return the picture of the newest tracks, and their errors if there is ground truth."""
     run = newest_run(session, TRACKS)
+    tracks = [] if run is None else [Accuracy(run, None, None, tuple(read_trajectories(session, run)))]
     return {
         "tracks_picture": html_figures.tracks_picture(session, run),
-        "trajectories": None if run is None else trajectory_table([_with_trajectories(session, run)]),
+        "trajectories": trajectory_table(tracks),
     }
-
-
-def _with_trajectories(session: Session, run: str) -> Accuracy:
-    return Accuracy(run, None, None, tuple(read_trajectories(session, run)))
 
 
 def _commands(session: Session, findings: Findings) -> dict[str, str]:

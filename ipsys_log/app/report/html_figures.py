@@ -85,8 +85,8 @@ def residual_pictures(findings: Findings) -> list[Picture]:
     accuracies = shown_models(findings)
     if not accuracies:
         return []
-    pictures = []
-    scale = residual_scale(findings, accuracies)
+    pictures, scale = [], residual_scale(findings, accuracies)
+    hull = "Dashed" if has_legend(len(findings.training_m())) else "Grey line"
     for accuracy in accuracies:
         figure, axes = new_figure(5.6)
         arrows = draw_residuals(axes, findings, accuracy, scale)
@@ -94,14 +94,10 @@ def residual_pictures(findings: Findings) -> list[Picture]:
         caption = (
             f"Errors of {label(accuracy.model)}, seen from above. An arrow points from the calibration "
             "point to the estimated position; arrows are enlarged. "
-            f"{_hull_text(findings)}: area of the calibration points of a camera"
+            f"{hull}: area of the calibration points of a camera"
         )
         pictures.append(picture(figure, caption))
     return pictures
-
-
-def _hull_text(findings: Findings) -> str:
-    return "Dashed" if has_legend(len(findings.training_m())) else "Grey line"
 
 
 def learning_pictures(findings: Findings) -> list[Picture]:

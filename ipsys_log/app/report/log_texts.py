@@ -53,16 +53,7 @@ def sizes_json(path: str, file_bytes: int, sizes: Sequence[ChannelSize]) -> dict
     return {
         "path": path,
         "bytes": file_bytes,
-        "channels": [
-            {
-                "topic": size.topic,
-                "messages": size.messages,
-                "payload_bytes": size.payload_bytes,
-                "stored_bytes": size.stored_bytes,
-                "share": size.stored_bytes / file_bytes,
-            }
-            for size in sizes
-        ],
+        "channels": [{**asdict(size), "share": size.stored_bytes / file_bytes} for size in sizes],
         "other_bytes": file_bytes - stored_bytes,
     }
 

@@ -26,7 +26,6 @@ from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
 from ipsys_log.live_runs.survey.scene import (
     CameraView,
     MeasuringScene,
-    StationaryInterval,
     observe_marker,
     visible_markers,
 )
@@ -74,7 +73,8 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
         for measurement in reversed(history)
         if measurement.refers_to is None
     ]
-    return {"next": next_id(history), "places": rows, "measured": _measured(scene.intervals, active)}
+    measured = [next((m.id for m in active if interval.covers(m)), None) for interval in scene.intervals]
+    return {"next": next_id(history), "places": rows, "measured": measured}
 
 
 def _tapes(measurement: Measurement) -> str:
@@ -82,11 +82,6 @@ def _tapes(measurement: Measurement) -> str:
     side = [measurement.side] if measurement.side else []
     height = [f"height {measurement.height_m * CM_PER_M:.1f} cm"] if measurement.height_m is not None else []
     return ", ".join([*tapes, *side, *height])
-
-
-def _measured(intervals: Sequence[StationaryInterval], active: Sequence[Measurement]) -> list[str | None]:
-    """Return the id of the measurement of each stationary interval; None if it is not measured yet."""
-    return [next((m.id for m in active if interval.covers(m)), None) for interval in intervals]
 
 
 # A longer list of ids is not read.

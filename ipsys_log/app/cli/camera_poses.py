@@ -27,6 +27,7 @@ from ipsys_log.app.cli.options import (
     switch,
 )
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.app.report.rows import wrap_text
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
@@ -159,8 +160,8 @@ def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
 
 
 def _marked(lines: Iterable[tuple[str, bool]]) -> Iterator[Text]:
-    """Yield lines in green if they are good, else in red."""
-    return (Text(line, "green" if is_good else "red") for line, is_good in lines)
+    """Yield lines of at most 80 columns, in green if they are good, else in red."""
+    return (Text(wrap_text(line), "green" if is_good else "red") for line, is_good in lines)
 
 
 def drift(

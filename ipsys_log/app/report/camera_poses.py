@@ -11,7 +11,7 @@ from rich.text import Text
 
 from ipsys_log.app.report.alignment import AlignedLab
 from ipsys_log.app.report.json_format import plain
-from ipsys_log.app.report.rows import Rows, cm, mm, wrap_text
+from ipsys_log.app.report.rows import Rows, cm, mm
 from ipsys_log.statistics.alignment import LEVEL_M, Alignment
 from ipsys_log.statistics.camera_moves import CameraState, MarkerMove, Move
 from ipsys_log.statistics.coverage import FloorCoverage, Overlap, Patch
@@ -215,7 +215,7 @@ def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
     if not lines:
         text = f"No camera has moved: the mean shift of each floor map is below {mm(LEAST_SHIFT_M)} mm."
         lines = [(text, True)]
-    return [(wrap_text(text), is_good) for text, is_good in lines]
+    return lines
 
 
 def _marker_line(move: MarkerMove) -> str:

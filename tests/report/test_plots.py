@@ -19,7 +19,6 @@ from matplotlib.text import Text
 from ipsys_log.app.report.accuracy import Accuracy, accuracy_json
 from ipsys_log.app.report.figures import png
 from ipsys_log.app.report.findings import Findings
-from ipsys_log.app.report.learning_figure import learning_figure, published_figure
 from ipsys_log.app.report.paper_figures import (
     cross_validation_csv,
     models_figure,
@@ -28,7 +27,7 @@ from ipsys_log.app.report.paper_figures import (
     shown_models,
     write_plots,
 )
-from ipsys_log.app.report.points_figure import places_figure
+from ipsys_log.app.report.points_figures import learning_figure, places_figure, published_figure
 from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Residual
 from ipsys_log.tools.trajectory_errors import TrajectoryErrors

@@ -15,7 +15,7 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.app.web.dashboard.feed import Feed
+from ipsys_log.app.web.dashboard.app import Feed
 from ipsys_log.app.web.dashboard.map import describe_floor
 from ipsys_log.app.web.dashboard.pictures import shrink
 from ipsys_log.app.web.dashboard.status import RecentEvents

@@ -43,28 +43,18 @@ def is_url(path: Path) -> bool:
     return _URL_AS_PATH.match(str(path)) is not None and not path.exists()
 
 
-def read_files(given: Paths) -> Paths:
-    """Return the file, or the files, of an argument of a command that reads only files.
+def refuse_urls(why: str) -> Callable[[Paths], Paths]:
+    """Return a function that checks the files of an argument, and refuses a URL with a reason."""
 
-    Raises
-    ------
-    IpsysError
-        A URL is among them.
-    """
-    _refuse(given, "is at a URL, but this command reads files; download them first")
-    return given
+    def check(given: Paths) -> Paths:
+        _refuse(given, why)
+        return given
+
+    return check
 
 
-def appended_logs(given: Paths) -> Paths:
-    """Return the log, or the logs, that a command extends or repairs.
-
-    Raises
-    ------
-    IpsysError
-        A URL is among them.
-    """
-    _refuse(given, "is at a URL, but this command writes into the log; download the log first")
-    return given
+read_files = refuse_urls("is at a URL, but this command reads files; download them first")
+_appended = refuse_urls("is at a URL, but this command writes into the log; download the log first")
 
 
 def needs_local_files(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -156,8 +146,8 @@ def _location(text: str | None) -> Any:
 log_argument = partial(typer.Argument, metavar="LOG", callback=_locations)
 other_log_option = partial(typer.Option, metavar="LOG", callback=_location)
 file_log_argument = partial(typer.Argument, metavar="LOG", callback=read_files)
-appended_log_argument = partial(typer.Argument, metavar="LOG", callback=appended_logs)
-appended_log_option = partial(typer.Option, metavar="LOG", callback=appended_logs)
+appended_log_argument = partial(typer.Argument, metavar="LOG", callback=_appended)
+appended_log_option = partial(typer.Option, metavar="LOG", callback=_appended)
 Logs = Annotated[
     LogList, log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
 ]

@@ -57,9 +57,10 @@ def say_faults(page: PageServer, name: str = "the measuring page") -> None:
 @contextmanager
 def serve_measuring(scene: MeasuringScene, host: str | None, port: int) -> Iterator[PageServer]:
     """Serve the measuring page until the block ends."""
-    from ipsys_log.app.web.server import serve
+    from ipsys_log.app.web.app import build_app
+    from ipsys_log.app.web.server import serve_app
 
-    with serve(scene, host, port) as page:
+    with serve_app(build_app(scene), host, port) as page:
         print_code(page.url, host is not None)
         try:
             yield page

@@ -23,7 +23,6 @@ from ipsys_log.app.report.drive_figures import draw_tracks, read_drawn_tracks
 from ipsys_log.app.report.figures import PAGE_IN, add_bar, has_legend, new_figure, style_axes, svg_data_uri
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.floor_figure import draw_ground
-from ipsys_log.app.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
 from ipsys_log.app.report.paper_figures import (
     HELD_OUT,
     draw_models,
@@ -31,7 +30,14 @@ from ipsys_log.app.report.paper_figures import (
     residual_scale,
     shown_models,
 )
-from ipsys_log.app.report.points_figure import draw_coverage
+from ipsys_log.app.report.points_figures import (
+    Curves,
+    camera_curves,
+    curves_picture,
+    draw_coverage,
+    limits_cm,
+    mean_curves,
+)
 from ipsys_log.app.report.styles import robot_colour, shorten
 from ipsys_log.app.report.tables import height_note
 from ipsys_log.log.dataset import Session

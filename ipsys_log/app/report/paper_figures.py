@@ -20,7 +20,7 @@ from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.app.report.advice import has_published, label
 from ipsys_log.app.report.figures import ERROR_COLOURS, png, scale_logarithmic, style_axes
 from ipsys_log.app.report.files import write_files
-from ipsys_log.app.report.findings import Findings, PointErrors, errors_in, overall_row
+from ipsys_log.app.report.findings import Findings, errors_in, overall_row
 from ipsys_log.app.report.floor_figure import (
     Square,
     arrow_factor,
@@ -30,8 +30,13 @@ from ipsys_log.app.report.floor_figure import (
     show_square,
     square_around,
 )
-from ipsys_log.app.report.learning_figure import learning_figure, mean_curves, published_figure
-from ipsys_log.app.report.points_figure import draw_hulls, places_figure
+from ipsys_log.app.report.points_figures import (
+    draw_hulls,
+    learning_figure,
+    mean_curves,
+    places_figure,
+    published_figure,
+)
 from ipsys_log.app.report.styles import NOTE, model_styles
 from ipsys_log.app.report.tables import height_note
 from ipsys_log.errors import IpsysError
@@ -67,10 +72,7 @@ def shown_models(findings: Findings) -> list[Accuracy]:
 
 def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
     """Return one scale for the maps of all these models, so that the maps can be compared by eye."""
-    missed = [missed for accuracy in accuracies for missed in findings.point_errors(accuracy)]
-    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
-    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
-    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
+    places_m, errors_m, lengths_cm = _point_errors(findings, accuracies)
     square = square_around(findings.rig, [places_m])
     factor = arrow_factor(list(errors_m), 2 * square.half)
     # Make room for the arrows, while the floor stays large.
@@ -100,10 +102,7 @@ def residuals_figure(findings: Findings) -> Figure:
 
 def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
     """Draw one model's mean error at each point as an arrow on the floor, coloured by its length in space."""
-    missed = findings.point_errors(accuracy)
-    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
-    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
-    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
+    places_m, errors_m, lengths_cm = _point_errors(findings, [accuracy])
     draw_ground(axes, findings.rig, [places_m])
     draw_hulls(axes, findings)
     show_square(axes, scale.square)
@@ -122,8 +121,13 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: Re
     return arrows
 
 
-def _lengths_cm(findings: Findings, missed: PointErrors) -> Array:
-    return missed.lengths_m[:, 0 if findings.in_space else 1] * CM_PER_M
+def _point_errors(findings: Findings, accuracies: Sequence[Accuracy]) -> tuple[Array, Array, Array]:
+    """Return points and errors on the floor (n, 2) in m, and lengths (n,) in cm, of models in all cameras."""
+    errors = [one for accuracy in accuracies for one in findings.point_errors(accuracy)]
+    places_m = np.vstack([one.world_m[:, :2] for one in errors])
+    offsets_m = np.vstack([one.offsets_m[:, :2] for one in errors])
+    lengths_m = np.concatenate([one.lengths_m[:, 0 if findings.in_space else 1] for one in errors])
+    return places_m, offsets_m, lengths_m * CM_PER_M
 
 
 _LOG_RATIO = 10.0

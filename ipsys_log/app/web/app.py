@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from ipsys_log.app.report.styles import camera_styles
-from ipsys_log.app.web.requests import ERROR_HANDLERS, MOST_DIGITS, answer_file, read_json, whole_number
+from ipsys_log.app.web.requests import ERROR_HANDLERS, MOST_DIGITS, file_routes, read_json, whole_number
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.checks import (
     EntryCheck,
@@ -160,12 +160,6 @@ def checked_json(checked: EntryCheck) -> dict[str, Any]:
     }
 
 
-_FILES = {
-    "/": ("measure.html", "text/html"),
-    "/measure.css": ("measure.css", "text/css"),
-    "/theme.css": ("theme.css", "text/css"),
-    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("measure", "cameras", "floor", "make")},
-}
 # Number of images that are kept for later requests, after the page got their addresses.
 _KEPT = 30
 
@@ -180,7 +174,7 @@ def build_app(scene: MeasuringScene, setup: str | None = None) -> Starlette:
     questions = _Questions(scene, setup)
     return Starlette(
         routes=[
-            *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
+            *file_routes("measure", ("measure", "cameras", "floor", "make")),
             Route("/picture/{camera}/{time_ns}", questions.picture),
             Route("/api/scene", questions.scene),
             Route("/api/views", questions.views),

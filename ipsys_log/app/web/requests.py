@@ -5,14 +5,16 @@ from __future__ import annotations
 import hmac
 import json
 import secrets
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ipsys_log.errors import IpsysError
@@ -200,20 +202,36 @@ def answer_claim(seat: OperatorSeat, body: Mapping[str, Any]) -> dict[str, int]:
     return {"operator": seat.claim(body.get("take_over") is True)}
 
 
-Answer = Callable[[Request], Coroutine[Any, Any, Response]]
-
 _LARGEST = 16 << 10
 MOST_DIGITS = 20
 
 
-def answer_file(name: str, kind: str, package: str = "ipsys_log.app.web") -> Answer:
-    """Return a handler that answers with a file of a package; ``kind`` is its media type."""
-    content = files(package).joinpath(name).read_bytes()
+def file_routes(
+    page: str, scripts: Sequence[str], folder: str = "", shared: Sequence[str] = ()
+) -> Iterator[Route]:
+    """Yield the routes of the files of a page: its HTML, its styles and its scripts.
+
+    Parameters
+    ----------
+    page : the name of the HTML and of the styles, which are in ``folder`` below this package.
+    scripts, shared : names of the scripts in ``folder``, and of those beside this module.
+    """
+    own, here = files("ipsys_log.app.web").joinpath(folder), files("ipsys_log.app.web")
+    yield _file_route("/", own.joinpath(f"{page}.html"), "text/html")
+    yield _file_route(f"/{page}.css", own.joinpath(f"{page}.css"), "text/css")
+    yield _file_route("/theme.css", here.joinpath("theme.css"), "text/css")
+    for place, names in ((own, scripts), (here, shared)):
+        for name in names:
+            yield _file_route(f"/{name}.js", place.joinpath(f"{name}.js"), "text/javascript")
+
+
+def _file_route(path: str, file: Traversable, kind: str) -> Route:
+    content = file.read_bytes()
 
     async def answer(_: Request) -> Response:
         return Response(content, media_type=kind)
 
-    return answer
+    return Route(path, answer)
 
 
 def whole_number(text: str) -> int | None:

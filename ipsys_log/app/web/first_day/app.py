@@ -24,7 +24,7 @@ from ipsys_log.app.web.requests import (
     MAY_WRITE,
     OperatorSeat,
     answer_claim,
-    answer_file,
+    file_routes,
     operator_of,
     read_json,
 )
@@ -35,15 +35,7 @@ from ipsys_log.statistics.pairs import active_measurements
 
 Body = Mapping[str, Any]
 
-_OWN = "ipsys_log.app.web.first_day"
 _SCRIPTS = ("setup", "panels", "fields", "pictures")
-_FILES = {
-    "/": ("setup.html", "text/html", _OWN),
-    "/setup.css": ("setup.css", "text/css", _OWN),
-    "/theme.css": ("theme.css", "text/css"),
-    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("make", "operator")},
-    **{f"/{name}.js": (f"{name}.js", "text/javascript", _OWN) for name in _SCRIPTS},
-}
 
 
 class _Embedded:
@@ -85,7 +77,7 @@ class SetupApp:
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
-                *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
+                *file_routes("setup", _SCRIPTS, "first_day", ("make", "operator")),
                 Route("/picture/{kind}/{name}", self._picture),
                 Route("/print/{name}.pdf", self._print),
                 Route("/api/state", self._state),

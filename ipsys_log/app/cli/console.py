@@ -97,14 +97,7 @@ def progress_bar(
     frame_steps : names of the steps that count frames: their bars show a rate. Default: the causal stages.
     lines_in_pipe : print lines in a file or a pipe, as :func:`progress_lines`; otherwise nothing.
     """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
     columns = (
         TextColumn("{task.description:<13}"),

@@ -24,13 +24,7 @@ from ipsys_log.app.report.styles import GRID, REST, camera_styles, robot_colour,
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    TRUTH_TOPIC,
-    CameraEvaluation,
-    Evaluation,
-    ReferencePoint,
-    Rig,
-)
+from ipsys_log.messages import TRUTH_TOPIC, CameraEvaluation, Evaluation, ReferencePoint, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION

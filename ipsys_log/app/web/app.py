@@ -23,12 +23,7 @@ from ipsys_log.live_runs.survey.checks import (
     withdrawal_of,
 )
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
-from ipsys_log.live_runs.survey.scene import (
-    CameraView,
-    MeasuringScene,
-    observe_marker,
-    visible_markers,
-)
+from ipsys_log.live_runs.survey.scene import CameraView, MeasuringScene, observe_marker, visible_markers
 from ipsys_log.messages import Measurement
 from ipsys_log.statistics.pairs import active_baselines, active_measurements, locate_measurements, withdrawals
 from ipsys_log.units import CM_PER_M, NS_PER_S

@@ -195,13 +195,7 @@ def _wanted(session: Session, topics: list[str]) -> list[str]:
 
 
 def _ns(seconds: float | None, start_ns: int = 0) -> int | None:
-    """Return the time in ns that lies `seconds` after `start_ns`; None without an option.
-
-    Raises
-    ------
-    IpsysError
-        The value is not a number of seconds of these centuries.
-    """
+    """Return the time in ns that lies `seconds` after `start_ns`; None without an option."""
     if seconds is None:
         return None
     if not 0 <= seconds < 1e10:

@@ -122,11 +122,6 @@ def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]])
     """Read a rig for cameras that are given by their images; None if no file is named.
 
     A rig that describes only some of the cameras causes a remark.
-
-    Raises
-    ------
-    IpsysError
-        The rig cannot be read, or describes only other cameras.
     """
     if path is None:
         return None
@@ -185,11 +180,6 @@ def load_lab(
 
     The intrinsics come from ``calibration``, else from the file that the rig names, relative to the rig file.
     The files of the rig are read only ``with_lenses``.
-
-    Raises
-    ------
-    IpsysError
-        The rig has no such camera, or no camera with a source.
     """
     from ipsys_log.capture.lab import Lab
     from ipsys_log.exchange.lab_files import load_cameras, load_lenses

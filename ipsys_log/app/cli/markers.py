@@ -147,13 +147,7 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
 
 
 def _parse_ids(text: str, dictionary: str) -> list[int]:
-    """Parse a list of ids such as ``1,2,5-9``; each id occurs once.
-
-    Raises
-    ------
-    IpsysError
-        The text is no list, or has an id that the dictionary does not have.
-    """
+    """Parse a list of ids of a dictionary, such as ``1,2,5-9``; each id occurs once."""
     from ipsys_log.messages.rig_checks import dictionary_size
 
     ids: list[int] = []

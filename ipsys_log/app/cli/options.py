@@ -161,13 +161,7 @@ _OTHER_FILES = (
 
 
 def check_present(logs: Sequence[LogLocation]) -> None:
-    """Check that the files of logs exist, before the imports of the pipeline, which take longer.
-
-    Raises
-    ------
-    LogError
-        A log is missing.
-    """
+    """Check that the files of logs exist, before the imports of the pipeline, which take longer."""
     for log in logs:
         if isinstance(log, Path) and not log.exists():
             from ipsys_log.log.byte_source import open_for_reading
@@ -176,13 +170,7 @@ def check_present(logs: Sequence[LogLocation]) -> None:
 
 
 def _named_as_log(path: Path | None) -> Path | None:
-    """Return the path of a new log, with the extension of logs.
-
-    Raises
-    ------
-    IpsysError
-        The name is that of another kind of file.
-    """
+    """Return the path of a new log, with the extension of logs; other extensions are errors."""
     if path is None or path.suffix == ".mcap" or path.is_dir() or is_url(path):
         return path
     if path.suffix.lower() in _OTHER_FILES:
@@ -194,13 +182,7 @@ def _named_as_log(path: Path | None) -> Path | None:
 
 
 def _figure_file(path: Path | None) -> Path | None:
-    """Return the file of a figure, which can be written.
-
-    Raises
-    ------
-    IpsysError
-        It cannot be written, or has no format of figures.
-    """
+    """Return the file of a figure, after the check that it can be written in its format."""
     _refuse(path, _NOT_HERE)
     if path is not None:
         check_figure_file(path, "--plot")

@@ -82,11 +82,6 @@ def plan_dashboard(
     """Check that a dashboard can be served, before a camera is opened; None without a dashboard.
 
     All modules are loaded here: no frame must wait for them.
-
-    Raises
-    ------
-    IpsysError
-        The port is in use, or an option has no effect.
     """
     port = _checked_port(is_wanted, port)
     if not is_wanted:
@@ -129,13 +124,7 @@ def serve_dashboard(
 
 
 def check_playback_page(is_wanted: bool, host: str | None, port: int | None) -> int:
-    """Check that the dashboard of a playback can be served; return its port.
-
-    Raises
-    ------
-    IpsysError
-        The port is in use, or an option has no effect.
-    """
+    """Check that the dashboard of a playback can be served; return its port."""
     port = _checked_port(is_wanted, port)
     if is_wanted:
         from ipsys_log.app.web.server import check_port_free

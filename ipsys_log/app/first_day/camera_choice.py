@@ -135,11 +135,6 @@ def add_camera(path: Path, camera: RigCamera) -> None:
 
     A camera of the rig with the same source, apart from its password, gets the new source and the new name.
     The entry of its name without a source gets the source.
-
-    Raises
-    ------
-    IpsysError
-        The rig file has a fault, or cannot be changed.
     """
     rig = load_rig(path)
     key, cameras = hide_password(str(camera.source)), list(rig.cameras)
@@ -153,13 +148,7 @@ def add_camera(path: Path, camera: RigCamera) -> None:
 
 
 def set_calibration(path: Path, camera: str, file: str) -> None:
-    """Write the name of a file of intrinsics into the rig file.
-
-    Raises
-    ------
-    IpsysError
-        The rig file has a fault, or cannot be changed.
-    """
+    """Write the name of a file of intrinsics into the rig file."""
     rig = load_rig(path)
     cameras = tuple(replace(one, calibration=file) if one.name == camera else one for one in rig.cameras)
     _write_cameras(path, rig, cameras)
@@ -321,13 +310,7 @@ def _with_user(address: str, user: str, password: str) -> str:
 
 
 def _name(name: str, camera: RigCamera, rig: Rig) -> str:
-    """Return the name of a camera: the typed one, or a free one.
-
-    Raises
-    ------
-    IpsysError
-        The typed name is not valid, or another camera has it.
-    """
+    """Return the name of a camera: the typed one if it is valid and not taken, or a free one."""
     key = hide_password(str(camera.source))
     others = [one for one in rig.cameras if one.source and hide_password(one.source) != key]
     taken = {one.name for one in others}

@@ -82,13 +82,7 @@ class CameraPictures:
         return next(found, None)
 
     def take_all(self, job: Job) -> None:
-        """Search for cameras, and take a picture of each, one after the other.
-
-        Raises
-        ------
-        IpsysError
-            The rig file has a fault.
-        """
+        """Search for cameras, and take a picture of each, one after the other."""
         self._attached = list_attached()
         rig = load_rig(self._rig_file)
         for option in list_options(rig, self._attached):

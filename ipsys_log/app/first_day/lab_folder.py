@@ -224,13 +224,7 @@ class OutlierPoint:
 
 
 def find_outlier_points(paths: Sequence[Path], accuracies: Sequence[Accuracy]) -> tuple[OutlierPoint, ...]:
-    """Return the calibration points that contradict the fit and are not excluded, the worst first.
-
-    Raises
-    ------
-    IpsysError
-        A log cannot be read.
-    """
+    """Return the calibration points that contradict the fit and are not excluded, the worst first."""
     suspects = [suspect for suspect, _ in gather_outliers(accuracies)]
     origins = _origins(paths) if suspects else {}
     return tuple(

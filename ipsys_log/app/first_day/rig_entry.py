@@ -161,13 +161,7 @@ def _in_memory(text: str) -> Rig:
 
 
 def _value(key: str, text: str) -> Any:
-    """Return the value of a field.
-
-    Raises
-    ------
-    IpsysError
-        The text is empty, or is not a number.
-    """
+    """Return the value of a field; an empty text, or one that is no number, is an error."""
     if key == "robots":
         return [_marker_id(part) for part in re.split(r"[,;\s]+", text) if part]
     if not text:
@@ -188,13 +182,7 @@ def _marker_id(text: str) -> int:
 
 
 def _check_alone(key: str, value: Any, dictionary: str) -> None:
-    """Check one value in a rig without the others.
-
-    Raises
-    ------
-    IpsysError
-        The value is impossible, or has another unit.
-    """
+    """Check one value in a rig without the others: it is possible, and has the unit of its field."""
     rig = Rig("lab", "DICT_4X4_100", 0.2)
     if key == "dictionary":
         marker_detector(value)

@@ -42,7 +42,8 @@ class Pages(NamedTuple):
 class SetupSession:
     """The setup of the lab in a folder. Its state comes from the files of the folder.
 
-    Only pictures of cameras and the present job are in memory.
+    Only pictures of cameras and the present job are in memory. An action raises an IpsysError if a job works,
+    if an earlier step is missing, or if a file or a typed name has a fault.
 
     Parameters
     ----------
@@ -98,34 +99,16 @@ class SetupSession:
         }
 
     def save_rig(self, typed: Mapping[str, str]) -> list[Fault]:
-        """Write the typed rig; return the faults of its fields instead.
-
-        Raises
-        ------
-        IpsysError
-            The rig file cannot be changed, or a job works.
-        """
+        """Write the typed rig; return the faults of its fields instead."""
         self._check_idle()
         return save_rig_entry(self._folder.rig_file, typed)
 
     def simulate(self) -> None:
-        """Write the rig of the simulated lab and its sheet (``ipsys init lab.toml --simulated``).
-
-        Raises
-        ------
-        IpsysError
-            There is a rig file already.
-        """
+        """Write the rig of the simulated lab and its sheet (``ipsys init lab.toml --simulated``)."""
         write_new(simulated_lab_texts(self._folder.rig_file))
 
     def save_cameras(self, names: Mapping[str, str]) -> list[Fault]:
-        """Write the named cameras into the rig file; return the faults of names instead.
-
-        Raises
-        ------
-        IpsysError
-            The rig file has a fault, or a job works.
-        """
+        """Write the named cameras into the rig file; return the faults of names instead."""
         self._check_idle()
         return save_cameras(self._folder.rig_file, names, self._cameras.attached())
 
@@ -133,11 +116,6 @@ class SetupSession:
         """Start to open the camera of a typed address; return the fault of a field instead.
 
         With a picture, the camera is written into the rig file. Without one, the state has the fault.
-
-        Raises
-        ------
-        IpsysError
-            The rig file has a fault, or a job works.
         """
         self._check_idle()
         self._cameras.forget_fault()
@@ -150,13 +128,7 @@ class SetupSession:
         return []
 
     def use_intrinsics(self, camera: str) -> None:
-        """Write the file of intrinsics of a camera into the rig file.
-
-        Raises
-        ------
-        IpsysError
-            The folder has no such file.
-        """
+        """Write the file of intrinsics of a camera into the rig file."""
         self._check_idle()
         files = {one.camera: one.file for one in read_progress(self._folder).intrinsics}
         file = files.get(camera)
@@ -165,13 +137,7 @@ class SetupSession:
         set_calibration(self._folder.rig_file, camera, file)
 
     def calibrate(self, camera: str, typed: Mapping[str, str]) -> list[Fault]:
-        """Start the calibration of a camera with a board; return the fault of a field instead.
-
-        Raises
-        ------
-        IpsysError
-            The rig has no such camera, or a job works.
-        """
+        """Start the calibration of a camera with a board; return the fault of a field instead."""
         self._check_idle()
         step = read_progress(self._folder)
         if camera not in [one.camera for one in step.intrinsics]:
@@ -189,24 +155,12 @@ class SetupSession:
         return []
 
     def exclude(self, log: str, point: str) -> None:
-        """Exclude a calibration point that contradicts the fit.
-
-        Raises
-        ------
-        IpsysError
-            There is no such log or point, or a job works.
-        """
+        """Exclude a calibration point that contradicts the fit."""
         self._check_idle()
         exclude_outlier(self._folder.calibration_logs(), log, point)
 
     def start(self, action: str) -> None:
-        """Start the job of an action.
-
-        Raises
-        ------
-        IpsysError
-            There is no such action, another job works, or the step lacks an earlier one.
-        """
+        """Start the job of an action."""
         if action not in self._actions:
             raise IpsysError(f"the action {action!r} is not known; reload this page")
         title, name, job = self._actions[action]
@@ -280,14 +234,7 @@ def _describe_fit(fit: FitFacts) -> dict[str, Any]:
 
 
 def _print(folder: LabFolder, name: str, typed: Mapping[str, str]) -> bytes:
-    """Return the markers of the rig file, or a board of typed fields, as PDF (``ipsys markers``).
-
-    Raises
-    ------
-    IpsysError
-        There is no such print, a field or the rig has a fault, or a board is larger than a page. Or
-        Matplotlib is not installed.
-    """
+    """Return the markers of the rig file, or a board of typed fields, as PDF (``ipsys markers``)."""
     check_installed("a print needs", "matplotlib")
     from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out, rig_prints
 

@@ -1,4 +1,7 @@
-"""The work of the steps with cameras and logs; each does what its command does, without a terminal."""
+"""The work of the steps with cameras and logs; each does what its command does, without a terminal.
+
+An IpsysError says which fault the rig, a camera, a log or a sheet has.
+"""
 
 from __future__ import annotations
 
@@ -56,13 +59,7 @@ class LiveRecording:
 
 
 def align(folder: LabFolder, job: Job) -> None:
-    """Record the cameras for some seconds, and compute the camera points of the markers (``ipsys align``).
-
-    Raises
-    ------
-    IpsysError
-        The rig or a camera has a fault.
-    """
+    """Record the cameras for some seconds, and compute the camera points of the markers (``ipsys align``)."""
     with _new_log(folder, ALIGNMENT_LOG) as log:
         _record(folder, job, log, _ALIGN_S)
         if not job.is_stopped():
@@ -74,11 +71,6 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
 
     This is ``ipsys calibrate --rig lab.toml --board BOARD --camera NAME``; it also writes the file into the
     rig. Simulated cameras show the board.
-
-    Raises
-    ------
-    IpsysError
-        The camera has a fault, or the pictures do not determine its intrinsics.
     """
     rig, cameras = load_cameras(folder.rig_file, [search.camera])
     check_sources(cameras)
@@ -116,11 +108,6 @@ def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
     """Record stationary markers, and append the tape measurements of a sheet.
 
     This is ``ipsys record``, and then ``ipsys measure LOG --csv SHEET``.
-
-    Raises
-    ------
-    IpsysError
-        The rig, a camera or a row of the sheet has a fault.
     """
     with _new_log(folder, "calibration") as log:
         _record(folder, job, log, _SHEET_S)
@@ -138,11 +125,6 @@ def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManage
     Parameters
     ----------
     show : shows the measuring page of a scene.
-
-    Raises
-    ------
-    IpsysError
-        The rig or a camera has a fault, or the rig has fewer than two reference points.
     """
     with _new_log(folder, "calibration") as log, _open_cameras(folder, job) as (opened, monitor):
         check_references(opened.rig)
@@ -157,11 +139,6 @@ def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
     """Fit the model to all calibration points of the folder, and evaluate it (``ipsys replay``).
 
     A stop keeps the finished runs; the logs get no part of a run.
-
-    Raises
-    ------
-    IpsysError
-        No log has calibration points, or the points do not determine the model.
     """
     api.replay(*folder.calibration_logs(), progress=job.progress, say=job.say)
 
@@ -172,11 +149,6 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
     Parameters
     ----------
     show : shows the dashboard of a recording; its value gets the recorded messages.
-
-    Raises
-    ------
-    IpsysError
-        The rig, a camera or the model has a fault.
     """
     request = Request(model_from=folder.calibration_logs()[-1])
     with _new_log(folder, "live") as log, _open_cameras(folder, job) as (opened, monitor):

@@ -17,13 +17,7 @@ FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 
 def check_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:
-    """Check that a file can be written, before any work is done.
-
-    Raises
-    ------
-    IpsysError
-        The file cannot be written, or it is one of the logs.
-    """
+    """Check that a file can be written and is none of the logs, before any work is done."""
     from ipsys_log.log.lock import describe_broken_link  # late: it imports the library of logs
 
     if is_one_of(path, logs):
@@ -38,27 +32,14 @@ def check_file(path: Path, option: str, logs: Sequence[LogLocation]) -> None:
 
 
 def check_parquet_name(path: Path, option: str) -> None:
-    """Check that the name of a table ends in ``.parquet``: its readers choose the format by the name.
-
-    Raises
-    ------
-    IpsysError
-        The name has another end.
-    """
+    """Check that the name of a table ends in ``.parquet``: its readers choose the format by the name."""
     if path.suffix != ".parquet":
         name = path.with_suffix(".parquet") if path.name else "FILE.parquet"
         raise IpsysError(f"{option} {path}: the name must end in .parquet; use {name}")
 
 
 def check_figure_file(path: Path, option: str) -> None:
-    """Check that a figure can be written and has a valid format, before any work is done.
-
-    Raises
-    ------
-    IpsysError
-        Matplotlib is not installed, the file cannot be written, or its name does not end in one of
-        ``FIGURE_SUFFIXES``.
-    """
+    """Check that a figure can be drawn and written, by a name with a suffix of ``FIGURE_SUFFIXES``."""
     check_installed(f"{option} needs", "matplotlib")
     check_file(path, option, [])
     if path.suffix.lower() not in FIGURE_SUFFIXES:
@@ -67,13 +48,7 @@ def check_figure_file(path: Path, option: str) -> None:
 
 
 def check_folder(folder: Path, option: str) -> None:
-    """Check that a folder exists or can be created, and can be written to.
-
-    Raises
-    ------
-    IpsysError
-        The folder cannot be created or written to.
-    """
+    """Check that a folder exists or can be created, and can be written to."""
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not existing.is_dir():
         raise IpsysError(f"{option} {folder}: {existing} is a file; name a folder")

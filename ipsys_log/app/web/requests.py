@@ -147,13 +147,7 @@ class OperatorSeat:
         self._last = secrets.randbelow(_NUMBERS)
 
     def claim(self, take_over: bool) -> int:
-        """Return the number of a new operator.
-
-        Raises
-        ------
-        IpsysError
-            Another device operates, and the new one does not take over.
-        """
+        """Return the number of a new operator; it takes an occupied seat only by ``take_over``."""
         if self.number and not take_over:
             raise IpsysError(_OCCUPIED)
         self._last += 1
@@ -168,13 +162,7 @@ class OperatorSeat:
             self.version += 1
 
     def check(self, number: int) -> None:
-        """Check that a device operates.
-
-        Raises
-        ------
-        IpsysError
-            Another device operates, or none.
-        """
+        """Check that a device operates, and no other."""
         if not number or number != self.number:
             raise IpsysError(_OCCUPIED)
 
@@ -189,13 +177,7 @@ def operator_of(body: Mapping[str, Any], key: str = "operator") -> int:
 
 
 def answer_claim(seat: OperatorSeat, body: Mapping[str, Any]) -> dict[str, int]:
-    """Claim the seat for a device, or release it; return the answer to its request.
-
-    Raises
-    ------
-    IpsysError
-        Another device operates, and the new one does not take over.
-    """
+    """Claim the seat for a device if it is free or taken over, or release it; return the answer."""
     if "release" in body:
         seat.release(operator_of(body, "release"))
         return {}

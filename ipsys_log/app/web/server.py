@@ -172,13 +172,7 @@ async def _serve(
 
 
 def check_port_free(host: str | None, port: int, option: str = "--port") -> None:
-    """Check that a page can be served at an address and a port; ``option`` names the port in errors.
-
-    Raises
-    ------
-    IpsysError
-        The errors of :func:`serve_app`.
-    """
+    """Check that a page can be served at an address and a port; ``option`` names the port in errors."""
     _listen(host or _LOOPBACK, port, option).close()
 
 

@@ -235,11 +235,6 @@ def dashboard_of_recording(
     log, model, run : the log that is written, the fitted model, and the run of its tracks.
     streams : the streams of positions.
     seat : the seat of the device that operates, if another page has it, too.
-
-    Raises
-    ------
-    IpsysError
-        The model or the intrinsics of a camera are not valid.
     """
     cameras, now_ns = opened.cameras, opened.cameras.clock.now_ns
     setting = DashboardSetting(
@@ -249,13 +244,7 @@ def dashboard_of_recording(
 
 
 def dashboard_of_player(player: Player, scene: PlayedScene) -> Dashboard:
-    """Return the dashboard of a played log. It has no operator: a log is not changed.
-
-    Raises
-    ------
-    IpsysError
-        The model or the intrinsics of a camera are not valid.
-    """
+    """Return the dashboard of a played log. It has no operator: a log is not changed."""
     played = PlayedLog(player, scene)
     rig, lenses, model, run = scene.rig, scene.lenses, scene.model, scene.run
     log = Path(scene.name)

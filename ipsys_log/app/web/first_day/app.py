@@ -166,13 +166,7 @@ class SetupApp:
 
 
 def _texts(body: Mapping[str, Any], key: str) -> dict[str, str]:
-    """Return an object of texts in a request.
-
-    Raises
-    ------
-    IpsysError
-        The value is not an object.
-    """
+    """Return an object of texts in a request; another value is an error."""
     value = body.get(key)
     if not isinstance(value, dict):
         raise IpsysError(f"{key} must be an object of texts; reload this page")

@@ -106,7 +106,6 @@ def test_cookies_of_other_programs_do_not_block_access(shared: Caller) -> None:
         f'foo="open; {ours}',
         f'a b=c d; {name}="{shared.token}"',
         f"{name}=stale; {ours}",
-        f"{ours}; {name}=stale",
         f"foo=\xff\xfe; {ours}",
         f"$Version=1; foo@bar=1,2; {ours} ",
         f"foo={'x' * 20_000}; {ours}",

@@ -77,12 +77,12 @@ class Guard:
         scope[MAY_WRITE] = True
         if self._token is not None:
             token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-            if scope["method"] == "GET" and scope["path"] == "/" and self._fitting([token]):
+            if scope["method"] == "GET" and scope["path"] == "/" and _is_one_of(token, self._tokens):
                 return self._welcome(scope, token)
-            fitting = self._fitting(self._cookies(headers, scope))
-            if not fitting:
+            cookie = Request(scope).cookies.get(self._name(scope), "")
+            if not _is_one_of(cookie, self._tokens):
                 return _refuse("open the page with the full address that ipsys printed")
-            scope[MAY_WRITE] = self._token in fitting
+            scope[MAY_WRITE] = _is_one_of(cookie, [self._token])
         if scope["method"] not in ("GET", "HEAD"):
             origin = headers.get("origin")
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
@@ -91,28 +91,11 @@ class Guard:
                 return _refuse("this device may only view; open the address to operate that ipsys printed")
         return None
 
-    def _fitting(self, given: Iterable[str]) -> set[str]:
-        """Return the tokens of this page among the given texts."""
-        texts = [text.encode() for text in given]
-        return {own for own in self._tokens for text in texts if hmac.compare_digest(text, own.encode())}
-
     def _welcome(self, scope: Scope, token: str) -> Response:
         """Move the token from the address line, where other people could read it, to a cookie."""
         response = RedirectResponse("/", 303)
         response.set_cookie(self._name(scope), token, httponly=True, samesite="strict")
         return response
-
-    def _cookies(self, headers: Headers, scope: Scope) -> Iterator[str]:
-        """Yield the values of our cookie.
-
-        The header also has cookies of other programs on this host, in any form. A strict parser
-        (``http.cookies``) drops the whole header for one bad cookie.
-        """
-        for header in headers.getlist("cookie"):
-            for pair in header.split(";"):
-                name, _, value = pair.partition("=")
-                if name.strip() == self._name(scope):
-                    yield value.strip().strip('"')
 
     @staticmethod
     def _name(scope: Scope) -> str:
@@ -121,6 +104,10 @@ class Guard:
         Browsers send a cookie to all ports of a host. Two pages on one machine must not share a cookie.
         """
         return f"ipsys_{(scope.get('server') or ('', 0))[1]}"
+
+
+def _is_one_of(given: str, tokens: Iterable[str]) -> bool:
+    return any(hmac.compare_digest(given.encode(), token.encode()) for token in tokens)
 
 
 def _refuse(text: str) -> Response:

@@ -184,10 +184,7 @@ for group, commands in {**_FIRST, **_FURTHER}.items():
         text, _, examples = cleandoc(command.__doc__ or "").partition("\n\nExamples\n\n")
         EXAMPLES[_name(command)] = cleandoc(examples).splitlines()
         app.command(
-            _name(command),
-            help=_unwrapped(text),
-            epilog=f"Examples\n\n{examples}",
-            rich_help_panel=group,
+            _name(command), help=_unwrapped(text), epilog=f"Examples\n\n{examples}", rich_help_panel=group
         )(_wrapped(command))
 batch.add_commands(app, _BATCH, _wrapped)
 

@@ -22,16 +22,11 @@ if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab
 
 Sources = Annotated[
-    list[Path] | None,
-    file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE"),
+    list[Path] | None, file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE")
 ]
-RigNow = Annotated[
-    Path | None,
-    named("--rig", "FILE", "Without SOURCE: use the cameras of this rig now."),
-]
+RigNow = Annotated[Path | None, named("--rig", "FILE", "Without SOURCE: use the cameras of this rig now.")]
 Seconds = Annotated[
-    float,
-    named("--seconds", "SECONDS", "Without SOURCE: duration, while you move the board.", min=1.0),
+    float, named("--seconds", "SECONDS", "Without SOURCE: duration, while you move the board.", min=1.0)
 ]
 BoardName = Annotated[
     str,
@@ -68,10 +63,7 @@ Cameras = Annotated[
         "name of the camera.",
     ),
 ]
-Output = Annotated[
-    Path,
-    named("--output,-o", "PATH", "Folder of the files, or one file, such as red.yaml."),
-]
+Output = Annotated[Path, named("--output,-o", "PATH", "Folder of the files, or one file, such as red.yaml.")]
 Formats = Annotated[
     list[str] | None,
     named("--format", "NAME", "File format: opencv (the default), ros or kalibr; repeat it for several."),

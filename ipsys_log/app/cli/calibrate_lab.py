@@ -53,10 +53,7 @@ if TYPE_CHECKING:
 # Largest goal that still means something, in mm.
 _MOST_GOAL_MM = 1000.0
 
-Goal = Annotated[
-    float,
-    named("--goal-mm", "MM", "Wanted mean error over the floor of each camera, in mm."),
-]
+Goal = Annotated[float, named("--goal-mm", "MM", "Wanted mean error over the floor of each camera, in mm.")]
 Output = Annotated[
     Path | None,
     log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
@@ -67,12 +64,11 @@ Sources = Annotated[
     NoLogs,
     log_argument(
         help="Logs, files or URLs, read as one session. The last log gets the results. Without LOG: use the "
-        "cameras of --rig now.",
+        "cameras of --rig now."
     ),
 ]
 Seconds = Annotated[
-    float | None,
-    named("--seconds", "SECONDS", "Without LOG: stop the cameras after this time.", min=1.0),
+    float | None, named("--seconds", "SECONDS", "Without LOG: stop the cameras after this time.", min=1.0)
 ]
 Terminal = Annotated[
     bool,
@@ -263,6 +259,6 @@ def _ask_points(output: Path, request: Request) -> None:
     with progress_bar() as progress, open_finished_log(output, request, progress, say) as scene:
         say(
             f"measure {_LEAST_POINTS} to 4 of the points at which a marker was stationary; s skips a point, "
-            "q ends",
+            "q ends"
         )
         ask_places(scene)

@@ -41,22 +41,18 @@ NoOrLogs = Annotated[
     NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
 ]
 Output = Annotated[
-    Path | None,
-    log_option(help="A new log for the results. Without LOG, it also gets the camera frames."),
+    Path | None, log_option(help="A new log for the results. Without LOG, it also gets the camera frames.")
 ]
 Sources = Annotated[
-    LogList,
-    log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own."),
+    LogList, log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own.")
 ]
 Baseline = Annotated[
-    OtherLog,
-    other_log_option("--baseline", help="The log before all moves. Default: the first by time."),
+    OtherLog, other_log_option("--baseline", help="The log before all moves. Default: the first by time.")
 ]
 ModelLog = Annotated[
     OtherLog,
     other_log_option(
-        "--model-from",
-        help="The log with the fitted model. Default: the baseline, if it has one.",
+        "--model-from", help="The log with the fitted model. Default: the baseline, if it has one."
     ),
 ]
 Fix = Annotated[

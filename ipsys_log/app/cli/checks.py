@@ -134,9 +134,7 @@ def _agreement(comparisons: Sequence[Comparison]) -> str:
     )
 
 
-def repair(
-    log: Annotated[Path, appended_log_argument(help="A damaged or incomplete log.")],
-) -> None:
+def repair(log: Annotated[Path, appended_log_argument(help="A damaged or incomplete log.")]) -> None:
     """Repair a log: keep everything that can be read, report the losses, and complete its runs.
 
     A log without an end is completed in place. For any other damage, a new log replaces it. The old data are

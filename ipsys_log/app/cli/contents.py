@@ -28,8 +28,7 @@ _Seconds = float | None
 def info(
     logs: ReadLogs,
     runs: Annotated[
-        bool,
-        switch("--runs", "Show the runs with their inputs, parameters, versions and states."),
+        bool, switch("--runs", "Show the runs with their inputs, parameters, versions and states.")
     ] = False,
     sizes: Annotated[
         bool, switch("--sizes", "Show the size of each channel of each log, the largest first.")
@@ -129,24 +128,19 @@ def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[
 def cat(
     logs: ReadLogs,
     topics: Annotated[
-        list[str] | None,
-        named("--topics", "TOPIC,...", "Print only these topics, separated by commas."),
+        list[str] | None, named("--topics", "TOPIC,...", "Print only these topics, separated by commas.")
     ] = None,
     start_secs: Annotated[
-        _Seconds,
-        named("--start-secs", "SECONDS", "Begin at this log time since 1970, in UTC."),
+        _Seconds, named("--start-secs", "SECONDS", "Begin at this log time since 1970, in UTC.")
     ] = None,
     end_secs: Annotated[
-        _Seconds,
-        named("--end-secs", "SECONDS", "End before this log time since 1970, in UTC."),
+        _Seconds, named("--end-secs", "SECONDS", "End before this log time since 1970, in UTC.")
     ] = None,
     start_offset: Annotated[
-        _Seconds,
-        named("--start-offset", "SECONDS", "Begin so long after the first message."),
+        _Seconds, named("--start-offset", "SECONDS", "Begin so long after the first message.")
     ] = None,
     end_offset: Annotated[
-        _Seconds,
-        named("--end-offset", "SECONDS", "End so long after the first message."),
+        _Seconds, named("--end-offset", "SECONDS", "End so long after the first message.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

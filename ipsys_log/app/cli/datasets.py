@@ -30,10 +30,7 @@ def catalogue(
             "such as s3://lab/2026-*/*.mcap.",
         ),
     ],
-    output: Annotated[
-        Path,
-        named("--output,-o", "FILE", "The catalogue: a Parquet file (.parquet)."),
-    ],
+    output: Annotated[Path, named("--output,-o", "FILE", "The catalogue: a Parquet file (.parquet).")],
     baseline: Annotated[
         str | None,
         named(
@@ -104,8 +101,7 @@ def _log(name: str, text: str) -> LogLocation:
 
 def pack(
     logs: Annotated[
-        list[Path] | None,
-        file_log_argument(help="Logs, read as one session; they stay unchanged."),
+        list[Path] | None, file_log_argument(help="Logs, read as one session; they stay unchanged.")
     ] = None,
     output: Annotated[
         Path | None,
@@ -115,13 +111,9 @@ def pack(
             "The dataset to write: a folder, or a zip archive if the name ends in .zip.",
         ),
     ] = None,
-    card: Annotated[
-        Path | None,
-        named("--card", "FILE", "The filled form of the dataset card."),
-    ] = None,
+    card: Annotated[Path | None, named("--card", "FILE", "The filled form of the dataset card.")] = None,
     card_form: Annotated[
-        Path | None,
-        named("--card-form", "FILE", "Only write the empty form of the dataset card."),
+        Path | None, named("--card-form", "FILE", "Only write the empty form of the dataset card.")
     ] = None,
     model: Annotated[
         list[str] | None,
@@ -130,12 +122,10 @@ def pack(
         ),
     ] = None,
     without_images: Annotated[
-        bool,
-        switch("--without-images", "Leave out the images, and keep the detected markers."),
+        bool, switch("--without-images", "Leave out the images, and keep the detected markers.")
     ] = False,
     blur: Annotated[
-        bool,
-        switch("--blur", "Blur the images outside of the detected markers: a new recording, in grey."),
+        bool, switch("--blur", "Blur the images outside of the detected markers: a new recording, in grey.")
     ] = False,
     every: Annotated[int, named("--every", "N", "Keep each n-th frame of each camera.", min=1)] = 1,
 ) -> None:

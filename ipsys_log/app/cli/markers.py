@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Rig
 
 RigNow = Annotated[
-    Path | None,
-    named("--rig", "FILE", "Print the markers of this rig file, in their true size."),
+    Path | None, named("--rig", "FILE", "Print the markers of this rig file, in their true size.")
 ]
 Ids = Annotated[
     str | None,
@@ -52,8 +51,7 @@ MarkerScale = Annotated[
     named("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
 PageName = Annotated[
-    str | None,
-    named("--page", "NAME", "Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small."),
+    str | None, named("--page", "NAME", "Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small.")
 ]
 Output = Annotated[Path, named("--output,-o", "FILE", "The PDF to write.")]
 Force = Annotated[bool, switch("--force", "Overwrite an existing file.")]

@@ -35,8 +35,7 @@ def node(
     camera: Annotated[str, named("--camera", "NAME", "The camera of this host; the node has its name.")] = "",
     output: NodeLog = None,
     centre: Annotated[
-        str | None,
-        named("--centre", "HOST:PORT", "The address of the centre, instead of the rig's."),
+        str | None, named("--centre", "HOST:PORT", "The address of the centre, instead of the rig's.")
     ] = None,
     certificates: Annotated[
         Path | None,
@@ -47,10 +46,7 @@ def node(
     ] = False,
     calibration: Calibrations = None,
     corners: Corners = None,
-    seconds: Annotated[
-        float | None,
-        named("--seconds", "SECONDS", "Stop after this time.", min=0.1),
-    ] = None,
+    seconds: Annotated[float | None, named("--seconds", "SECONDS", "Stop after this time.", min=0.1)] = None,
     force: Force = False,
 ) -> None:
     """Record one camera of this host, and send its frames to the centre, until Ctrl-C.
@@ -100,12 +96,7 @@ def _new_log(camera: str) -> Path:
 
 
 def _send(
-    lab: Lab,
-    network: NodeNetwork,
-    target: Path,
-    seconds: float | None,
-    request: Request | None,
-    force: bool,
+    lab: Lab, network: NodeNetwork, target: Path, seconds: float | None, request: Request | None, force: bool
 ) -> None:
     """Record the camera and send its frames, or with a request their markers."""
     from ipsys_log import __version__

@@ -198,8 +198,7 @@ def figure_option(subject: str) -> Any:
 log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
 NewLog = Annotated[Path, log_option(help="The log to write, with a name that ends in .mcap.")]
 RigFile = Annotated[
-    Path | None,
-    named("--rig", "FILE", "Use this rig file (lab.toml) instead of the rig in the log."),
+    Path | None, named("--rig", "FILE", "Use this rig file (lab.toml) instead of the rig in the log.")
 ]
 Calibrations = Annotated[
     list[str] | None,
@@ -213,8 +212,7 @@ Calibrations = Annotated[
 Corners = stage_option(CORNERS)[0]
 Method = stage_option(METHOD)[0]
 Only = Annotated[
-    list[str] | None,
-    named("--camera", "NAME", "Use only this camera of the rig; repeat it for several."),
+    list[str] | None, named("--camera", "NAME", "Use only this camera of the rig; repeat it for several.")
 ]
 Force = Annotated[bool, switch("--force", "Overwrite an existing log of this name.")]
 Overwrite = Annotated[bool, switch("--overwrite,--force", "Replace an existing log of this name.")]
@@ -227,10 +225,7 @@ Host = Annotated[
         "one address. The page has a new secret at each start. Default: only this machine.",
     ),
 ]
-Port = Annotated[
-    int,
-    named("--port", "PORT", "Port of the page; 0 for any free port.", min=0, max=65535),
-]
+Port = Annotated[int, named("--port", "PORT", "Port of the page; 0 for any free port.", min=0, max=65535)]
 RigNow = Annotated[Path, named("--rig", "FILE", "The rig file, with a source for each camera.")]
 Terminal = Annotated[
     bool, switch("--terminal", "Ask for the measurements in the terminal instead of on a page.")

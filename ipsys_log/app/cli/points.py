@@ -149,12 +149,10 @@ def _serve(scene: MeasuringScene, host: str | None, port: int) -> None:
 
 def exclude(
     log: Annotated[
-        Path,
-        appended_log_argument(help="A finished log with measurements, which gets the change."),
+        Path, appended_log_argument(help="A finished log with measurements, which gets the change.")
     ],
     points: Annotated[
-        list[str],
-        typer.Argument(metavar="POINT", help="Names of calibration points, such as p007."),
+        list[str], typer.Argument(metavar="POINT", help="Names of calibration points, such as p007.")
     ],
     reason: Annotated[str, named("--reason", "TEXT", "The reason, which is written into the log.")],
     readmit: Annotated[

@@ -65,12 +65,10 @@ def record(
     detect: Annotated[bool, switch("--detect", "Detect the markers and write them, too.")] = False,
     corners: Corners = None,
     measure: Annotated[
-        bool,
-        switch("--measure", "Enter tape measurements during the recording, on a page for the phone."),
+        bool, switch("--measure", "Enter tape measurements during the recording, on a page for the phone.")
     ] = False,
     points_only: Annotated[
-        bool,
-        switch("--points-only", "With --measure: keep only about 1 s of frames of each measured point."),
+        bool, switch("--points-only", "With --measure: keep only about 1 s of frames of each measured point.")
     ] = False,
     terminal: Terminal = False,
     host: Host = None,

@@ -141,8 +141,7 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
 @writes_nothing
 def cameras(
     rig: Annotated[
-        Path | None,
-        named("--rig", "FILE", "Check that USB is fast enough for the cameras of this rig."),
+        Path | None, named("--rig", "FILE", "Check that USB is fast enough for the cameras of this rig.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

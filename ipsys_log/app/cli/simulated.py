@@ -45,12 +45,10 @@ def simulate(
         ),
     ] = None,
     seed: Annotated[
-        int | None,
-        named("--seed", "N", "Seed of the random numbers. The same seed gives the same bytes."),
+        int | None, named("--seed", "N", "Seed of the random numbers. The same seed gives the same bytes.")
     ] = None,
     settings: Annotated[
-        Path | None,
-        named("--settings", "FILE", "Read settings from a TOML file; docs/data.md lists them."),
+        Path | None, named("--settings", "FILE", "Read settings from a TOML file; docs/data.md lists them.")
     ] = None,
     changes: Annotated[
         list[str] | None,
@@ -94,8 +92,7 @@ def drive(
     robots: Annotated[int, switch("--robots", "Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
-        Path | None,
-        named("--program", "FILE", "The program of the robots (default: the example of ipsys)."),
+        Path | None, named("--program", "FILE", "The program of the robots (default: the example of ipsys).")
     ] = None,
     over: Annotated[str, named("--over", "udp|vrpn|ros2", "The stream of the positions.")] = "udp",
     loss: Annotated[float, named("--loss", "SHARE", "Lose this share of the datagrams, such as 0.05.")] = 0.0,

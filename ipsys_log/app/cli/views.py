@@ -17,12 +17,10 @@ from ipsys_log.log.location import LogLocation, file_beside
 
 _COUNTED = ("bag", "video", "pictures")
 Runs = Annotated[
-    list[str] | None,
-    named("--run", "NAME", "Show this run instead of the newest; repeat it for several."),
+    list[str] | None, named("--run", "NAME", "Show this run instead of the newest; repeat it for several.")
 ]
 Save = Annotated[
-    Path | None,
-    named("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer."),
+    Path | None, named("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer.")
 ]
 FoxgloveLayout = Annotated[
     Path | None,
@@ -33,10 +31,7 @@ FoxgloveLayout = Annotated[
     ),
 ]
 _HTML = (
-    Annotated[
-        Path | None,
-        named("--html", "FILE", "The page to write. Default: the log's name with .html."),
-    ],
+    Annotated[Path | None, named("--html", "FILE", "The page to write. Default: the log's name with .html.")],
     None,
 )
 _REPORT = f"""
@@ -104,50 +99,31 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
 
 def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:
     check_installed("report needs", "matplotlib", "jinja2")
-    target = html or file_beside(output or logs[-1], ".html")
-    check_file(target, "--html", [*logs, *([output] if output else [])])
-    if _report_robots(logs, target):
-        return
-    if _report_recording(logs, target):
-        return
     from ipsys_log.app.report.html import render_report
-
-    with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
-        write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
-    console.print(f"{target} written: open it in a browser")
-
-
-def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
-    """Write the page of a session without calibration points; return False if the logs have some."""
-    from ipsys_log.app.report.html import render_report
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.messages.channels import MEASUREMENTS
-
-    with Session(logs) as session:
-        if session.topics(MEASUREMENTS):
-            return False
-        page = render_report(session, ())
-    write_files(target.parent, {target.name: page.encode()})
-    console.print(f"{target} written: open it in a browser")
-    say("the session has no calibration points: the page shows the recording and its runs")
-    return True
-
-
-def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
-    """Write the page and the figure of a robot run; return False if the logs have none."""
     from ipsys_log.app.report.robot_run import render_robot_run
     from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import MEASUREMENTS
     from ipsys_log.tools.robot_run import has_robot_run
 
+    target = html or file_beside(output or logs[-1], ".html")
+    check_file(target, "--html", [*logs, *([output] if output else [])])
     with Session(logs) as session:
-        if not has_robot_run(session):
-            return False
-        picture = target.with_suffix(".png")
-        check_file(picture, "--html", logs)
-        page, panels = render_robot_run(session)
-    write_files(target.parent, {target.name: page.encode(), picture.name: panels})
-    console.print(f"{target} and {picture} written")
-    return True
+        if has_robot_run(session):
+            picture = target.with_suffix(".png")
+            check_file(picture, "--html", logs)
+            page, panels = render_robot_run(session)
+            write_files(target.parent, {target.name: page.encode(), picture.name: panels})
+            console.print(f"{target} and {picture} written")
+            return
+        has_points = bool(session.topics(MEASUREMENTS))
+        page = "" if has_points else render_report(session, ())
+    if has_points:
+        with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
+            page = render_report(session, accuracies)
+    write_files(target.parent, {target.name: page.encode()})
+    console.print(f"{target} written: open it in a browser")
+    if not has_points:
+        say("the session has no calibration points: the page shows the recording and its runs")
 
 
 _options = options_until("evaluate")
@@ -186,10 +162,7 @@ def export(
         list[str] | None,
         named("--run", "NAME", "Export this run instead of the newest; repeat it for several."),
     ] = None,
-    robot: Annotated[
-        str | None,
-        named("--robot", "NAME", "Export only this robot."),
-    ] = None,
+    robot: Annotated[str | None, named("--robot", "NAME", "Export only this robot.")] = None,
     without_images: Annotated[
         bool, switch("--without-images", "Leave the images out of a ROS 2 bag.")
     ] = False,

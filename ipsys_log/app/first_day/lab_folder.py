@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -96,19 +97,12 @@ class LabFolder:
 
         Until :meth:`finish_log`, the log does not count: it is being written.
         """
-        number, path = 1, self.path / f"{name}{_SUFFIX}"
-        while path.exists():
-            number += 1
-            path = self.path / f"{name}_{number}{_SUFFIX}"
-        self._writing = path
-        return path
+        self._writing = _unused(self.path / f"{name}{_SUFFIX}")
+        return self._writing
 
     def new_board_folder(self, camera: str) -> Path:
         """Make and return a folder for pictures of a board: ``boards/red``, ``boards/red_2`` and so on."""
-        number, path = 1, self.path / "boards" / camera
-        while path.exists():
-            number += 1
-            path = self.path / "boards" / f"{camera}_{number}"
+        path = _unused(self.path / "boards" / camera)
         path.mkdir(parents=True)
         return path
 
@@ -147,6 +141,12 @@ class LabFolder:
             self._facts = {key: facts for key, facts in self._facts.items() if facts.path != path}
             self._facts[stamp] = _read_facts(path)
         return self._facts[stamp]
+
+
+def _unused(path: Path) -> Path:
+    """Return the path; if it exists, with ``_2``, ``_3`` and so on in its name."""
+    others = (path.with_stem(f"{path.stem}_{number}") for number in count(2))
+    return next(one for one in chain([path], others) if not one.exists())
 
 
 def _stamp(paths: Sequence[Path]) -> _Stamp | None:

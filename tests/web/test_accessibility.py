@@ -10,8 +10,8 @@ import pytest
 from ipsys_log.api import python_api as api
 from ipsys_log.app.first_day.lab_folder import LabFolder
 from ipsys_log.app.web.app import build_app
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.messages import CameraModel, Model
 from tests.conftest import Unmeasured

@@ -12,17 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_result, remarks, say
-from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    LogList,
-    Option,
-    check_present,
-    flag,
-    log_argument,
-    option,
-)
+from ipsys_log.app.cli.options import check_present, flag, log_argument, option
 from ipsys_log.app.cli.signals import say_kept
 from ipsys_log.app.cli.stages import build_command, options_until, replay_options
 from ipsys_log.app.report.files import check_file, check_parquet_name
@@ -51,7 +43,7 @@ _DERIVED = (
     "is read together with its derived log. Default: the working folder."
 )
 _LOGS = Annotated[
-    LogList,
+    cli.LogList,
     log_argument(
         help="Logs, files or URLs, each one on its own. A folder, or a URL that ends with /, stands for all "
         "logs below it."
@@ -63,7 +55,7 @@ _OUTPUT = option(
     "working folder.",
 )  # fmt: skip
 # The options of the workers and of the result, which all commands of the group have.
-_WORKERS: dict[str, Option] = {
+_WORKERS: dict[str, cli.Option] = {
     "scheduler": option(
         str | None, "--scheduler", "ADDRESS",
         "Use the workers of this Dask scheduler, such as tls://head:8786. Access to a scheduler means code "
@@ -85,14 +77,14 @@ _WORKERS: dict[str, Option] = {
     "table": option(
         Path | None, "--table", "FILE", "Write the results to a Parquet file: a row for each log."
     ),
-    "as_json": (AsJson, False),
+    "as_json": (cli.AsJson, False),
 }  # fmt: skip
-_EXPORT: dict[str, Option] = {
+_EXPORT: dict[str, cli.Option] = {
     "output": option(
         Path, "--output,-o", "FOLDER",
         "The folder for the files, named as the logs. They keep the folders of the logs below the folder or "
         "pattern that you name.",
-        REQUIRED,
+        cli.REQUIRED,
     ),
     "format_": option(str, "--format", "NAME", "csv, parquet, tum, kitti, ros2, mp4 or coco.", "csv"),
     "channel": option(
@@ -117,8 +109,8 @@ def add_commands(
         no_args_is_help=True,
     )
 
-    def add(name: str, text: str, work: Callable[..., None], options: dict[str, Option]) -> None:
-        options = {"logs": (_LOGS, REQUIRED), **options, **_WORKERS}
+    def add(name: str, text: str, work: Callable[..., None], options: dict[str, cli.Option]) -> None:
+        options = {"logs": (_LOGS, cli.REQUIRED), **options, **_WORKERS}
         group.command(name, help=text)(wrap(build_command(name, text, options, work)))
 
     derived = option(Path | None, "--derived,-o", "FOLDER", _DERIVED)
@@ -141,7 +133,7 @@ def add_commands(
     app.add_typer(group, name="batch", rich_help_panel=panel)
 
 
-def _stage_options(until: str | None) -> dict[str, Option]:
+def _stage_options(until: str | None) -> dict[str, cli.Option]:
     left_out = ("logs", "output", "jobs", "as_json")
     return {name: option for name, option in options_until(until).items() if name not in left_out}
 

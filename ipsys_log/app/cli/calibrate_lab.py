@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import (
     FieldOfView,
@@ -22,22 +23,7 @@ from ipsys_log.app.cli.lab_inputs import (
     write_nominal,
 )
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import (
-    AsJson,
-    Calibrations,
-    Corners,
-    Force,
-    Host,
-    NoLogs,
-    Port,
-    RigFile,
-    Train,
-    figure_option,
-    log_argument,
-    log_option,
-    named,
-    switch,
-)
+from ipsys_log.app.cli.options import figure_option, log_argument, log_option, named, switch
 from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.app.cli.stages import derive
 from ipsys_log.errors import IpsysError
@@ -61,7 +47,7 @@ Output = Annotated[
 Plot = Annotated[Path | None, figure_option("the expected error over the floor of each camera")]
 
 Sources = Annotated[
-    NoLogs,
+    cli.NoLogs,
     log_argument(
         help="Logs, files or URLs, read as one session. The last log gets the results. Without LOG: use the "
         "cameras of --rig now."
@@ -85,19 +71,19 @@ def calibrate_lab(
     goal_mm: Goal = 3.0,
     focal: Focal = None,
     field_of_view: FieldOfView = None,
-    train: Train = "train",
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
+    train: cli.Train = "train",
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
     output: Output = None,
     plot: Plot = None,
     save_nominal: SaveNominal = None,
     seconds: Seconds = None,
     terminal: Terminal = False,
-    host: Host = None,
-    port: Port = 8000,
-    force: Force = False,
-    as_json: AsJson = False,
+    host: cli.Host = None,
+    port: cli.Port = 8000,
+    force: cli.Force = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Calibrate all cameras of a lab together, from drives of robots and a few measured points.
 

@@ -8,24 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.text import Text
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.app.cli.open_cameras import check_target, prepare_lab, record_now
-from ipsys_log.app.cli.options import (
-    AsJson,
-    Calibrations,
-    Corners,
-    LogList,
-    NoLogs,
-    OtherLog,
-    RigFile,
-    figure_option,
-    log_argument,
-    log_option,
-    named,
-    other_log_option,
-    switch,
-)
+from ipsys_log.app.cli.options import figure_option, log_argument, log_option, named, other_log_option, switch
 from ipsys_log.app.cli.stages import derive
 from ipsys_log.app.report.rows import wrap_text
 from ipsys_log.errors import IpsysError
@@ -38,19 +25,19 @@ if TYPE_CHECKING:
     from ipsys_log.live_runs.survey.drift_reading import DriftReading
 
 NoOrLogs = Annotated[
-    NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
+    cli.NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
 ]
 Output = Annotated[
     Path | None, log_option(help="A new log for the results. Without LOG, it also gets the camera frames.")
 ]
 Sources = Annotated[
-    LogList, log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own.")
+    cli.LogList, log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own.")
 ]
 Baseline = Annotated[
-    OtherLog, other_log_option("--baseline", help="The log before all moves. Default: the first by time.")
+    cli.OtherLog, other_log_option("--baseline", help="The log before all moves. Default: the first by time.")
 ]
 ModelLog = Annotated[
-    OtherLog,
+    cli.OtherLog,
     other_log_option(
         "--model-from", help="The log with the fitted model. Default: the baseline, if it has one."
     ),
@@ -66,15 +53,15 @@ Fix = Annotated[
 
 def align(
     logs: NoOrLogs = None,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
     seconds: Annotated[
         float, named("--seconds", "SECONDS", "Without LOG: duration of the recording.", min=0.1)
     ] = 3.0,
     plot: Annotated[Path | None, figure_option("the floor map and the camera images")] = None,
     output: Output = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Show the tilt that makes each camera look straight down, and the floor that all cameras see.
 
@@ -164,10 +151,10 @@ def drift(
     logs: Sources,
     baseline: Baseline = None,
     model_from: ModelLog = None,
-    rig: RigFile = None,
+    rig: cli.RigFile = None,
     fix: Fix = False,
     plot: Annotated[Path | None, figure_option("the drift over time")] = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Show which camera moved, when, and by how much its positions are wrong since then.
 

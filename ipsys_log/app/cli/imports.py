@@ -9,20 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import load_calibrations, read_lab, say_remark, say_unusual
-from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    Calibrations,
-    Option,
-    RigFile,
-    appended_log_option,
-    log_option,
-    option,
-    read_files,
-    with_options,
-)
+from ipsys_log.app.cli.options import appended_log_option, log_option, option, read_files, with_options
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
@@ -45,10 +35,10 @@ _INTO = appended_log_option(
     help="For truth: the log of the same drive. For detections: a log without images. It gets a run."
 )
 # The options of all kinds.
-_OPTIONS: dict[str, Option] = {
+_OPTIONS: dict[str, cli.Option] = {
     "into": (Annotated[Path | None, _INTO], None),
-    "rig": (RigFile, None),
-    "calibration": (Calibrations, None),
+    "rig": (cli.RigFile, None),
+    "calibration": (cli.Calibrations, None),
     "rate": option(float | None, "--rate", "HZ", "Images per second, if they have no times. Default: 1."),
     "times": option(
         str | None, "--times", "FILE|names",
@@ -86,13 +76,13 @@ _OPTIONS: dict[str, Option] = {
     "length_unit": option(
         str | None, "--length-unit", "m|mm", "Unit of x, y and z whose header has none."
     ),
-    "as_json": (AsJson, False),
+    "as_json": (cli.AsJson, False),
 }  # fmt: skip
 
 
 @with_options(
     {
-        "sources": (_SOURCES, REQUIRED),
+        "sources": (_SOURCES, cli.REQUIRED),
         "output": (Annotated[Path | None, _NEW_LOG], None),
         "kind": option(
             str | None,

@@ -6,22 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
-from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    LogList,
-    NewLog,
-    Option,
-    Overwrite,
-    ReadLogs,
-    flag,
-    log_argument,
-    log_option,
-    named,
-    option,
-    with_options,
-)
+from ipsys_log.app.cli.options import flag, log_argument, log_option, named, option, with_options
 from ipsys_log.app.report.rows import counted
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -38,7 +25,7 @@ _TIME = "UTC, such as '2026-05-04 10:00:00', or seconds from the start of the lo
 
 
 # The options that select a part, as the fields of `CutOptions`.
-_SELECTION: dict[str, Option] = {
+_SELECTION: dict[str, cli.Option] = {
     "start": option(str, "--start", "TIME", f"Keep messages from this time on: {_TIME}", ""),
     "end": option(str, "--end", "TIME", f"Keep messages before this time: {_TIME}", ""),
     "topics": option(
@@ -69,15 +56,15 @@ _SELECTION: dict[str, Option] = {
 
 @with_options(
     {
-        "logs": (ReadLogs, REQUIRED),
+        "logs": (cli.ReadLogs, cli.REQUIRED),
         "output": (Annotated[Path | None, log_option(help=_NEW_LOG)], None),
         **_SELECTION,
         "compact": flag(
             "--compact", "Leave out superseded and unfinished runs, and keep everything else of one LOG."
         ),
         "dry_run": flag("--dry-run", "With --compact: only list these runs, and write nothing."),
-        "overwrite": (Overwrite, False),
-        "as_json": (AsJson, False),
+        "overwrite": (cli.Overwrite, False),
+        "as_json": (cli.AsJson, False),
     }
 )
 def cut(
@@ -165,10 +152,10 @@ def _compact(
 
 def merge(
     logs: Annotated[
-        LogList,
+        cli.LogList,
         log_argument(help="The logs of the recorders, files or URLs. The clock of the first log counts."),
     ],
-    output: NewLog,
+    output: cli.NewLog,
     offset: Annotated[
         list[str] | None,
         named(
@@ -177,8 +164,8 @@ def merge(
             "Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
         ),
     ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Merge the logs of several recorders of one session, with different cameras, into a new log.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import (
     console,
     print_json,
@@ -20,16 +21,7 @@ from ipsys_log.app.cli.console import (
     say,
     warn,
 )
-from ipsys_log.app.cli.options import (
-    AsJson,
-    LogList,
-    ReadLogs,
-    appended_log_argument,
-    figure_option,
-    log_argument,
-    named,
-    switch,
-)
+from ipsys_log.app.cli.options import appended_log_argument, figure_option, log_argument, named, switch
 from ipsys_log.app.cli.signals import writes_nothing
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -47,7 +39,7 @@ _Seconds = float | None
 
 @writes_nothing
 def info(
-    logs: ReadLogs,
+    logs: cli.ReadLogs,
     runs: Annotated[
         bool, switch("--runs", "Show the runs with their inputs, parameters, versions and states.")
     ] = False,
@@ -59,7 +51,7 @@ def info(
         switch("--latency", "Show the latency of each step of a live run, from the frame to the position."),
     ] = False,
     plot: Annotated[Path | None, figure_option("the processing steps of --latency")] = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Show cameras, channels, counts, rates, gaps and runs of a log.
 
@@ -147,7 +139,7 @@ def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[
 
 @writes_nothing
 def cat(
-    logs: ReadLogs,
+    logs: cli.ReadLogs,
     topics: Annotated[
         list[str] | None, named("--topics", "TOPIC,...", "Print only these topics, separated by commas.")
     ] = None,
@@ -163,7 +155,7 @@ def cat(
     end_offset: Annotated[
         _Seconds, named("--end-offset", "SECONDS", "End so long after the first message.")
     ] = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Print the messages of a log in log order, one line each: time (UTC), topic, schema and short content.
 
@@ -218,7 +210,7 @@ def _ns(seconds: float | None, start_ns: int = 0) -> int | None:
     return start_ns + round(seconds * NS_PER_S)
 
 
-Logs = Annotated[LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
+Logs = Annotated[cli.LogList, log_argument(help="Logs, files or URLs; each one is read separately.")]
 
 
 @writes_nothing
@@ -227,7 +219,7 @@ def check(
     details: Annotated[
         bool, switch("--details", "Also print notes: rates, unknown channels, current runs.")
     ] = False,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Read logs completely and check them: file, channels, times, rates, references and runs.
 
@@ -256,7 +248,7 @@ def check(
 @writes_nothing
 def verify(
     logs: Annotated[
-        LogList,
+        cli.LogList,
         log_argument(help="Logs, files or URLs, read as one session. With --compare: one or two logs."),
     ],
     run: Annotated[
@@ -267,7 +259,7 @@ def verify(
         bool,
         switch("--compare", "Compare the runs of two logs, or two runs of one log, and compute nothing."),
     ] = False,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Compute every run of a log again from its inputs, and compare each channel byte for byte.
 

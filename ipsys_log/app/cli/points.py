@@ -10,24 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_json, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations, load_matching_rig
-from ipsys_log.app.cli.options import (
-    AsJson,
-    Calibrations,
-    Corners,
-    Host,
-    LogList,
-    Logs,
-    Port,
-    RigFile,
-    Terminal,
-    Train,
-    appended_log_argument,
-    figure_option,
-    named,
-    switch,
-)
+from ipsys_log.app.cli.options import appended_log_argument, figure_option, named, switch
 from ipsys_log.app.cli.pages import serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
 from ipsys_log.app.cli.stages import derive
@@ -68,17 +54,17 @@ _MODEL, _GOOD = "poly", 40
 @runs_until_stopped
 def measure(
     log: Log,
-    terminal: Terminal = False,
+    terminal: cli.Terminal = False,
     csv: Sheet = None,
     places: Places = False,
     ab: Baseline = None,
-    host: Host = None,
-    port: Port = 8000,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
+    host: cli.Host = None,
+    port: cli.Port = 8000,
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
     force: Insist = False,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Enter the tape measurements of a log: on a page for the phone, in the terminal, or from a sheet.
 
@@ -158,7 +144,7 @@ def exclude(
     readmit: Annotated[
         bool, switch("--readmit", "Use excluded points again, instead of excluding points.")
     ] = False,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Exclude calibration points of a log from all stages, or re-admit them. Nothing is erased.
 
@@ -233,15 +219,15 @@ Plot = Annotated[Path | None, figure_option("the error over the floor, before an
 
 
 def plan(
-    logs: Logs,
+    logs: cli.Logs,
     places: Count = 5,
     model: Model = "best",
     height_m: Heights = None,
-    train: Train = "train",
-    rig: RigFile = None,
-    calibration: Calibrations = None,
+    train: cli.Train = "train",
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
     plot: Plot = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Propose the next points to measure, which reduce the predicted error over the floor most.
 
@@ -283,7 +269,7 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
         say(f"{plot} drawn")
 
 
-def _check(logs: LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
+def _check(logs: cli.LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
     """Check that a plan is possible, before a model is fitted."""
     from ipsys_log.engine.select import copied_run
     from ipsys_log.engine.view import LogView

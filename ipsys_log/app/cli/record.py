@@ -10,26 +10,10 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Annotated, Any
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import say, warn
 from ipsys_log.app.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import (
-    Calibrations,
-    Corners,
-    FittedModels,
-    Force,
-    Host,
-    Method,
-    NewLog,
-    OneLog,
-    Only,
-    OtherLog,
-    Port,
-    RigNow,
-    Seconds,
-    Terminal,
-    other_log_option,
-    switch,
-)
+from ipsys_log.app.cli.options import other_log_option, switch
 from ipsys_log.app.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
 from ipsys_log.app.cli.points import show_measured
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped
@@ -58,30 +42,30 @@ _NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
 
 @runs_until_stopped
 def record(
-    output: NewLog,
-    rig: RigNow = Path("lab.toml"),
-    camera: Only = None,
-    calibration: Calibrations = None,
+    output: cli.NewLog,
+    rig: cli.RigNow = Path("lab.toml"),
+    camera: cli.Only = None,
+    calibration: cli.Calibrations = None,
     detect: Annotated[bool, switch("--detect", "Detect the markers and write them, too.")] = False,
-    corners: Corners = None,
+    corners: cli.Corners = None,
     measure: Annotated[
         bool, switch("--measure", "Enter tape measurements during the recording, on a page for the phone.")
     ] = False,
     points_only: Annotated[
         bool, switch("--points-only", "With --measure: keep only about 1 s of frames of each measured point.")
     ] = False,
-    terminal: Terminal = False,
-    host: Host = None,
-    port: Port = 8000,
+    terminal: cli.Terminal = False,
+    host: cli.Host = None,
+    port: cli.Port = 8000,
     model_from: Annotated[
-        OtherLog,
+        cli.OtherLog,
         other_log_option(
             "--model-from",
             help="With --measure: compare each point with the model of this log, a file or a URL.",
         ),
     ] = None,
-    seconds: Seconds = None,
-    force: Force = False,
+    seconds: cli.Seconds = None,
+    force: cli.Force = False,
     as_json: Annotated[bool, switch("--json", "With --points-only: print JSON.", hidden=True)] = False,
 ) -> None:
     """Record the camera frames, unchanged, until Ctrl-C.
@@ -241,24 +225,24 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras)
 @runs_until_stopped
 @takes_streams
 def live(
-    output: NewLog,
+    output: cli.NewLog,
     model_from: Annotated[
-        OneLog,
+        cli.OneLog,
         other_log_option("--model-from", help="The log with the fitted model to apply, a file or a URL."),
     ],
-    rig: RigNow = Path("lab.toml"),
-    model: FittedModels = None,
-    camera: Only = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
-    method: Method = "perimeter",
+    rig: cli.RigNow = Path("lab.toml"),
+    model: cli.FittedModels = None,
+    camera: cli.Only = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
+    method: cli.Method = "perimeter",
     view: View = False,
     web: Web = False,
     web_port: WebPort = None,
     *,
     streams: StreamOptions,
-    seconds: Seconds = None,
-    force: Force = False,
+    seconds: cli.Seconds = None,
+    force: cli.Force = False,
 ) -> None:
     """Track robots live: record, and process every frame with all stages up to fuse, until Ctrl-C.
 

@@ -5,18 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import MODEL, check_target
-from ipsys_log.app.cli.options import (
-    AsJson,
-    FittedModels,
-    Force,
-    NewLog,
-    OneLog,
-    named,
-    other_log_option,
-    switch,
-)
+from ipsys_log.app.cli.options import named, other_log_option, switch
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
@@ -35,7 +27,7 @@ Failures = Annotated[
 
 
 def simulate(
-    output: NewLog,
+    output: cli.NewLog,
     cameras: Annotated[
         str | None,
         named(
@@ -81,14 +73,14 @@ def simulate(
 
 @runs_until_stopped
 def drive(
-    output: NewLog,
+    output: cli.NewLog,
     model_from: Annotated[
-        OneLog,
+        cli.OneLog,
         other_log_option(
             "--model-from", help="The log of the simulated lab with the model, a file or a URL."
         ),
     ],
-    model: FittedModels = None,
+    model: cli.FittedModels = None,
     robots: Annotated[int, switch("--robots", "Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
@@ -111,8 +103,8 @@ def drive(
         int, switch("--port", "First of the used ports; 0: free ports.", min=0, max=65000)
     ] = 9870,
     seconds: Annotated[float, switch("--seconds", "Stop after this time.", min=1.0)] = 300.0,
-    as_json: AsJson = False,
-    force: Force = False,
+    as_json: cli.AsJson = False,
+    force: cli.Force = False,
 ) -> None:
     """Let robots drive in the simulated lab, each by a program that gets only streamed positions.
 

@@ -9,15 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_outcomes, print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
 from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    Calibrations,
-    Logs,
-    Option,
-    RigFile,
     check_present,
     figure_option,
     flag,
@@ -49,10 +44,10 @@ def _stage_lines() -> str:
 
 
 # The options of every stage, and of the printed results.
-_SHARED: dict[str, Option] = {
-    "logs": (Logs, REQUIRED),
-    "rig": (RigFile, None),
-    "calibration": (Calibrations, None),
+_SHARED: dict[str, cli.Option] = {
+    "logs": (cli.Logs, cli.REQUIRED),
+    "rig": (cli.RigFile, None),
+    "calibration": (cli.Calibrations, None),
     "run": option(
         str | None, "--run", "NAME", "Name of the new run, instead of edges, poly, poly_2 ..."
     ),
@@ -65,9 +60,9 @@ _SHARED: dict[str, Option] = {
         "same with any number.",
         min=1,
     ),
-    "as_json": (AsJson, False),
+    "as_json": (cli.AsJson, False),
 }  # fmt: skip
-_PRINTS: dict[str, Option] = {
+_PRINTS: dict[str, cli.Option] = {
     "plot": (Annotated[Path | None, figure_option("the floor and the errors")], None),
     "details": flag(
         "--details", "Print details, too: errors by camera, every outlier, models by number of points."
@@ -115,7 +110,7 @@ Examples
 """
 
 
-def options_until(name: str | None) -> dict[str, Option]:
+def options_until(name: str | None) -> dict[str, cli.Option]:
     """Return the options of a stage, with the parameters of all stages up to it; None: of all stages."""
     options = dict(_SHARED)
     as_json = options.pop("as_json")
@@ -126,7 +121,7 @@ def options_until(name: str | None) -> dict[str, Option]:
 
 
 def build_command(
-    name: str, text: str, options: Mapping[str, Option], work: Callable[..., None]
+    name: str, text: str, options: Mapping[str, cli.Option], work: Callable[..., None]
 ) -> Callable[..., None]:
     """Return a command with a help text and these options."""
 

@@ -101,47 +101,36 @@ def calibrate_lab(
         ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
     """
     from ipsys_log.engine.graph import writes
+    from ipsys_log.engine.options import Request
     from ipsys_log.live_runs.survey.lab_calibration import describe_lab
     from ipsys_log.messages.channels import MODEL
 
     if not 0 < goal_mm <= _MOST_GOAL_MM:
         raise IpsysError(f"--goal-mm {goal_mm:g}: is not a length above 0 and up to {_MOST_GOAL_MM:g} mm")
+    nominal = [("--focal", text) for text in focal or []]
+    nominal += [("--field-of-view", text) for text in field_of_view or []]
     if logs:
-        _refuse_live(seconds=seconds, terminal=terminal, host=host, force=force)
+        for name, value in {"seconds": seconds, "terminal": terminal, "host": host, "force": force}.items():
+            if value:
+                raise IpsysError(f"--{name} is only for live cameras; leave out LOG or this option")
     else:
         if output is None:
             raise IpsysError("no log is given; name a log, or give --rig lab.toml -o lab.mcap to use cameras")
-        nominal = [("--focal", text) for text in focal or []]
-        nominal += [("--field-of-view", text) for text in field_of_view or []]
         page = None if terminal else (host, port)
-        _record_drive(
-            output,
-            rig or Path("lab.toml"),
-            calibration,
-            nominal,
-            corners,
-            goal_mm / 1000,
-            seconds,
-            page,
-            force,
-        )
+        request, goal_m = Request(corners=corners), goal_mm / 1000
+        _record_drive(output, rig, calibration, nominal, request, goal_m, seconds, page, force)
         # The log has the rig and the intrinsics of its cameras.
-        logs, output, rig, calibration, focal, field_of_view = [output], None, None, None, None, None
+        logs, output, rig, calibration, nominal = [output], None, None, None, []
     given_rig = load_matching_rig(rig, lambda: cameras_of(logs))
     _check(logs, given_rig)
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
-    nominal_values = nominal_lenses_of_logs(logs, lenses, focal or [], field_of_view or [])
+    nominal_values = nominal_lenses_of_logs(logs, lenses, nominal)
     if save_nominal is not None:
         write_nominal(nominal_values, save_nominal)
     lenses = {**lenses, **nominal_values}
-    options: dict[str, Any] = {
-        "train": train,
-        "rig": rig,
-        "calibration": None,
-        "corners": corners,
-        "run": None,
-    }
-    with derive(logs, "fit", output, model=["joint"], lenses=lenses, **options) as (session, outcomes, _):
+    given: dict[str, Any] = {"model": ["joint"], "lenses": lenses, "train": train}
+    given |= {"rig": rig, "calibration": None, "corners": corners, "run": None}
+    with derive(logs, "fit", output, **given) as (session, outcomes, _):
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
         in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
         with progress_bar() as progress:
@@ -169,13 +158,6 @@ def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:
             )
 
 
-def _refuse_live(**options: object) -> None:
-    """Refuse options that belong to a recording."""
-    for name, value in options.items():
-        if value:
-            raise IpsysError(f"--{name} is only for live cameras; leave out LOG or this option")
-
-
 def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
     from ipsys_log.app.report.calibration import lab_advice, lab_headline, lab_json, lab_table
 
@@ -190,10 +172,10 @@ def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
 
 def _record_drive(
     output: Path,
-    rig: Path,
+    rig: Path | None,
     calibration: list[str] | None,
     nominal: Sequence[tuple[str, str]],
-    corners: str | None,
+    request: Request,
     goal_m: float,
     seconds: float | None,
     page: tuple[str | None, int] | None,
@@ -203,26 +185,19 @@ def _record_drive(
 
     Parameters
     ----------
-    output : the new log.
-    rig, calibration : files of the rig and of intrinsics.
     nominal : options for nominal intrinsics, with their texts.
-    corners : method of the corners.
     goal_m : wanted mean error of every camera.
-    seconds : duration; None: until a signal.
     page : address and port of the measuring page; None: the terminal asks after the recording.
-    force : overwrite an existing log.
     """
-    from ipsys_log.engine.options import Request
     from ipsys_log.live_runs import pipeline
     from ipsys_log.live_runs.survey.live_calibration import LiveCalibration
 
     if page is not None:
         check_installed("the measuring page needs", "starlette", "uvicorn")
-    lab = prepare_lab(rig, None, calibration)
+    lab = prepare_lab(rig or Path("lab.toml"), None, calibration)
     sizes_px = {c.name: (c.width, c.height) for c in lab.cameras if c.width and c.height}
     lab.lenses.update(nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
     check_target(output, force, lab.files)
-    request = Request(corners=corners)
     ready_to_measure(lab, request, None, page)
     with open_cameras(lab, output, seconds) as (opened, status):
         scene = live_scene(opened, None)

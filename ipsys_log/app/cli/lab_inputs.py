@@ -209,19 +209,17 @@ def cameras_of(logs: Sequence[LogLocation]) -> set[str]:
 def nominal_lenses_of_logs(
     logs: Sequence[LogLocation],
     given: dict[str, CameraCalibration],
-    focal: list[str],
-    field_of_view: list[str],
+    options: Sequence[tuple[str, str]],
 ) -> dict[str, CameraCalibration]:
-    """Return nominal intrinsics of the cameras of logs, by camera."""
+    """Return nominal intrinsics of the cameras of logs, by camera; see :func:`nominal_lenses`."""
     from ipsys_log.engine.checks import image_sizes
     from ipsys_log.log.dataset import Session
 
-    if not focal and not field_of_view:
+    if not options:
         return {}
     with Session(logs) as session:
         sizes_px = image_sizes(session)
         calibrated = {*session.calibrations, *given}
-    options = [*(("--focal", text) for text in focal), *(("--field-of-view", text) for text in field_of_view)]
     return nominal_lenses(options, sorted(cameras_of(logs)), calibrated, sizes_px)
 
 

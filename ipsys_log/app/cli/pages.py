@@ -83,15 +83,13 @@ def plan_dashboard(
 
     All modules are loaded here: no frame must wait for them.
     """
-    port = _checked_port(is_wanted, port)
+    port = check_dashboard(is_wanted, host, port)
     if not is_wanted:
         return None
     import ipsys_log.app.web.dashboard.app  # noqa: F401
-    from ipsys_log.app.web.server import check_port_free
     from ipsys_log.engine.graph import copy_model
     from ipsys_log.engine.select import wanted_models
 
-    check_port_free(host, port, "--web-port")
     first, *_ = wanted_models(request)
     return DashboardPlan(host, port, copy_model(request, first)[1])
 
@@ -123,9 +121,11 @@ def serve_dashboard(
         yield [dashboard]
 
 
-def check_playback_page(is_wanted: bool, host: str | None, port: int | None) -> int:
-    """Check that the dashboard of a playback can be served; return its port."""
-    port = _checked_port(is_wanted, port)
+def check_dashboard(is_wanted: bool, host: str | None, port: int | None) -> int:
+    """Check that a dashboard can be served, and that its option has an effect; return its port."""
+    if port is not None and not is_wanted:
+        raise IpsysError("--web-port: has no effect without --web; add --web")
+    port = _USUAL_PORT if port is None else port
     if is_wanted:
         from ipsys_log.app.web.server import check_port_free
 
@@ -163,12 +163,6 @@ def _serve(dashboard: Dashboard, host: str | None, port: int, has_viewers: bool)
             yield
         finally:
             say_faults(page, "the dashboard")
-
-
-def _checked_port(is_wanted: bool, port: int | None) -> int:
-    if port is not None and not is_wanted:
-        raise IpsysError("--web-port: has no effect without --web; add --web")
-    return _USUAL_PORT if port is None else port
 
 
 def _print_addresses(page: PageServer, is_secret: bool) -> None:

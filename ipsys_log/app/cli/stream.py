@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli.console import say
 from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, named, option, switch
-from ipsys_log.app.cli.pages import Web, WebPort, check_playback_page, serve_playback
+from ipsys_log.app.cli.pages import Web, WebPort, check_dashboard, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -226,7 +226,7 @@ def stream(
     settings = choose_streams(described, folder, has_page=web, **streams)
     if not settings and not web:
         raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870, or add --web")
-    port = check_playback_page(web, streams["host"], web_port)
+    port = check_dashboard(web, streams["host"], web_port)
     options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")
     player = Player(logs, run, topics or (), options, settings, say=say, has_dashboard=web)
     stop_on_signal(player.stop)

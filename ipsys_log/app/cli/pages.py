@@ -105,11 +105,7 @@ def serve_dashboard(
 ) -> Iterator[list[Dashboard]]:
     """Serve the dashboard of a live recording until the end of the block, and print its address.
 
-    Parameters
-    ----------
-    plan : None: there is no dashboard.
-    opened, status : the open cameras, and the status on the screen.
-    log, run, streams : the log that is written, the run of the shown tracks, and the streams of positions.
+    Without a plan, there is no dashboard.
     """
     if plan is None:
         yield []

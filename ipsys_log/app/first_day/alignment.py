@@ -55,10 +55,6 @@ class AlignmentResult:
 def read_result(session: Session, run: str) -> AlignmentResult:
     """Read the alignment from a log of ``ipsys align``.
 
-    Parameters
-    ----------
-    run : the run of its camera points.
-
     Raises
     ------
     IpsysError

@@ -242,11 +242,6 @@ def find_outlier_points(paths: Sequence[Path], accuracies: Sequence[Accuracy]) -
 def exclude_outlier(paths: Sequence[Path], log: str, point: str) -> None:
     """Exclude a calibration point from all stages (``ipsys exclude LOG POINT``); nothing is erased.
 
-    Parameters
-    ----------
-    paths : the logs that may be changed.
-    log : the name of one of them.
-
     Raises
     ------
     IpsysError

@@ -41,11 +41,6 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
     On the left is the floor map, if the coverage is known. On the right is the image of each camera with its
     markers. Each marker shows the difference of its Zc from the median. An arrow shows the direction to turn
     the camera.
-
-    Parameters
-    ----------
-    lab : the alignment to draw.
-    path : path of the figure; an existing file is replaced. The suffix gives the file format.
     """
     floor = lab.coverage is not None
     columns = -(-len(lab.alignments) // _ROWS)

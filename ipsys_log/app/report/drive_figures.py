@@ -132,12 +132,6 @@ def draw_panels(session: Session, result: RobotRunResult, robot: RobotResult) ->
     A panel has the images of all cameras at one instant, the last camera of the rig on top. The text at its
     top left is the position that the controller received last. A circle is around the robot. A camera without
     a frame at this instant is grey.
-
-    Parameters
-    ----------
-    session : the open log.
-    result : the results of the log, from :func:`ipsys_log.tools.robot_run.read_robot_run`.
-    robot : the robot, one of the results.
     """
     panels = _panels(result, robot)
     figure = Figure(figsize=(12.0, 14.0), layout="constrained")

@@ -65,12 +65,7 @@ class FloorData:
 
 
 def draw_floor(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, str]]) -> None:
-    """Draw the floor, tracks, points and errors of a scene.
-
-    Parameters
-    ----------
-    styles : colour and marker shape by camera.
-    """
+    """Draw the floor, tracks, points and errors of a scene."""
     around_m = [place.point_m[:2] for place in scene.places]
     if not around_m and not (scene.rig and scene.rig.floor):
         lines = (*scene.tracks.values(), *scene.truth.values())
@@ -252,13 +247,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
 
     The left side shows the floor to scale: measured points, tracks and, if known, the ground truth. An arrow
     shows the error of the first model at each held-out point. The title states the factor of the arrows. The
-    right side shows every error of every model and camera, in cm.
-
-    Parameters
-    ----------
-    session : open logs.
-    accuracies : from :func:`ipsys_log.app.report.accuracy.read_accuracy`; empty leaves out the right side.
-    path : path of the figure; an existing file is replaced. The suffix gives the file format.
+    right side shows every error of every model and camera, in cm; it exists only with accuracies.
 
     Raises
     ------

@@ -46,11 +46,6 @@ _MS_PER_S = 1e3
 def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     """Render the page of a session; the same log always gives the same page.
 
-    Parameters
-    ----------
-    session : open logs.
-    accuracies : from :func:`ipsys_log.app.report.accuracy.read_accuracy`.
-
     Raises
     ------
     IpsysError

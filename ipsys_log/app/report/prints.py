@@ -181,13 +181,7 @@ def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
 
 
 def lay_out(prints: Sequence[Print], paper: Paper) -> list[Page]:
-    """Arrange prints on pages: markers in rows from the top left, each board on a separate page.
-
-    Parameters
-    ----------
-    prints : prints that fit onto the paper; :func:`choose_paper` checks this.
-    paper : the paper of the pages.
-    """
+    """Arrange prints on pages: markers in rows from the top left, each board on a separate page."""
     markers = [item for item in prints if not item.is_board]
     pages = _rows_of_markers(markers, paper)
     for board in prints:

@@ -230,10 +230,7 @@ def dashboard_of_recording(
 
     Parameters
     ----------
-    opened : the open cameras.
-    checks : last checks of the cameras, by name.
-    log, model, run : the log that is written, the fitted model, and the run of its tracks.
-    streams : the streams of positions.
+    log, run : the log that is written, and the run of the shown tracks.
     seat : the seat of the device that operates, if another page has it, too.
     """
     cameras, now_ns = opened.cameras, opened.cameras.clock.now_ns

@@ -14,9 +14,9 @@ from rich.text import Text
 
 from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_result, remarks, say
-from ipsys_log.app.cli.options import check_present, flag, log_argument, option
+from ipsys_log.app.cli.options import check_present, flag, log_argument, option, with_options
 from ipsys_log.app.cli.signals import say_kept
-from ipsys_log.app.cli.stages import build_command, options_until, replay_options
+from ipsys_log.app.cli.stages import options_until, replay_options
 from ipsys_log.app.report.files import check_file, check_parquet_name
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -111,7 +111,7 @@ def add_commands(
 
     def add(name: str, text: str, work: Callable[..., None], options: dict[str, cli.Option]) -> None:
         options = {"logs": (_LOGS, cli.REQUIRED), **options, **_WORKERS}
-        group.command(name, help=text)(wrap(build_command(name, text, options, work)))
+        group.command(name, help=text)(wrap(with_options(options, name, text)(work)))
 
     derived = option(Path | None, "--derived,-o", "FOLDER", _DERIVED)
     outdated = flag("--outdated", "Replay only logs that hold outdated runs.")

@@ -12,7 +12,7 @@ import typer
 
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.app.cli.open_cameras import SENT_NOW, prepare_lab, record_now
-from ipsys_log.app.cli.options import AsJson, figure_option, file_log_argument, named, switch
+from ipsys_log.app.cli.options import AsJson, figure_option, file_log_argument, setting, switch
 from ipsys_log.app.cli.signals import note_kept, say_kept
 from ipsys_log.app.report.files import check_file, check_folder, write_files
 from ipsys_log.errors import IpsysError
@@ -24,30 +24,30 @@ if TYPE_CHECKING:
 Sources = Annotated[
     list[Path] | None, file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE")
 ]
-RigNow = Annotated[Path | None, named("--rig", "FILE", "Without SOURCE: use the cameras of this rig now.")]
+RigNow = Annotated[Path | None, setting("--rig", "FILE", "Without SOURCE: use the cameras of this rig now.")]
 Seconds = Annotated[
-    float, named("--seconds", "SECONDS", "Without SOURCE: duration, while you move the board.", min=1.0)
+    float, setting("--seconds", "SECONDS", "Without SOURCE: duration, while you move the board.", min=1.0)
 ]
 BoardName = Annotated[
     str,
-    named(
+    setting(
         "--board",
         "COLUMNSxROWS",
         "Inner corners of a chessboard, such as 6x4, or squares of a ChArUco board, such as charuco:4x5.",
     ),
 ]
 Square = Annotated[
-    float, named("--square", "METRES", "Side of a square, in m. It does not change the intrinsics.")
+    float, setting("--square", "METRES", "Side of a square, in m. It does not change the intrinsics.")
 ]
 MarkerScale = Annotated[
     float,
-    named("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
+    setting("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
-Dictionary = Annotated[str, named("--dictionary", "NAME", "Dictionary of the markers of a ChArUco board.")]
+Dictionary = Annotated[str, setting("--dictionary", "NAME", "Dictionary of the markers of a ChArUco board.")]
 Inverted = Annotated[bool, switch("--inverted", "The board has black and white exchanged.")]
 Lens = Annotated[
     str,
-    named(
+    setting(
         "--lens",
         "NAME",
         "Distortion model: fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 "
@@ -56,17 +56,19 @@ Lens = Annotated[
 ]
 Cameras = Annotated[
     list[str] | None,
-    named(
+    setting(
         "--camera",
         "CAMERA",
         "Use only this camera of the log or rig; repeat it for several. With images or a video: the "
         "name of the camera.",
     ),
 ]
-Output = Annotated[Path, named("--output,-o", "PATH", "Folder of the files, or one file, such as red.yaml.")]
+Output = Annotated[
+    Path, setting("--output,-o", "PATH", "Folder of the files, or one file, such as red.yaml.")
+]
 Formats = Annotated[
     list[str] | None,
-    named("--format", "NAME", "File format: opencv (the default), ros or kalibr; repeat it for several."),
+    setting("--format", "NAME", "File format: opencv (the default), ros or kalibr; repeat it for several."),
 ]
 Plot = Annotated[Path | None, figure_option("coverage and residuals")]
 Force = Annotated[

@@ -23,7 +23,7 @@ from ipsys_log.app.cli.lab_inputs import (
     write_nominal,
 )
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import figure_option, log_argument, log_option, named, switch
+from ipsys_log.app.cli.options import figure_option, log_argument, log_option, setting, switch
 from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.app.cli.stages import derive
 from ipsys_log.errors import IpsysError
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 # Largest goal that still means something, in mm.
 _MOST_GOAL_MM = 1000.0
 
-Goal = Annotated[float, named("--goal-mm", "MM", "Wanted mean error over the floor of each camera, in mm.")]
+Goal = Annotated[float, setting("--goal-mm", "MM", "Wanted mean error over the floor of each camera, in mm.")]
 Output = Annotated[
     Path | None,
     log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
@@ -54,7 +54,7 @@ Sources = Annotated[
     ),
 ]
 Seconds = Annotated[
-    float | None, named("--seconds", "SECONDS", "Without LOG: stop the cameras after this time.", min=1.0)
+    float | None, setting("--seconds", "SECONDS", "Without LOG: stop the cameras after this time.", min=1.0)
 ]
 Terminal = Annotated[
     bool,

@@ -12,7 +12,14 @@ from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.app.cli.open_cameras import check_target, prepare_lab, record_now
-from ipsys_log.app.cli.options import figure_option, log_argument, log_option, named, other_log_option, switch
+from ipsys_log.app.cli.options import (
+    figure_option,
+    log_argument,
+    log_option,
+    other_log_option,
+    setting,
+    switch,
+)
 from ipsys_log.app.cli.stages import derive
 from ipsys_log.app.report.rows import wrap_text
 from ipsys_log.errors import IpsysError
@@ -57,7 +64,7 @@ def align(
     calibration: cli.Calibrations = None,
     corners: cli.Corners = None,
     seconds: Annotated[
-        float, named("--seconds", "SECONDS", "Without LOG: duration of the recording.", min=0.1)
+        float, setting("--seconds", "SECONDS", "Without LOG: duration of the recording.", min=0.1)
     ] = 3.0,
     plot: Annotated[Path | None, figure_option("the floor map and the camera images")] = None,
     output: Output = None,

@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
-from ipsys_log.app.cli.options import AsJson, file_log_argument, named, switch
+from ipsys_log.app.cli.options import AsJson, file_log_argument, setting, switch
 from ipsys_log.app.cli.signals import say_kept
 from ipsys_log.app.report.files import check_file, check_parquet_name
 from ipsys_log.errors import IpsysError
@@ -30,10 +30,10 @@ def catalogue(
             "such as s3://lab/2026-*/*.mcap.",
         ),
     ],
-    output: Annotated[Path, named("--output,-o", "FILE", "The catalogue: a Parquet file (.parquet).")],
+    output: Annotated[Path, setting("--output,-o", "FILE", "The catalogue: a Parquet file (.parquet).")],
     baseline: Annotated[
         str | None,
-        named(
+        setting(
             "--baseline",
             "LOG",
             "Also record the drift of the cameras since this log, by their reference markers.",
@@ -41,11 +41,11 @@ def catalogue(
     ] = None,
     model_from: Annotated[
         str | None,
-        named("--model-from", "LOG", "The log with the model for the drift. Default: the baseline."),
+        setting("--model-from", "LOG", "The log with the model for the drift. Default: the baseline."),
     ] = None,
     derived: Annotated[
         Path | None,
-        named(
+        setting(
             "--derived",
             "FOLDER",
             "The folder of -o in ipsys batch replay, with the results of logs that cannot be appended "
@@ -105,19 +105,19 @@ def pack(
     ] = None,
     output: Annotated[
         Path | None,
-        named(
+        setting(
             "--output,-o",
             "DATASET",
             "The dataset to write: a folder, or a zip archive if the name ends in .zip.",
         ),
     ] = None,
-    card: Annotated[Path | None, named("--card", "FILE", "The filled form of the dataset card.")] = None,
+    card: Annotated[Path | None, setting("--card", "FILE", "The filled form of the dataset card.")] = None,
     card_form: Annotated[
-        Path | None, named("--card-form", "FILE", "Only write the empty form of the dataset card.")
+        Path | None, setting("--card-form", "FILE", "Only write the empty form of the dataset card.")
     ] = None,
     model: Annotated[
         list[str] | None,
-        named(
+        setting(
             "--model", "NAME", "Score this model; repeat it for several. Default: all that the logs allow."
         ),
     ] = None,
@@ -127,7 +127,7 @@ def pack(
     blur: Annotated[
         bool, switch("--blur", "Blur the images outside of the detected markers: a new recording, in grey.")
     ] = False,
-    every: Annotated[int, named("--every", "N", "Keep each n-th frame of each camera.", min=1)] = 1,
+    every: Annotated[int, setting("--every", "N", "Keep each n-th frame of each camera.", min=1)] = 1,
 ) -> None:
     """Write logs as a dataset: the recorded channels, the rig, a card, checksums and the expected scores.
 
@@ -178,7 +178,7 @@ def score(
     ],
     model: Annotated[
         list[str] | None,
-        named(
+        setting(
             "--model",
             "MODEL",
             "Repeat only this model, or score your own as FILE.py:CLASS; repeat it for several.",

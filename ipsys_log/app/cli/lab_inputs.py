@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ipsys_log.app.cli.console import say, warn
-from ipsys_log.app.cli.options import named
+from ipsys_log.app.cli.options import setting
 from ipsys_log.app.report.files import check_folder, write_files
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl, parse_location
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Focal = Annotated[
     list[str] | None,
-    named(
+    setting(
         "--focal",
         "[CAMERA=]PX",
         "Nominal focal length in pixels, of one camera, or of all cameras without a calibration. The "
@@ -29,13 +29,13 @@ Focal = Annotated[
 ]
 FieldOfView = Annotated[
     list[str] | None,
-    named(
+    setting(
         "--field-of-view", "[CAMERA=]DEGREES", "Nominal horizontal field of view, instead of a focal length."
     ),
 ]
 SaveNominal = Annotated[
     Path | None,
-    named(
+    setting(
         "--save-nominal",
         "DIR",
         "With LOG: write the nominal intrinsics into this folder, such as red.yaml, for lab.toml and "
@@ -207,9 +207,7 @@ def cameras_of(logs: Sequence[LogLocation]) -> set[str]:
 
 
 def nominal_lenses_of_logs(
-    logs: Sequence[LogLocation],
-    given: dict[str, CameraCalibration],
-    options: Sequence[tuple[str, str]],
+    logs: Sequence[LogLocation], given: dict[str, CameraCalibration], options: Sequence[tuple[str, str]]
 ) -> dict[str, CameraCalibration]:
     """Return nominal intrinsics of the cameras of logs, by camera; see :func:`nominal_lenses`."""
     from ipsys_log.engine.checks import image_sizes

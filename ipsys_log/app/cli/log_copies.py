@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
-from ipsys_log.app.cli.options import flag, log_argument, log_option, named, option, with_options
+from ipsys_log.app.cli.options import flag, log_argument, log_option, option, setting, with_options
 from ipsys_log.app.report.rows import counted
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -158,7 +158,7 @@ def merge(
     output: cli.NewLog,
     offset: Annotated[
         list[str] | None,
-        named(
+        setting(
             "--offset",
             "NAME=SECONDS",
             "Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",

@@ -21,7 +21,7 @@ from ipsys_log.app.cli.console import (
     say,
     warn,
 )
-from ipsys_log.app.cli.options import appended_log_argument, figure_option, log_argument, named, switch
+from ipsys_log.app.cli.options import appended_log_argument, figure_option, log_argument, setting, switch
 from ipsys_log.app.cli.signals import writes_nothing
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -141,19 +141,19 @@ def _latency(logs: Sequence[LogLocation], plot: Path | None) -> tuple[Any, list[
 def cat(
     logs: cli.ReadLogs,
     topics: Annotated[
-        list[str] | None, named("--topics", "TOPIC,...", "Print only these topics, separated by commas.")
+        list[str] | None, setting("--topics", "TOPIC,...", "Print only these topics, separated by commas.")
     ] = None,
     start_secs: Annotated[
-        _Seconds, named("--start-secs", "SECONDS", "Begin at this log time since 1970, in UTC.")
+        _Seconds, setting("--start-secs", "SECONDS", "Begin at this log time since 1970, in UTC.")
     ] = None,
     end_secs: Annotated[
-        _Seconds, named("--end-secs", "SECONDS", "End before this log time since 1970, in UTC.")
+        _Seconds, setting("--end-secs", "SECONDS", "End before this log time since 1970, in UTC.")
     ] = None,
     start_offset: Annotated[
-        _Seconds, named("--start-offset", "SECONDS", "Begin so long after the first message.")
+        _Seconds, setting("--start-offset", "SECONDS", "Begin so long after the first message.")
     ] = None,
     end_offset: Annotated[
-        _Seconds, named("--end-offset", "SECONDS", "End so long after the first message.")
+        _Seconds, setting("--end-offset", "SECONDS", "End so long after the first message.")
     ] = None,
     as_json: cli.AsJson = False,
 ) -> None:
@@ -253,7 +253,7 @@ def verify(
     ],
     run: Annotated[
         list[str] | None,
-        named("--run", "NAME", "Use only this run. With --compare, give it twice for two runs."),
+        setting("--run", "NAME", "Use only this run. With --compare, give it twice for two runs."),
     ] = None,
     compare: Annotated[
         bool,

@@ -9,7 +9,7 @@ import typer
 
 from ipsys_log.app.cli.console import say, warn
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import Calibrations, Corners, Force, log_option, named, switch
+from ipsys_log.app.cli.options import Calibrations, Corners, Force, log_option, setting, switch
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -32,21 +32,25 @@ def node(
     rig: Annotated[
         Path, typer.Argument(metavar="FILE", help="The rig file, with the source of the camera.")
     ] = Path("lab.toml"),
-    camera: Annotated[str, named("--camera", "NAME", "The camera of this host; the node has its name.")] = "",
+    camera: Annotated[
+        str, setting("--camera", "NAME", "The camera of this host; the node has its name.")
+    ] = "",
     output: NodeLog = None,
     centre: Annotated[
-        str | None, named("--centre", "HOST:PORT", "The address of the centre, instead of the rig's.")
+        str | None, setting("--centre", "HOST:PORT", "The address of the centre, instead of the rig's.")
     ] = None,
     certificates: Annotated[
         Path | None,
-        named("--certificates", "FOLDER", "The folder of the certificates, instead of the rig's."),
+        setting("--certificates", "FOLDER", "The folder of the certificates, instead of the rig's."),
     ] = None,
     detect: Annotated[
         bool, switch("--detect", "Detect the markers here, and send only the markers.")
     ] = False,
     calibration: Calibrations = None,
     corners: Corners = None,
-    seconds: Annotated[float | None, named("--seconds", "SECONDS", "Stop after this time.", min=0.1)] = None,
+    seconds: Annotated[
+        float | None, setting("--seconds", "SECONDS", "Stop after this time.", min=0.1)
+    ] = None,
     force: Force = False,
 ) -> None:
     """Record one camera of this host, and send its frames to the centre, until Ctrl-C.

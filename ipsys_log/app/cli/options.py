@@ -82,21 +82,21 @@ Option = tuple[Any, Any]
 REQUIRED = inspect.Parameter.empty
 
 
-def named(names: str, metavar: str | None, text: str, **settings: Any) -> Any:
-    """Return the description of an option; other names follow the first one after a comma."""
+def setting(names: str, metavar: str | None, text: str, **settings: Any) -> Any:
+    """Return the description of an option with a value; other names follow the first one after a comma."""
     return typer.Option(*names.split(","), metavar=metavar, help=text, **settings)
 
 
 def switch(names: str, text: str, **settings: Any) -> Any:
     """Return the description of an option without a value."""
-    return named(names, None, text, **settings)
+    return setting(names, None, text, **settings)
 
 
 def option(
     kind: Any, names: str, metavar: str | None, text: str, default: Any = None, **settings: Any
 ) -> Option:
     """Return an option of a table."""
-    return Annotated[kind, named(names, metavar, text, **settings)], default
+    return Annotated[kind, setting(names, metavar, text, **settings)], default
 
 
 def flag(name: str, text: str, **settings: Any) -> Option:
@@ -111,8 +111,10 @@ def stage_option(parameter: StageParameter) -> Option:
     return option(parameter.kind, name, parameter.metavar, parameter.help, parameter.default, **least)
 
 
-def with_options(options: Mapping[str, Option]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of a table, by the names of its parameters."""
+def with_options(
+    options: Mapping[str, Option], name: str | None = None, text: str | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of a table, by the names of its parameters; and a name and a help text."""
     keyword = inspect.Parameter.KEYWORD_ONLY
 
     def decorate(work: Callable[..., None]) -> Callable[..., None]:
@@ -126,6 +128,8 @@ def with_options(options: Mapping[str, Option]) -> Callable[[Callable[..., None]
         ]
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {name: kind for name, (kind, _) in options.items()}
+        if name is not None:
+            command.__name__, command.__doc__ = name, text
         return command
 
     return decorate
@@ -191,18 +195,18 @@ def _figure_file(path: Path | None) -> Path | None:
 
 def figure_option(subject: str) -> Any:
     """Return the description of the option ``--plot``."""
-    return named("--plot", "FILE", f"Draw {subject}: .png, .pdf, .svg or .jpg.", callback=_figure_file)
+    return setting("--plot", "FILE", f"Draw {subject}: .png, .pdf, .svg or .jpg.", callback=_figure_file)
 
 
 # The options that every command uses for the name of a new log.
 log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
 NewLog = Annotated[Path, log_option(help="The log to write, with a name that ends in .mcap.")]
 RigFile = Annotated[
-    Path | None, named("--rig", "FILE", "Use this rig file (lab.toml) instead of the rig in the log.")
+    Path | None, setting("--rig", "FILE", "Use this rig file (lab.toml) instead of the rig in the log.")
 ]
 Calibrations = Annotated[
     list[str] | None,
-    named(
+    setting(
         "--calibration",
         "CAMERA=FILE",
         "Use these camera intrinsics: a calibration file of OpenCV, ROS, Kalibr or others, or a "
@@ -212,33 +216,33 @@ Calibrations = Annotated[
 Corners = stage_option(CORNERS)[0]
 Method = stage_option(METHOD)[0]
 Only = Annotated[
-    list[str] | None, named("--camera", "NAME", "Use only this camera of the rig; repeat it for several.")
+    list[str] | None, setting("--camera", "NAME", "Use only this camera of the rig; repeat it for several.")
 ]
 Force = Annotated[bool, switch("--force", "Overwrite an existing log of this name.")]
 Overwrite = Annotated[bool, switch("--overwrite,--force", "Replace an existing log of this name.")]
 Host = Annotated[
     str | None,
-    named(
+    setting(
         "--host",
         "ADDRESS",
         "Let a phone in this network open the page: 0.0.0.0 for all addresses of this machine, or "
         "one address. The page has a new secret at each start. Default: only this machine.",
     ),
 ]
-Port = Annotated[int, named("--port", "PORT", "Port of the page; 0 for any free port.", min=0, max=65535)]
-RigNow = Annotated[Path, named("--rig", "FILE", "The rig file, with a source for each camera.")]
+Port = Annotated[int, setting("--port", "PORT", "Port of the page; 0 for any free port.", min=0, max=65535)]
+RigNow = Annotated[Path, setting("--rig", "FILE", "The rig file, with a source for each camera.")]
 Terminal = Annotated[
     bool, switch("--terminal", "Ask for the measurements in the terminal instead of on a page.")
 ]
 FittedModels = Annotated[
     list[str] | None,
-    named(
+    setting(
         "--model",
         "NAME",
         "Model of this log, such as best; repeat it for several. The first one is shown, streamed and "
         "used by robots. Default: poly, if the log has it.",
     ),
 ]
-Seconds = Annotated[float | None, named("--seconds", "SECONDS", "Stop after this time.", min=0.1)]
-Train = Annotated[str, named("--train", "LABEL", "Fit on the measurements with this label.")]
+Seconds = Annotated[float | None, setting("--seconds", "SECONDS", "Stop after this time.", min=0.1)]
+Train = Annotated[str, setting("--train", "LABEL", "Fit on the measurements with this label.")]
 AsJson = Annotated[bool, switch("--json", "Print JSON.")]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from ipsys_log.app.cli.console import console, remarks, say
-from ipsys_log.app.cli.options import named, switch
+from ipsys_log.app.cli.options import setting, switch
 from ipsys_log.errors import IpsysError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _CODE_STYLE = "#ffffff on #000000"
 Web = Annotated[bool, switch("--web", "Show a page, the dashboard, for any number of browsers.")]
 WebPort = Annotated[
     int | None,
-    named(
+    setting(
         "--web-port",
         "PORT",
         "Serve the dashboard on this port instead of 8000; 0 for any free port.",

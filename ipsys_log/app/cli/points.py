@@ -13,7 +13,7 @@ import typer
 from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_json, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations, load_matching_rig
-from ipsys_log.app.cli.options import appended_log_argument, figure_option, named, switch
+from ipsys_log.app.cli.options import appended_log_argument, figure_option, setting, switch
 from ipsys_log.app.cli.pages import serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
 from ipsys_log.app.cli.stages import derive
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Log = Annotated[Path, appended_log_argument(help="A finished log, which gets the measurements.")]
 Sheet = Annotated[
     Path | None,
-    named("--csv", "SHEET", "Read the measurements from a sheet; docs/measuring.md shows the columns."),
+    setting("--csv", "SHEET", "Read the measurements from a sheet; docs/measuring.md shows the columns."),
 ]
 Insist = Annotated[bool, switch("--force", "With --csv: write rows that look wrong, too.")]
 Places = Annotated[
@@ -39,7 +39,7 @@ Places = Annotated[
 ]
 Baseline = Annotated[
     str | None,
-    named(
+    setting(
         "--ab",
         "CM",
         "The distance between the first two reference points, read with this tape, in cm. It shows the "
@@ -140,7 +140,7 @@ def exclude(
     points: Annotated[
         list[str], typer.Argument(metavar="POINT", help="Names of calibration points, such as p007.")
     ],
-    reason: Annotated[str, named("--reason", "TEXT", "The reason, which is written into the log.")],
+    reason: Annotated[str, setting("--reason", "TEXT", "The reason, which is written into the log.")],
     readmit: Annotated[
         bool, switch("--readmit", "Use excluded points again, instead of excluding points.")
     ] = False,
@@ -204,11 +204,11 @@ _MOST_PLACES = 50
 # Without a floor in the rig, this is the largest height of a marker.
 _HIGHEST_M = 5.0
 
-Count = Annotated[int, named("--places", "N", "Number of points to propose.")]
-Model = Annotated[str, named("--model", "NAME", "The model to improve.")]
+Count = Annotated[int, setting("--places", "N", "Number of points to propose.")]
+Model = Annotated[str, setting("--model", "NAME", "The model to improve.")]
 Heights = Annotated[
     list[float] | None,
-    named(
+    setting(
         "--height-m",
         "METRES",
         "Height of the marker above the floor, in m; repeat it for several. Default: the heights of the "

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.app.cli.console import console, print_result, say
-from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, named, other_log_option, switch
+from ipsys_log.app.cli.options import AsJson, Host, OtherLog, Port, other_log_option, setting, switch
 from ipsys_log.app.cli.pages import print_code, say_faults
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.app.report.files import check_file, check_folder, write_files
@@ -144,7 +144,7 @@ def setup(folder: _Folder, host: Host = None, port: Port = _PORT) -> None:
 @writes_nothing
 def cameras(
     rig: Annotated[
-        Path | None, named("--rig", "FILE", "Check that USB is fast enough for the cameras of this rig.")
+        Path | None, setting("--rig", "FILE", "Check that USB is fast enough for the cameras of this rig.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -204,19 +204,19 @@ def _command(folder: Path, host: str | None, port: int) -> str:
 
 
 RigNow = Annotated[
-    Path | None, named("--rig", "FILE", "Print the markers of this rig file, in their true size.")
+    Path | None, setting("--rig", "FILE", "Print the markers of this rig file, in their true size.")
 ]
 Ids = Annotated[
     str | None,
-    named("--ids", "LIST", "Print these ids, such as 1,2,3 or 0-9, instead of the ids of the rig."),
+    setting("--ids", "LIST", "Print these ids, such as 1,2,3 or 0-9, instead of the ids of the rig."),
 ]
 Length = Annotated[
     float | None,
-    named("--length", "METRES", "Side of the black square, in m, instead of the lengths of the rig."),
+    setting("--length", "METRES", "Side of the black square, in m, instead of the lengths of the rig."),
 ]
 Dictionary = Annotated[
     str | None,
-    named(
+    setting(
         "--dictionary",
         "NAME",
         "Dictionary of --ids without a rig (default: DICT_4X4_100) and of a ChArUco board "
@@ -225,22 +225,22 @@ Dictionary = Annotated[
 ]
 BoardName = Annotated[
     str | None,
-    named(
+    setting(
         "--board",
         "COLUMNSxROWS",
         "Print a board for ipsys calibrate: inner corners of a chessboard, such as 6x4, or "
         "squares of a ChArUco board, such as charuco:4x5.",
     ),
 ]
-Square = Annotated[float, named("--square", "METRES", "Side of a square of the board, in m.")]
+Square = Annotated[float, setting("--square", "METRES", "Side of a square of the board, in m.")]
 MarkerScale = Annotated[
     float,
-    named("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
+    setting("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
 PageName = Annotated[
-    str | None, named("--page", "NAME", "Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small.")
+    str | None, setting("--page", "NAME", "Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small.")
 ]
-Output = Annotated[Path, named("--output,-o", "FILE", "The PDF to write.")]
+Output = Annotated[Path, setting("--output,-o", "FILE", "The PDF to write.")]
 Force = Annotated[bool, switch("--force", "Overwrite an existing file.")]
 
 _DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"

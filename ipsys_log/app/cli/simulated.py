@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import MODEL, check_target
-from ipsys_log.app.cli.options import named, other_log_option, switch
+from ipsys_log.app.cli.options import other_log_option, setting, switch
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 Paths = Annotated[
     list[str] | None,
-    named("--path", "ROBOT=X,Y...", 'Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'),
+    setting("--path", "ROBOT=X,Y...", 'Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'),
 ]
 Failures = Annotated[
     list[str] | None,
-    named("--fail", "CAMERA=START:SECONDS", "Let a camera fail: white=20:5 is at 20 s, for 5 s."),
+    setting("--fail", "CAMERA=START:SECONDS", "Let a camera fail: white=20:5 is at 20 s, for 5 s."),
 ]
 
 
@@ -30,21 +30,21 @@ def simulate(
     output: cli.NewLog,
     cameras: Annotated[
         str | None,
-        named(
+        setting(
             "--cameras",
             "GRID",
             "Columns x rows of the cameras of a hall, such as 6x4. Default: a lab with three cameras.",
         ),
     ] = None,
     seed: Annotated[
-        int | None, named("--seed", "N", "Seed of the random numbers. The same seed gives the same bytes.")
+        int | None, setting("--seed", "N", "Seed of the random numbers. The same seed gives the same bytes.")
     ] = None,
     settings: Annotated[
-        Path | None, named("--settings", "FILE", "Read settings from a TOML file; docs/data.md lists them.")
+        Path | None, setting("--settings", "FILE", "Read settings from a TOML file; docs/data.md lists them.")
     ] = None,
     changes: Annotated[
         list[str] | None,
-        named("--set", "NAME=VALUE", "Change a setting, such as drive_s=4; repeat it for several."),
+        setting("--set", "NAME=VALUE", "Change a setting, such as drive_s=4; repeat it for several."),
     ] = None,
 ) -> None:
     """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
@@ -84,10 +84,13 @@ def drive(
     robots: Annotated[int, switch("--robots", "Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
-        Path | None, named("--program", "FILE", "The program of the robots (default: the example of ipsys).")
+        Path | None,
+        setting("--program", "FILE", "The program of the robots (default: the example of ipsys)."),
     ] = None,
-    over: Annotated[str, named("--over", "udp|vrpn|ros2", "The stream of the positions.")] = "udp",
-    loss: Annotated[float, named("--loss", "SHARE", "Lose this share of the datagrams, such as 0.05.")] = 0.0,
+    over: Annotated[str, setting("--over", "udp|vrpn|ros2", "The stream of the positions.")] = "udp",
+    loss: Annotated[
+        float, setting("--loss", "SHARE", "Lose this share of the datagrams, such as 0.05.")
+    ] = 0.0,
     delay_ms: Annotated[float, switch("--delay-ms", "Delay the datagrams, in ms.")] = 0.0,
     fail: Failures = None,
     lockstep: Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
@@ -118,18 +118,6 @@ def options_until(name: str | None) -> dict[str, cli.Option]:
         options[parameter.name] = stage_option(parameter)
     ordered = {name: options[name] for name in _ORDER if name in options}
     return {**ordered, **options, "as_json": as_json}
-
-
-def build_command(
-    name: str, text: str, options: Mapping[str, cli.Option], work: Callable[..., None]
-) -> Callable[..., None]:
-    """Return a command with a help text and these options."""
-
-    def command(**given: Any) -> None:
-        work(**given)
-
-    command.__name__, command.__doc__ = name, text
-    return with_options(options)(command)
 
 
 def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
@@ -313,15 +301,7 @@ def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
 
 _options = options_until(None)
 _json = _options.pop("as_json")
-replay = build_command(
-    "replay",
-    _REPLAY,
-    {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json},
-    _replay,
-)
-evaluate = build_command(
-    "evaluate",
-    _EVALUATE,
-    {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]},
-    partial(_derive, "evaluate"),
-)
+_options = {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json}
+replay = with_options(_options, "replay", _REPLAY)(_replay)
+_options = {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]}
+evaluate = with_options(_options, "evaluate", _EVALUATE)(partial(_derive, "evaluate"))

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli.console import say
-from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, named, option, switch
+from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option, setting, switch
 from ipsys_log.app.cli.pages import Web, WebPort, check_dashboard, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
 from ipsys_log.errors import IpsysError
@@ -39,18 +39,20 @@ _KEY = re.compile(r"\x1b\[[A-D]|.", re.DOTALL)
 _RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
-RigFile = Annotated[Path | None, named("--rig", "FILE", "Open the streams of this rig file (lab.toml).")]
-Rate = Annotated[float, named("--rate", "FACTOR", "Play faster or slower: 2 is twice as fast.")]
+RigFile = Annotated[Path | None, setting("--rig", "FILE", "Open the streams of this rig file (lab.toml).")]
+Rate = Annotated[float, setting("--rate", "FACTOR", "Play faster or slower: 2 is twice as fast.")]
 Loop = Annotated[bool, switch("--loop", "Begin again at the end.")]
 StartPaused = Annotated[bool, switch("--start-paused", "Wait for a key at the start.")]
-StartOffset = Annotated[float, named("--start-offset", "SECONDS", "Begin so long after the first position.")]
-Run = Annotated[str | None, named("--run", "NAME", "Play the tracks of this run. Default: the newest.")]
+StartOffset = Annotated[
+    float, setting("--start-offset", "SECONDS", "Begin so long after the first position.")
+]
+Run = Annotated[str | None, setting("--run", "NAME", "Play the tracks of this run. Default: the newest.")]
 Topics = Annotated[
     list[str] | None,
-    named("--topics", "TOPIC", "Play this topic instead, such as /truth/tracks; repeat it for several."),
+    setting("--topics", "TOPIC", "Play this topic instead, such as /truth/tracks; repeat it for several."),
 ]
 Restamp = Annotated[
-    str, named("--restamp", "original|now", "Give the positions their capture times, or the present time.")
+    str, setting("--restamp", "original|now", "Give the positions their capture times, or the present time.")
 ]
 
 

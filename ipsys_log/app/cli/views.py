@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ipsys_log.app.cli.console import console, progress_bar, say
-from ipsys_log.app.cli.options import ReadLogs, named, switch
-from ipsys_log.app.cli.stages import MORE, build_command, derive, options_until
+from ipsys_log.app.cli.options import ReadLogs, setting, switch, with_options
+from ipsys_log.app.cli.stages import MORE, derive, options_until
 from ipsys_log.app.report.files import check_file, write_files
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -17,21 +17,23 @@ from ipsys_log.log.location import LogLocation, file_beside
 
 _COUNTED = ("bag", "video", "pictures")
 Runs = Annotated[
-    list[str] | None, named("--run", "NAME", "Show this run instead of the newest; repeat it for several.")
+    list[str] | None, setting("--run", "NAME", "Show this run instead of the newest; repeat it for several.")
 ]
 Save = Annotated[
-    Path | None, named("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer.")
+    Path | None, setting("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer.")
 ]
 FoxgloveLayout = Annotated[
     Path | None,
-    named(
+    setting(
         "--foxglove-layout",
         "FILE",
         "Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
     ),
 ]
 _HTML = (
-    Annotated[Path | None, named("--html", "FILE", "The page to write. Default: the log's name with .html.")],
+    Annotated[
+        Path | None, setting("--html", "FILE", "The page to write. Default: the log's name with .html.")
+    ],
     None,
 )
 _REPORT = f"""
@@ -128,14 +130,14 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
 
 _options = options_until("evaluate")
 del _options["as_json"]
-report = build_command("report", _REPORT, {**_options, "html": _HTML}, _report)
+report = with_options({**_options, "html": _HTML}, "report", _REPORT)(_report)
 
 
 def export(
     logs: ReadLogs,
     output: Annotated[
         Path,
-        named(
+        setting(
             "--output,-o",
             "FILE",
             "The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
@@ -144,7 +146,7 @@ def export(
     ],
     format_: Annotated[
         str | None,
-        named(
+        setting(
             "--format",
             "NAME",
             "csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
@@ -152,7 +154,7 @@ def export(
     ] = None,
     table: Annotated[
         str,
-        named(
+        setting(
             "--table",
             "NAME",
             "tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
@@ -160,15 +162,15 @@ def export(
     ] = "tracks",
     run: Annotated[
         list[str] | None,
-        named("--run", "NAME", "Export this run instead of the newest; repeat it for several."),
+        setting("--run", "NAME", "Export this run instead of the newest; repeat it for several."),
     ] = None,
-    robot: Annotated[str | None, named("--robot", "NAME", "Export only this robot.")] = None,
+    robot: Annotated[str | None, setting("--robot", "NAME", "Export only this robot.")] = None,
     without_images: Annotated[
         bool, switch("--without-images", "Leave the images out of a ROS 2 bag.")
     ] = False,
-    frame_rate: Annotated[float, named("--frame-rate", "HZ", "Frames per second of a video.")] = 25.0,
+    frame_rate: Annotated[float, setting("--frame-rate", "HZ", "Frames per second of a video.")] = 25.0,
     size: Annotated[
-        str, named("--size", "WIDTHxHEIGHT", "Size of a video in pixels, two even numbers.")
+        str, setting("--size", "WIDTHxHEIGHT", "Size of a video in pixels, two even numbers.")
     ] = "1280x720",
 ) -> None:
     """Export positions, images or another channel to a file for other programs.

@@ -8,20 +8,9 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from ipsys_log.app.cli import lab_inputs
 from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import print_result, progress_bar, say
-from ipsys_log.app.cli.lab_inputs import (
-    FieldOfView,
-    Focal,
-    SaveNominal,
-    cameras_of,
-    lab_of_run,
-    load_calibrations,
-    load_matching_rig,
-    nominal_lenses,
-    nominal_lenses_of_logs,
-    write_nominal,
-)
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
 from ipsys_log.app.cli.options import figure_option, log_argument, log_option, setting, switch
 from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_measuring
@@ -69,15 +58,15 @@ _LEAST_POINTS = 2
 def calibrate_lab(
     logs: Sources = None,
     goal_mm: Goal = 3.0,
-    focal: Focal = None,
-    field_of_view: FieldOfView = None,
+    focal: lab_inputs.Focal = None,
+    field_of_view: lab_inputs.FieldOfView = None,
     train: cli.Train = "train",
     rig: cli.RigFile = None,
     calibration: cli.Calibrations = None,
     corners: cli.Corners = None,
     output: Output = None,
     plot: Plot = None,
-    save_nominal: SaveNominal = None,
+    save_nominal: lab_inputs.SaveNominal = None,
     seconds: Seconds = None,
     terminal: Terminal = False,
     host: cli.Host = None,
@@ -121,18 +110,18 @@ def calibrate_lab(
         _record_drive(output, rig, calibration, nominal, request, goal_m, seconds, page, force)
         # The log has the rig and the intrinsics of its cameras.
         logs, output, rig, calibration, nominal = [output], None, None, None, []
-    given_rig = load_matching_rig(rig, lambda: cameras_of(logs))
+    given_rig = lab_inputs.load_matching_rig(rig, lambda: lab_inputs.cameras_of(logs))
     _check(logs, given_rig)
-    lenses = load_calibrations(calibration, lambda: cameras_of(logs))
-    nominal_values = nominal_lenses_of_logs(logs, lenses, nominal)
+    lenses = lab_inputs.load_calibrations(calibration, lambda: lab_inputs.cameras_of(logs))
+    nominal_values = lab_inputs.nominal_lenses_of_logs(logs, lenses, nominal)
     if save_nominal is not None:
-        write_nominal(nominal_values, save_nominal)
+        lab_inputs.write_nominal(nominal_values, save_nominal)
     lenses = {**lenses, **nominal_values}
     given: dict[str, Any] = {"model": ["joint"], "lenses": lenses, "train": train}
     given |= {"rig": rig, "calibration": None, "corners": corners, "run": None}
     with derive(logs, "fit", output, **given) as (session, outcomes, _):
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
-        in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
+        in_force, all_lenses = lab_inputs.lab_of_run(session, run, given_rig, lenses)
         with progress_bar() as progress:
             lab = describe_lab(
                 session, run, in_force, all_lenses, (given_rig, lenses), train, goal_mm / 1000,
@@ -196,7 +185,7 @@ def _record_drive(
         check_installed("the measuring page needs", "starlette", "uvicorn")
     lab = prepare_lab(rig or Path("lab.toml"), None, calibration)
     sizes_px = {c.name: (c.width, c.height) for c in lab.cameras if c.width and c.height}
-    lab.lenses.update(nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
+    lab.lenses.update(lab_inputs.nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
     check_target(output, force, lab.files)
     ready_to_measure(lab, request, None, page)
     with open_cameras(lab, output, seconds) as (opened, status):

@@ -14,19 +14,10 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from ipsys_log.app.web import requests
 from ipsys_log.app.web.dashboard.operator import Operator
 from ipsys_log.app.web.dashboard.pictures import shrink
 from ipsys_log.app.web.dashboard.state import Dashboard, DashboardSetting, PlayedLog
-from ipsys_log.app.web.requests import (
-    ERROR_HANDLERS,
-    MAY_WRITE,
-    OperatorSeat,
-    answer_claim,
-    file_routes,
-    operator_of,
-    read_json,
-    whole_number,
-)
 from ipsys_log.capture.lab import OpenLab
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.errors import FrameError, IpsysError
@@ -139,7 +130,7 @@ def build_dashboard(dashboard: Dashboard, setup: str | None = None) -> Starlette
     answers = _Answers(dashboard, setup)
     return Starlette(
         routes=[
-            *file_routes("dashboard", _SCRIPTS, "dashboard", ("make", "operator")),
+            *requests.file_routes("dashboard", _SCRIPTS, "dashboard", ("make", "operator")),
             Route("/picture/{camera}/{time_ns}", answers.picture),
             Route("/api/scene", answers.scene),
             Route("/api/live", answers.live),
@@ -147,7 +138,7 @@ def build_dashboard(dashboard: Dashboard, setup: str | None = None) -> Starlette
             Route("/api/mark", answers.mark, methods=["POST"]),
             Route("/api/segment", answers.segment, methods=["POST"]),
         ],
-        exception_handlers=ERROR_HANDLERS,
+        exception_handlers=requests.ERROR_HANDLERS,
     )
 
 
@@ -159,7 +150,7 @@ class _Answers:
         self._pictures: dict[tuple[str, int], bytes | None] = {}
 
     async def scene(self, request: Request) -> Response:
-        scene = self._dashboard.scene(request.scope.get(MAY_WRITE, True))
+        scene = self._dashboard.scene(request.scope.get(requests.MAY_WRITE, True))
         return JSONResponse({**scene, "setup": self._setup})
 
     async def live(self, _: Request) -> Response:
@@ -167,7 +158,7 @@ class _Answers:
         return StreamingResponse(events, media_type="text/event-stream")
 
     async def picture(self, request: Request) -> Response:
-        camera, time_ns = request.path_params["camera"], whole_number(request.path_params["time_ns"])
+        camera, time_ns = request.path_params["camera"], requests.whole_number(request.path_params["time_ns"])
         if time_ns is None:
             return Response(status_code=404)
         jpeg = self._encoded(camera, time_ns)
@@ -178,18 +169,18 @@ class _Answers:
 
     async def operate(self, request: Request) -> Response:
         """Claim the operation for a device, or release it."""
-        body = await read_json(request)
-        return JSONResponse(answer_claim(self._operator().seat, body))
+        body = await requests.read_json(request)
+        return JSONResponse(requests.answer_claim(self._operator().seat, body))
 
     async def mark(self, request: Request) -> Response:
-        body = await read_json(request)
-        self._operator().mark(operator_of(body), str(body.get("text", "")))
+        body = await requests.read_json(request)
+        self._operator().mark(requests.operator_of(body), str(body.get("text", "")))
         return JSONResponse({})
 
     async def segment(self, request: Request) -> Response:
         """Start a segment by its name, or end the present one."""
-        body = await read_json(request)
-        operator, number = self._operator(), operator_of(body)
+        body = await requests.read_json(request)
+        operator, number = self._operator(), requests.operator_of(body)
         if "start" in body:
             operator.start_segment(number, str(body["start"]))
         else:
@@ -224,7 +215,7 @@ def dashboard_of_recording(
     model: Model,
     run: str,
     streams: Sequence[Stream],
-    seat: OperatorSeat | None = None,
+    seat: requests.OperatorSeat | None = None,
 ) -> Dashboard:
     """Return the dashboard of a live recording, with an operator.
 
